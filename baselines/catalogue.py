@@ -1,7 +1,9 @@
-"""The named policies: how each is built, which options it has, and what it needs beyond the standard sensors.
+"""The named policies: how each is built, which options it has, and what it needs beyond the
+standard sensors.
 
-Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the command of a policy and
-shows it compensated encoder readings. The named policies are such compositions.
+Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the
+command of a policy and shows it compensated encoder readings. The named policies are such
+compositions.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,8 +18,18 @@ from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import Compensator, DynamicCompensator, GravityCompensator, OutputMethod
-from baselines.compensation.measured import LINK_ENCODER, TORQUE_SENSOR, DeflectionSensors, MeasuredCompensator
+from baselines.compensation.compensators import (
+    Compensator,
+    DynamicCompensator,
+    GravityCompensator,
+    OutputMethod,
+)
+from baselines.compensation.measured import (
+    LINK_ENCODER,
+    TORQUE_SENSOR,
+    DeflectionSensors,
+    MeasuredCompensator,
+)
 from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
@@ -53,7 +65,8 @@ class NamedPolicy:
         build: Builds it.
         options: Names of the `PolicyOptions` that have an effect on it.
         track: What it needs.
-        sensors: Sensors that it reads beyond the standard set, as `gymnasium.make(..., sensors=[...])` has them.
+        sensors: Sensors that it reads beyond the standard set, as `gymnasium.make(...,
+            sensors=[...])` has them.
     """
 
     build: Builder
@@ -62,11 +75,13 @@ class NamedPolicy:
     sensors: tuple[str, ...] = field(default=())
 
 
-def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001  one signature for all
+def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     return Zero(model.observation_table)
 
 
-def _around(core: Builder, compensator: Callable[..., Compensator], output: OutputMethod = "taylor") -> Builder:
+def _around(
+    core: Builder, compensator: Callable[..., Compensator], output: OutputMethod = "taylor"
+) -> Builder:
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
         made = compensator(model, options.output or output, options.gravity)
         return Compensated(core(env, model, options), made, ramp_s=options.ramp_s)
@@ -83,7 +98,9 @@ def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return WalkingController(model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s)
+    return WalkingController(
+        model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s
+    )
 
 
 def _without_feedback(build: Builder) -> Builder:
@@ -121,15 +138,21 @@ def _weighing(build: Builder) -> Builder:
 
 
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    return OnlineStiffness(_base(env, model, options), model, LegEstimator(model), options.adaptation)
+    return OnlineStiffness(
+        _base(env, model, options), model, LegEstimator(model), options.adaptation
+    )
 
 
 def _with_posture(build: Builder) -> Builder:
-    """With posture feedback, and with the planned ZMP shifted against its mean error where that is asked for."""
+    """With posture feedback, and with the planned ZMP shifted against its mean error where that
+    is asked for.
+    """
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
-        return policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
+        return (
+            policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
+        )
 
     return built
 
@@ -138,7 +161,11 @@ def learned_base(options: PolicyOptions, is_walker: bool) -> str:
     """Name of the policy whose offsets `iterative` learns."""
     name = options.learned_base or ("adaptive_posture" if is_walker else "input")
     known = ON_THE_WALKER if is_walker else ON_JOINTS
-    bases = [base for base, policy in known.items() if base != "iterative" and policy.track is Track.STANDARD]
+    bases = [
+        base
+        for base, policy in known.items()
+        if base != "iterative" and policy.track is Track.STANDARD
+    ]
     require_known("base of iterative", [name], bases)
     return name
 
@@ -146,7 +173,8 @@ def learned_base(options: PolicyOptions, is_walker: bool) -> str:
 def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     is_walker = isinstance(model, WalkerModel)
     known = ON_THE_WALKER if is_walker else ON_JOINTS
-    # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift away over the walks
+    # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift
+    # away over the walks
     if "swing_s" not in options.posture.model_fields_set:
         options = options.replace(posture=options.posture.replace(swing_s=0.0))
     base = known[learned_base(options, is_walker)].build(env, model, options)
@@ -155,14 +183,22 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
 
 
 def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
-    """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by them."""
+    """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by
+    them.
+    """
 
     def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         sensors = DeflectionSensors(model, sensor, joints)
         modelled = DynamicCompensator(model, options.output or "wrench", options.gravity)
         controller = _controller(env, model, options)
-        policy = Compensated(controller, MeasuredCompensator(modelled, sensors), options.ramp_s, corrects_policy=True)
-        estimator = LegEstimator(model, sensors) if sensor == TORQUE_SENSOR else EncoderEstimator(model, sensors)
+        policy = Compensated(
+            controller, MeasuredCompensator(modelled, sensors), options.ramp_s, corrects_policy=True
+        )
+        estimator = (
+            LegEstimator(model, sensors)
+            if sensor == TORQUE_SENSOR
+            else EncoderEstimator(model, sensors)
+        )
         return OnlineStiffness(policy, model, estimator, options.adaptation)
 
     return build
@@ -172,7 +208,9 @@ def _link_encoder(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     """`dynamic`, with links by their encoders and the stiffness of every joint adapted by them."""
     sensors = DeflectionSensors(model, LINK_ENCODER)
     modelled = DynamicCompensator(model, options.output or "taylor", options.gravity)
-    policy = Compensated(_zero(env, model, options), MeasuredCompensator(modelled, sensors), options.ramp_s)
+    policy = Compensated(
+        _zero(env, model, options), MeasuredCompensator(modelled, sensors), options.ramp_s
+    )
     return OnlineStiffness(policy, model, LinkEncoderEstimator(model, sensors), options.adaptation)
 
 
@@ -213,15 +251,22 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "disturbance_observer": NamedPolicy(
         _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
     ),
-    "link_encoder": NamedPolicy(_link_encoder, (*_COMPENSATOR, "adaptation"), Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "link_encoder": NamedPolicy(
+        _link_encoder, (*_COMPENSATOR, "adaptation"), Track.LINK_ENCODERS, (LINK_ENCODER,)
+    ),
     "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
-"""Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""
+"""Policies of robots on a fixed base.
+
+There `uncompensated` has no controller to add and equals `zero`.
+"""
 
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
-    "uncompensated_open": NamedPolicy(_without_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
+    "uncompensated_open": NamedPolicy(
+        _without_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")
+    ),
     "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER, "ramp_s")),
     "input_open": NamedPolicy(_without_feedback(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
@@ -234,21 +279,34 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
         _weighing(_with_sensors(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
     ),
     "hip_sensor": NamedPolicy(
-        _weighing(_with_sensors(LINK_ENCODER, ("hip",))), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
+        _weighing(_with_sensors(LINK_ENCODER, ("hip",))),
+        _MEASURED,
+        Track.LINK_ENCODERS,
+        (LINK_ENCODER,),
     ),
     "link_encoder": NamedPolicy(
         _weighing(_with_sensors(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
     ),
     "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
     "talos": NamedPolicy(
-        _talos, (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+        _talos,
+        (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque", "ramp_s"),
+        Track.TORQUE_SENSORS,
+        (TORQUE_SENSOR,),
     ),
-    "iterative": NamedPolicy(_iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS),
+    "iterative": NamedPolicy(
+        _iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS
+    ),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
-"""Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""
+"""Policies of the walker.
+
+The controller alone assumes K too, for the ankles' offsets and the friction.
+"""
 
 BEST_ON_THE_WALKER: str | None = "adaptive_posture"
-"""Best policy of the walker that needs no training and reads the standard sensors; residuals are compared with it."""
+"""Best policy of the walker that needs no training and reads the standard sensors; residuals are
+compared with it.
+"""
 BEST_ON_JOINTS: str | None = "friction"
 """The same for robots on a fixed base."""

@@ -21,15 +21,16 @@ class PolicyOptions(Model):
     """Options of the named policies, as keyword arguments of `baselines.make`."""
 
     stiffness: Any = None
-    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
-    None for the environment's assumed model."""
-    stiffness_scale: float = quantity("1", 1.0, gt=0, description="further factor on the K that is assumed")
+    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of
+    an identification; None for the environment's assumed model."""
+    stiffness_scale: float = quantity("1", 1.0, gt=0)
+    """Further factor on the K that is assumed [1]."""
     output: OutputMethod | None = None
-    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
-    what the policy's name says."""
+    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and
+    "none"; None for what the policy's name says."""
     gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or "lumped";
-    None for the first of them."""
+    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or
+    "lumped"; None for the first of them."""
     com_feedback: bool = True
     """Walker: whether the controller feeds the center of mass back."""
     gains: WalkingGains | None = None
@@ -41,7 +42,9 @@ class PolicyOptions(Model):
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
     zmp_offset: ZmpOffsetGains | None = None
-    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None for not at all."""
+    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None
+    for not at all.
+    """
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()
@@ -51,7 +54,10 @@ class PolicyOptions(Model):
     observer: ObserverGains = ObserverGains()
     """Testbed: filters and bound of `disturbance_observer`."""
     learned_base: str | None = None
-    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker, else `input`."""
+    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker,
+    else `input`.
+    """
     learning: LearningGains = LearningGains()
     """How `iterative` learns, and from how many trials."""
-    ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")
+    ramp_s: float = quantity("s", STAND_S, gt=0)
+    """Time in which the compensation grows from zero [s]."""

@@ -37,7 +37,9 @@ def policy_names() -> list[str]:
 
 
 def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """A baseline by its name, on a walker or on another robot; None for a policy that is no baseline."""
+    """A baseline by its name, on a walker or on another robot; None for a policy that is no
+    baseline.
+    """
     return (ON_THE_WALKER if is_walker else ON_JOINTS).get(name)
 
 
@@ -52,12 +54,16 @@ def track(name: str, is_walker: bool = True) -> Track:
 
 
 def best_analytic(is_walker: bool = True) -> str | None:
-    """The best policy without learning that reads the standard sensors, by its name; None where none is named."""
+    """The best policy without learning that reads the standard sensors, by its name; None where
+    none is named.
+    """
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 
 def sensors_needed(name: str) -> tuple[str, ...]:
-    """Sensors beyond the standard set that a policy reads, for `gymnasium.make(..., sensors=[...])`."""
+    """Sensors beyond the standard set that a policy reads, for `gymnasium.make(...,
+    sensors=[...])`.
+    """
     known = named_policy(name, is_walker=True) or named_policy(name, is_walker=False)
     return () if known is None else known.sensors
 
@@ -89,29 +95,34 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `uncompensated_open`, `input_open` | – | without feedback of the center of mass |
     | `residual:PATH` | a trained residual on its base: a folder, or a shipped name | the same |
 
-    `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each world on its own
-    robot. Until then it is its base. Evaluations call it before they score.
+    `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each
+    world on its own robot. Until then it is its base. Evaluations call it before they score.
 
     Args:
         name: As in the table.
         env: The environment, scalar or vector, wrapped or not; it provides the assumed model.
-        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback, gains, those that
-            have an effect on this policy in this environment; None is as if it were not given.
+        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback,
+            gains, those that have an effect on this policy in this environment; None is as if it
+            were not given.
 
     Returns:
-        An object with `predict`, usable on scalar and vector environments and in SB3's `evaluate_policy`.
+        An object with `predict`, usable on scalar and vector environments and in SB3's
+        `evaluate_policy`.
 
     Raises:
-        ConfigurationError: Unknown name or option, one without effect, or an environment that is not ours.
-    """
+        ConfigurationError: Unknown name or option, one without effect, or an environment that is
+            not ours.
+    """  # noqa: E501
     if name.startswith(RESIDUAL):
         return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
     if name.startswith(ITERATIVE):
         return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
-            f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
-            'gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to run on a wrapper of it'
+            "a baseline needs an environment with an assumed model, got"
+            f" {type(env.unwrapped).__name__}; make one with"
+            ' gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to'
+            " run on a wrapper of it"
         )
     given = {option: value for option, value in options.items() if value is not None}
     chosen = PolicyOptions(**given)
@@ -119,7 +130,9 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     known = named_policy(name, is_walker)
     if known is None:
         names = ON_THE_WALKER if is_walker else ON_JOINTS
-        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, [*names, f"{RESIDUAL}PATH"])
+        raise unknown_name(
+            f"policy of the {env.unwrapped.task.name}", name, [*names, f"{RESIDUAL}PATH"]
+        )
     _require_effect(name, env, given, known.options)
     return known.build(env, _assumed(env, chosen), chosen)
 
@@ -130,13 +143,14 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     task = env.unwrapped.task.name
     if description.robot != task:
         raise ConfigurationError(
-            f"{shortened(folder)} is a residual for the {description.robot}, the environment is the {task}"
+            f"{shortened(folder)} is a residual for the {description.robot}, the environment is the"
+            f" {task}"
         )
     joints = env.unwrapped.assumed_model.joint_names
     if description.joints not in ([], joints):
         raise ConfigurationError(
-            f"{shortened(folder)} was trained on a robot with the joints {', '.join(description.joints)}; "
-            f"the environment's has {', '.join(joints)}"
+            f"{shortened(folder)} was trained on a robot with the joints"
+            f" {', '.join(description.joints)}; the environment's has {', '.join(joints)}"
         )
     base = make(description.base, env, **{**description.base_options, **options})
     return residual_policy(folder, base, env.unwrapped.assumed_model)
@@ -147,7 +161,9 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     description, table = load_table(folder, env)
     model: RobotModel = env.unwrapped.assumed_model
     base = make(description.base, env, **options)
-    played = LearnedOffsets(base, model, learned_signals(model, description.learning), PolicyOptions().ramp_s)
+    played = LearnedOffsets(
+        base, model, learned_signals(model, description.learning), PolicyOptions().ramp_s
+    )
     played.play(table[None])
     return played
 
@@ -159,11 +175,17 @@ def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str
             # of those with options the oracle alone assumes no stiffness
             why = " but knows the true one" if option in ASSUMED_OPTIONS and usable else ""
             task = env.unwrapped.task.name
-            raise ConfigurationError(f"the policy {name!r} of the {task} does not use {option}{why}; {takes}")
+            raise ConfigurationError(
+                f"the policy {name!r} of the {task} does not use {option}{why}; {takes}"
+            )
 
 
 def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
     if options.stiffness is not None:
         model = model.with_stiffness(read_stiffness(options.stiffness))
-    return model if options.stiffness_scale == 1.0 else model.with_stiffness(options.stiffness_scale * model.stiffness)
+    return (
+        model
+        if options.stiffness_scale == 1.0
+        else model.with_stiffness(options.stiffness_scale * model.stiffness)
+    )

@@ -1,8 +1,9 @@
 """Environments in which an agent decides the residual of a base policy, for one world and for many.
 
-A step is a decision: the residual is held for `decision_period` control steps behind its low-pass, the base policy
-commands the robot, rewards are summed, and the next observation is that of the next decision. A world that ends inside
-a decision takes no further part in it: its observation and reward are those up to its end.
+A step is a decision: the residual is held for `decision_period` control steps behind its low-pass,
+the base policy commands the robot, rewards are summed, and the next observation is that of the next
+decision. A world that ends inside a decision takes no further part in it: its observation and
+reward are those up to its end.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,9 +30,13 @@ from elastic_env.world.task import Transition
 class _Deciding:
     """Base policy, correction and features of some worlds, and their memories."""
 
-    def __init__(self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int) -> None:
+    def __init__(
+        self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int
+    ) -> None:
         if not hasattr(env.unwrapped, "assumed_model"):
-            raise ConfigurationError(f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}")
+            raise ConfigurationError(
+                f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}"
+            )
         policy = make(base, env) if isinstance(base, str) else base
         self.settings = settings
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
@@ -48,7 +53,9 @@ class _Deciding:
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
-        """Features of the coming decision; the measurements count for some worlds only, or for all."""
+        """Features of the coming decision; the measurements count for some worlds only, or for
+        all.
+        """
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
         if worlds is not None and self._past is not None:
             past = put_rows(self._past, worlds, select_rows(past, worlds))
@@ -63,10 +70,15 @@ class _Deciding:
         return action
 
     def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
-        """A residual for the observations of its decision as numbers within [−1, 1], out of the mirror."""
+        """A residual for the observations of its decision as numbers within [−1, 1], out of the
+        mirror.
+        """
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
-            raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {shown(residual)}")
+            raise ActionError(
+                f"a residual must be finite numbers of shape {shape} within ±1, got"
+                f" {shown(residual)}"
+            )
         clipped = np.clip(given, -1.0, 1.0)
         return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 
@@ -75,7 +87,9 @@ ActsOn = Mapping[str, Bound | None]
 """Inputs, and the value of each at a residual of 1."""
 
 
-def _settings(acts_on: ActsOn | None, decision_period: int, further: dict[str, Any]) -> ResidualSettings:
+def _settings(
+    acts_on: ActsOn | None, decision_period: int, further: dict[str, Any]
+) -> ResidualSettings:
     chosen = {} if acts_on is None else {"acts_on": dict(acts_on)}
     return ResidualSettings(**chosen, decision_period=decision_period, **further)
 
@@ -86,8 +100,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
     Args:
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
-        acts_on: Inputs of the base that the residual acts on, each with its bound, see `ResidualSettings`; None for
-            the deflection that the base compensates.
+        acts_on: Inputs of the base that the residual acts on, each with its bound, see
+            `ResidualSettings`; None for the deflection that the base compensates.
         decision_period: Control steps per decision.
         **settings: Further parameters of `ResidualSettings`.
 
@@ -104,12 +118,20 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         **settings: Any,
     ) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, base_policy=base_policy, acts_on=acts_on, decision_period=decision_period, **settings
+            self,
+            base_policy=base_policy,
+            acts_on=acts_on,
+            decision_period=decision_period,
+            **settings,
         )
         gymnasium.Wrapper.__init__(self, env)
-        self._deciding = _Deciding(env, base_policy, _settings(acts_on, decision_period, settings), 1)
+        self._deciding = _Deciding(
+            env, base_policy, _settings(acts_on, decision_period, settings), 1
+        )
         self.observation_space = _box(self._deciding.features.width)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32)
+        self.action_space = gymnasium.spaces.Box(
+            -1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32
+        )
         self._last = np.zeros(0)
 
     @property
@@ -117,7 +139,9 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """How the residual acts."""
         return self._deciding.settings
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         self._last, info = self.env.reset(seed=seed, options=options)
         self._deciding.begin(np.ones(1, dtype=np.bool_))
@@ -127,7 +151,9 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.read_residual(self._last[None], action, self.action_space.shape or ())[None]
+        residual = self._deciding.read_residual(
+            self._last[None], action, self.action_space.shape or ()
+        )[None]
         total = 0.0
         terminated = False
         truncated = False
@@ -149,8 +175,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        acts_on: Inputs of the base that the residual acts on, each with its bound, see `ResidualSettings`; None for
-            the deflection that the base compensates.
+        acts_on: Inputs of the base that the residual acts on, each with its bound, see
+            `ResidualSettings`; None for the deflection that the base compensates.
         decision_period: Control steps per decision.
         autoreset_mode: When; None as the environment would.
         **settings: Further parameters of `ResidualSettings`.
@@ -195,32 +221,44 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """How the residual acts."""
         return self._deciding.settings
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world, or in those of options["reset_mask"]."""
         self._rows, info = self.env.reset(seed=seed, options=options)
         mask = reset_mask(options, self.num_envs)
         self._deciding.begin(mask)
         self._done = self._done & ~mask
         features = self._deciding.observe(self._rows, mask)
-        self._last = features if self._last is None else np.where(mask[:, None], features, self._last)
+        self._last = (
+            features if self._last is None else np.where(mask[:, None], features, self._last)
+        )
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their length, in an order drawn from a generator.
+        """Cut the first episodes at decisions spread evenly over their length, in an order drawn
+        from a generator.
 
-        Call it after `reset`. From the end of the first whole episode on the worlds are all over it; learning that saw
-        all worlds in the same phase would see one phase at a time. What is cut counts as truncated, and has no metrics.
+        Call it after `reset`. From the end of the first whole episode on the worlds are all over
+        it; learning that saw all worlds in the same phase would see one phase at a time. What is
+        cut counts as truncated, and has no metrics.
         """
         length = -(-self.env.unwrapped.task.num_steps // self.settings.decision_period)  # type: ignore[attr-defined]
         self._decisions = 0
-        self._cut_at = -(-generator.permutation(np.arange(1, self.num_envs + 1)) * length // self.num_envs)
+        self._cut_at = -(
+            -generator.permutation(np.arange(1, self.num_envs + 1)) * length // self.num_envs
+        )
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         residual = self._deciding.read_residual(self._rows, actions, self.action_space.shape or ())
-        waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
+        waiting = (
+            self._done
+            if self.autoreset_mode is AutoresetMode.NEXT_STEP
+            else np.zeros_like(self._done)
+        )
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
         truncated |= (self._cut_at == self._decisions) & ~terminated & ~waiting
@@ -242,7 +280,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
-        """Hold a residual for a decision period in the worlds that are alive; the observation is of features."""
+        """Hold a residual for a decision period in the worlds that are alive; the observation is
+        of features.
+        """
         n = self.num_envs
         reward = np.zeros(n)
         terminated = np.zeros(n, dtype=np.bool_)
@@ -251,7 +291,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
         for _ in range(self.settings.decision_period):
-            command = np.where(alive[:, None], self._deciding.act(self._rows, residual), np.float32(0.0))
+            command = np.where(
+                alive[:, None], self._deciding.act(self._rows, residual), np.float32(0.0)
+            )
             with _no_restarts(self.env.unwrapped):
                 self._rows, gained, fell, finished, info = self.env.step(command)
             reward += np.where(alive, gained, 0.0)
@@ -264,7 +306,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
                 truncated = truncated | (ended & finished)
                 reason = np.where(ended, info["termination"], reason)
                 for name, values in info["episode_metrics"].items():
-                    metrics[name] = np.where(ended, values, metrics.get(name, np.zeros_like(values)))
+                    metrics[name] = np.where(
+                        ended, values, metrics.get(name, np.zeros_like(values))
+                    )
                 alive = alive & ~ended
                 if not alive.any():
                     break
@@ -279,7 +323,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
 
 @contextmanager
 def _no_restarts(env: Any) -> Iterator[None]:
-    """Have worlds that end stay as they are for a step; whoever steps the environment itself finds it unchanged."""
+    """Have worlds that end stay as they are for a step; whoever steps the environment itself
+    finds it unchanged.
+    """
     mode = env.autoreset_mode
     env.autoreset_mode = AutoresetMode.DISABLED
     try:

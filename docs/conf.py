@@ -1,4 +1,6 @@
-"""The site: `make docs` builds it into docs/_build/html, without a network, with warnings as errors."""
+"""The site: `make docs` builds it into docs/_build/html, without a network, with warnings as
+errors.
+"""
 
 import os
 import sys
@@ -16,7 +18,9 @@ from reference import write_reference  # noqa: E402
 
 from elastic_env import __version__  # noqa: E402
 
-project, author, release = "elastic-env", "The elastic-env contributors", __version__
+project = "elastic-env"
+author = "The elastic-env contributors"
+release = __version__
 copyright = "the elastic-env contributors, Apache-2.0"  # noqa: A001  Sphinx's name
 
 extensions = [
@@ -34,7 +38,8 @@ suppress_warnings = ["config.cache", "myst.xref_missing.repository"]
 html_theme = "furo"
 html_title = "elastic-env"
 html_show_sphinx = False
-html_static_path, html_css_files = ["_static"], ["site.css"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 # formulas are MathML in the page, which every browser draws without a network
 html_math_renderer = "mathml"
 
@@ -59,7 +64,8 @@ write_reference(HERE / "generated")
 
 def _tables_as_text(app, what, name, obj, options, lines):  # noqa: ARG001  Sphinx's arguments
     """Show the Markdown tables of a docstring as they are: reStructuredText has no such tables."""
-    shown, inside = [], False
+    shown = []
+    inside = False
     for line in lines:
         is_row = line.lstrip().startswith("| ") or line.lstrip().startswith("|---")
         if is_row and not inside:
@@ -75,7 +81,11 @@ def _fields(app, what, name, obj, options, lines) -> None:  # noqa: ARG001  Sphi
     """List the fields of a configuration with unit and default, which stand in no docstring."""
     if isinstance(obj, type) and issubclass(obj, BaseModel):
         for field, info in obj.model_fields.items():
-            default = "required" if info.is_required() else f"default {info.get_default(call_default_factory=True)}"
+            default = (
+                "required"
+                if info.is_required()
+                else f"default {info.get_default(call_default_factory=True)}"
+            )
             lines += ["", f"* `{field}`: {info.description or 'see the class'}; {default}"]
 
 

@@ -1,4 +1,6 @@
-"""The reference pages that are written from the code: environments, gains of policies, and the help of commands."""
+"""The reference pages that are written from the code: environments, gains of policies, and the
+help of commands.
+"""
 
 import contextlib
 import io
@@ -34,18 +36,28 @@ def _signals(signals: Iterable[Signal]) -> str:
 
 
 def environments_page() -> str:
-    """Every simulated environment: id, observation, action, metrics, from the declarations in the code."""
-    parts = ["# Environments", "Written from the declarations in the code. [Options](../options.md) has all arguments."]
+    """Every simulated environment: id, observation, action, metrics, from the declarations in
+    the code.
+    """
+    parts = [
+        "# Environments",
+        "Written from the declarations in the code. [Options](../options.md) has all arguments.",
+    ]
     for name, known in IDS.items():
         if name == "hardware":
             continue
         env = gymnasium.make(known, disable_env_checker=True).unwrapped
         task = env.task
-        scenarios = ", ".join(f"`{scenario}`" for scenario in scenario_names(walks=name == "walker"))
+        scenarios = ", ".join(
+            f"`{scenario}`" for scenario in scenario_names(walks=name == "walker")
+        )
         metrics = ", ".join(f"`{metric.name}`" for metric in task.metrics)
         parts += [
             f"## `{known}`",
-            f"Control period {1e3 * task.num_substeps * task.model.opt.timestep:g} ms. On the command line: `{name}`.",
+            (
+                f"Control period {1e3 * task.num_substeps * task.model.opt.timestep:g} ms. On the"
+                f" command line: `{name}`."
+            ),
             f"**Scenarios**: {scenarios}.",
             "**Observation** (float64, one world):",
             _signals(task.observation_table),
@@ -56,8 +68,10 @@ def environments_page() -> str:
         env.close()
     parts += [
         f"## `{IDS['hardware']}`",
-        "The testbed on a real servo, or an emulated one. Spaces and `info` are those of the simulated testbed. "
-        "[Hardware](../hardware.md) has its arguments.",
+        (
+            "The testbed on a real servo, or an emulated one. Spaces and `info` are those of the"
+            " simulated testbed. [Hardware](../hardware.md) has its arguments."
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -69,13 +83,17 @@ def help_of(*words: str) -> str:
         main([*words, "--help"])
     plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).rstrip()
     return "\n".join(
-        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line for line in plain.splitlines()
+        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line
+        for line in plain.splitlines()
     )
 
 
 def commands_page() -> str:
     """`--help` of every command."""
-    parts = ["# Commands: help", "Output of `--help`. [Commands](../commands.md) has examples and durations."]
+    parts = [
+        "# Commands: help",
+        "Output of `--help`. [Commands](../commands.md) has examples and durations.",
+    ]
     for words in [
         *((command,) for command in COMMANDS if command != "hardware"),
         *(("hardware", part) for part in HARDWARE),
@@ -86,14 +104,23 @@ def commands_page() -> str:
 
 def gains_page() -> str:
     """Every option of a policy that is a mapping of gains: names, defaults, bounds and meaning."""
-    intro = "Written from the declarations in the code. [Options](../options.md#policies) says which policy has which."
+    intro = (
+        "Written from the declarations in the code. [Options](../options.md#policies) says which"
+        " policy has which."
+    )
     parts = ["# Gains of policies", intro]
     for option, field in PolicyOptions.model_fields.items():
-        models = [kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)]
+        models = [
+            kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)
+        ]
         for model in models:
             about = (model.__doc__ or "").partition("\n")[0]
             rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
-            parts += [f"## `{option}`", about, table(["name", "default", "bounds", "meaning"], rows)]
+            parts += [
+                f"## `{option}`",
+                about,
+                table(["name", "default", "bounds", "meaning"], rows),
+            ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -104,7 +131,9 @@ def _is_model(kind: object) -> bool:
 def _parameter(name: str, field: FieldInfo) -> list[str]:
     """Name, default, bounds and meaning of a parameter."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    found = [(sign, getattr(bound, key, None)) for bound in field.metadata for key, sign in signs.items()]
+    found = [
+        (sign, getattr(bound, key, None)) for bound in field.metadata for key, sign in signs.items()
+    ]
     bounds = ", ".join(f"{sign} {value:g}" for sign, value in found if value is not None)
     return [f"`{name}`", _value(field.default), bounds, " ".join((field.description or "").split())]
 
@@ -119,7 +148,8 @@ def _value(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case Model():
-            return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in type(value).model_fields)}}}"
+            names = type(value).model_fields
+            return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in names)}}}"
         case _:
             return str(value)
 
@@ -127,7 +157,11 @@ def _value(value: object) -> str:
 def write_reference(folder: Path) -> None:
     """Write the generated pages; a page that has not changed is left alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    pages = {"environments.md": environments_page(), "gains.md": gains_page(), "help.md": commands_page()}
+    pages = {
+        "environments.md": environments_page(),
+        "gains.md": gains_page(),
+        "help.md": commands_page(),
+    }
     for name, text in pages.items():
         page = folder / name
         if not page.is_file() or page.read_text(encoding="utf-8") != text:

@@ -1,4 +1,5 @@
-"""Gymnasium environments of robots with elastic joints: a single-actuator testbed and a humanoid walking in place.
+"""Gymnasium environments of robots with elastic joints: a single-actuator testbed and a humanoid
+walking in place.
 
 import gymnasium, elastic_env
 env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=3.0, scenario="nominal")
@@ -19,13 +20,22 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "IDS", "ActionError", "ConfigurationError", "ElasticError", "ElasticJoint", "JointRobot", "Servo", "make_elastic",
-]  # fmt: skip
+    "IDS",
+    "ActionError",
+    "ConfigurationError",
+    "ElasticError",
+    "ElasticJoint",
+    "JointRobot",
+    "Servo",
+    "make_elastic",
+]
 
 _ENVIRONMENTS = (
-    "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.robots.robot",
+    "elastic_env.robots.testbed",
+    "elastic_env.robots.thormang",
+    "elastic_env.robots.robot",
     "elastic_env.hardware.live",
-)  # fmt: skip
+)
 """Packages that say NAME and ID of an environment, and make it in a module `environment`."""
 
 _HOMES = {
@@ -40,7 +50,9 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Public names when they are asked for: a process beside the control loop imports this package too."""
+    """Public names when they are asked for: a process beside the control loop imports this
+    package too.
+    """
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
@@ -53,4 +65,6 @@ for _home in _ENVIRONMENTS:
     _room = import_module(_home)
     IDS[_room.NAME] = _room.ID
     _made = f"{_home}.environment"
-    gymnasium.register(id=_room.ID, entry_point=f"{_made}:make", vector_entry_point=f"{_made}:make_vector")
+    gymnasium.register(
+        id=_room.ID, entry_point=f"{_made}:make", vector_entry_point=f"{_made}:make_vector"
+    )

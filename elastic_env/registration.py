@@ -1,4 +1,6 @@
-"""What makes a robot an environment: its configuration, its task and its picture, registered with Gymnasium."""
+"""What makes a robot an environment: its configuration, its task and its picture, registered
+with Gymnasium.
+"""
 
 import inspect
 import os
@@ -54,21 +56,28 @@ class Robot:
         """Vector entry point; further arguments as in `configure`.
 
         Raises:
-            ConfigurationError: A number of worlds or threads that cannot be, or worlds beyond the memory.
+            ConfigurationError: A number of worlds or threads that cannot be, or worlds beyond the
+                memory.
         """
         bounds = ("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")
         for name, number, least, note in bounds:
             if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
-                raise ConfigurationError(f"{name} must be a whole number >= {least}{note}, got {shown(number)}")
+                raise ConfigurationError(
+                    f"{name} must be a whole number >= {least}{note}, got {shown(number)}"
+                )
         require_memory("num_envs", num_envs, _LEAST_WORLD_BYTES)
         task = self.task(self._configured(arguments), num_envs)
         picture = partial(self.picture, task)
-        return ElasticVectorEnv(task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture)
+        return ElasticVectorEnv(
+            task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture
+        )
 
     def register(self) -> None:
         """Make the id known to Gymnasium; a second time changes nothing."""
         if self.id not in gymnasium.registry:
-            gymnasium.register(id=self.id, entry_point=self.make, vector_entry_point=self.make_vector)
+            gymnasium.register(
+                id=self.id, entry_point=self.make, vector_entry_point=self.make_vector
+            )
 
     def _configured(self, arguments: dict[str, Any]) -> Any:
         known = inspect.signature(self.configure).parameters
@@ -85,7 +94,8 @@ def require_models(**arguments: tuple[Any, type[Any]]) -> None:
     for name, (given, model) in arguments.items():
         if not isinstance(given, dict | model | None):
             raise ConfigurationError(
-                f"{name} must be a {model.__name__} or a mapping of its parameters, got {shown(given)}"
+                f"{name} must be a {model.__name__} or a mapping of its parameters, got"
+                f" {shown(given)}"
             )
 
 
@@ -100,9 +110,10 @@ def require_memory(name: str, worlds: int, world_bytes: int) -> None:
     Raises:
         ConfigurationError: They do not fit.
     """
-    needed, there = int(worlds) * world_bytes, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    needed = int(worlds) * world_bytes
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > there:
         raise ConfigurationError(
-            f"{shown(worlds)} worlds take about {shown(needed // 10**9)} GB of memory, this computer has "
-            f"{there / 1e9:.1f} GB; set {name} to at most {there // world_bytes}"
+            f"{shown(worlds)} worlds take about {shown(needed // 10**9)} GB of memory, this"
+            f" computer has {there / 1e9:.1f} GB; set {name} to at most {there // world_bytes}"
         )

@@ -2,7 +2,8 @@
 1. Compensate a joint
 =====================
 
-One joint with an elastic gear carries a pendulum. We play a slow sine three times, and look at the link.
+One joint with an elastic gear carries a pendulum. We play a slow sine three times, and look at the
+link.
 """
 
 import gymnasium
@@ -15,14 +16,19 @@ import elastic_env  # noqa: F401  registers the environments
 env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal", reference="sine")
 
 # %%
-# A policy gets an observation and returns a command offset in rad. ``uncompensated`` commands the reference.
-# ``input`` adds the deflection under gravity (Eq. 9). ``dynamic`` adds that under the full joint torque.
+# A policy gets an observation and returns a command offset in rad. ``uncompensated`` commands the
+# reference.
+# ``input`` adds the deflection under gravity (Eq. 9). ``dynamic`` adds that under the full joint
+# torque.
 
 
 def play(name: str) -> dict:
     """Link error [rad] of every step, and the metrics of the episode."""
     policy = baselines.make(name, env)
-    (observation, info), state, done, errors = env.reset(seed=0), None, False, []
+    observation, info = env.reset(seed=0)
+    state = None
+    done = False
+    errors = []
     while not done:
         action, state = policy.predict(observation, state)
         observation, _, terminated, truncated, info = env.step(action)
@@ -36,7 +42,8 @@ for name, result in results.items():
     print(f"{name:13} {1e3 * result['link_error_rms_rad']:5.2f} mrad rms")
 
 # %%
-# Gravity compensation removes the large slow error. The rest is friction: it changes sign where the joint turns round.
+# Gravity compensation removes the large slow error. The rest is friction: it changes sign where the
+# joint turns round.
 
 fig, ax = plt.subplots(figsize=(7, 3.2))
 for name, result in results.items():

@@ -2,8 +2,8 @@
 2. Make a walker stand up straight
 ==================================
 
-A humanoid of 57 kg walks in place on twelve elastic joints. Without compensation its pelvis tilts towards the leg in
-the air.
+A humanoid of 57 kg walks in place on twelve elastic joints. Without compensation its pelvis tilts
+towards the leg in the air.
 
 The first walk on a computer compiles for some ten seconds.
 """
@@ -21,7 +21,10 @@ env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=3.0, num_steps=2,
 def walk(name: str) -> dict:
     """Roll of the pelvis [rad] at every step, and the metrics of the walk."""
     policy = baselines.make(name, env)
-    (observation, info), state, done, roll = env.reset(seed=0), None, False, []
+    observation, info = env.reset(seed=0)
+    state = None
+    done = False
+    roll = []
     while not done:
         action, state = policy.predict(observation, state)
         observation, _, terminated, truncated, info = env.step(action)
@@ -31,8 +34,10 @@ def walk(name: str) -> dict:
 
 
 # %%
-# ``input_output`` is the paper's method: Eq. 9 on the command, and Eq. 12 on the encoders that the feedback reads.
-# ``adaptive_posture`` also estimates the stiffness while it walks, and feeds the IMU back to the hips.
+# ``input_output`` is the paper's method: Eq. 9 on the command, and Eq. 12 on the encoders that the
+# feedback reads.
+# ``adaptive_posture`` also estimates the stiffness while it walks, and feeds the IMU back to the
+# hips.
 
 walks = {name: walk(name) for name in ("uncompensated", "input_output", "adaptive_posture")}
 for name, metrics in walks.items():
@@ -48,4 +53,7 @@ ax.set(xlabel="time [s]", ylabel="roll of the pelvis [mrad]")
 ax.legend()
 fig.tight_layout()
 
-assert walks["input_output"]["pelvis_error_rms_rad"] < walks["uncompensated"]["pelvis_error_rms_rad"] / 5
+assert (
+    walks["input_output"]["pelvis_error_rms_rad"]
+    < walks["uncompensated"]["pelvis_error_rms_rad"] / 5
+)

@@ -7,7 +7,8 @@ Observations are ``(num_worlds, m)``: take columns as ``observation[..., k]``.
 """
 
 # %%
-# The function ``make`` gets the environment, and returns the policy. Its keyword arguments are options.
+# The function ``make`` gets the environment, and returns the policy. Its keyword arguments are
+# options.
 
 import subprocess
 import sys
@@ -19,8 +20,11 @@ def elastic(*words: str) -> int:
     """Run `elastic WORDS` as in a terminal, and show what it prints; its exit code."""
     done = subprocess.run(
         [sys.executable, "-m", "train.commands.entry", *words],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     print(done.stdout)
     return done.returncode
 
@@ -54,7 +58,8 @@ own = ["--policy", f"{folder}/mine.py:make", "--output", str(folder / "alone")]
 assert elastic("evaluate", "--env", "walker", *own, "--reference", "3", "--scenario", "soft") == 0
 
 # %%
-# The leaderboard is a comparison. This copy of ``configs/leaderboard.yaml`` is small: two scenarios, one episode each.
+# The leaderboard is a comparison. This copy of ``configs/leaderboard.yaml`` is small: two
+# scenarios, one episode each.
 
 (folder / "leaderboard.yaml").write_text(f"""
 name: small_leaderboard
@@ -71,8 +76,11 @@ assert elastic("compare", str(folder / "leaderboard.yaml"), "--output", str(fold
 print((folder / "board" / "leaderboard.md").read_text())
 
 # %%
-# Less than the whole offset is worse in ``nominal`` and in ``soft``. Is a share above one better in ``soft``? Try it.
+# Less than the whole offset is worse in ``nominal`` and in ``soft``. Is a share above one better in
+# ``soft``? Try it.
 #
 # To compensate more or less of the deflection alone, assume another stiffness:
-# ``baselines.make("input_output", env, stiffness_scale=0.8)``. The page on commands has a policy with memory, and the
-# paper's compensator around a policy of your own. The page on the leaderboard says how to submit a policy.
+# ``baselines.make("input_output", env, stiffness_scale=0.8)``. The page on commands has a policy
+# with memory, and the
+# paper's compensator around a policy of your own. The page on the leaderboard says how to submit a
+# policy.

@@ -2,8 +2,9 @@
 4. Train a residual, and read the report
 ========================================
 
-A residual adds a learned correction to a compensator. A minute of training shows the way. It does not show
-what learning is worth. That takes five training seeds and more decisions, see ``configs/train_testbed.yaml``.
+A residual adds a learned correction to a compensator. A minute of training shows the way. It does
+not show what learning is worth. That takes five training seeds and more decisions, see
+``configs/train_testbed.yaml``.
 """
 
 import subprocess
@@ -16,8 +17,11 @@ def elastic(*words: str) -> int:
     """Run `elastic WORDS` as in a terminal, and show what it prints; its exit code."""
     done = subprocess.run(
         [sys.executable, "-m", "train.commands.entry", *words],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     print(done.stdout)
     return done.returncode
 
@@ -41,7 +45,8 @@ seeds: [0]
 assert elastic("train", str(folder / "train.yaml"), "--output", str(folder / "run")) == 0
 
 # %%
-# The comparison plays the residual and its base on the same episodes, with seeds that training never used.
+# The comparison plays the residual and its base on the same episodes, with seeds that training
+# never used.
 
 (folder / "compare.yaml").write_text(f"""
 name: small
@@ -53,7 +58,8 @@ episodes: 2
 assert elastic("compare", str(folder / "compare.yaml"), "--output", str(folder / "comparison")) == 0
 
 # %%
-# ``report.html`` opens without a network. ``summary.md`` has the same sentences. With one training seed they say that
+# ``report.html`` opens without a network. ``summary.md`` has the same sentences. With one training
+# seed they say that
 # nothing is judged.
 
 assert (folder / "comparison" / "report.html").is_file()

@@ -2,7 +2,8 @@
 7. Guard your figures in CI
 ===========================
 
-``elastic bench`` plays short rollouts. It ends with exit code 1 where a figure got worse than the file accepts.
+``elastic bench`` plays short rollouts. It ends with exit code 1 where a figure got worse than the
+file accepts.
 """
 
 import re
@@ -16,8 +17,11 @@ def elastic(*words: str) -> int:
     """Run `elastic WORDS` as in a terminal, and show what it prints; its exit code."""
     done = subprocess.run(
         [sys.executable, "-m", "train.commands.entry", *words],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
     print(done.stdout)
     return done.returncode
 
@@ -28,7 +32,7 @@ cases.write_text("""
 cases:
 - {env: testbed, policy: input, reference: {kind: sine, duration_s: 4.0}, figures: {link_error_rms_rad: 0.1}}
 - {env: testbed, policy: dynamic, reference: {kind: sine, duration_s: 4.0}, figures: {link_error_rms_rad: 0.1}}
-""")
+""")  # noqa: E501
 
 # %%
 # Accept the figures of today. This writes them into the file.

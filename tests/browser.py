@@ -1,4 +1,5 @@
-"""Open a page in headless Chromium: what it draws, and what its console says. CHROMIUM may name the program.
+"""Open a page in headless Chromium: what it draws, and what its console says. CHROMIUM may name the
+program.
 
 python -m tests.browser URL PICTURE.png [WIDTH [HEIGHT [light|dark [SECONDS]]]]
 """
@@ -20,9 +21,16 @@ from urllib.request import urlopen
 from websockets.sync.client import connect
 
 _FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader",
-    "--use-angle=swiftshader", "--remote-debugging-port=0", "--no-first-run", "--disable-extensions", "--mute-audio",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--enable-unsafe-swiftshader",
+    "--use-angle=swiftshader",
+    "--remote-debugging-port=0",
+    "--no-first-run",
+    "--disable-extensions",
+    "--mute-audio",
+)
 _START_S = 240.0
 
 
@@ -43,7 +51,9 @@ class Visit:
     overflow: int
 
 
-def visit(url: str, width: int = 1200, height: int = 800, scheme: str = "light", seconds: float = 3.0) -> Visit:
+def visit(
+    url: str, width: int = 1200, height: int = 800, scheme: str = "light", seconds: float = 3.0
+) -> Visit:
     """Open a page, wait, and look.
 
     Args:
@@ -58,10 +68,13 @@ def visit(url: str, width: int = 1200, height: int = 800, scheme: str = "light",
     """
     program = os.environ.get("CHROMIUM") or shutil.which("chromium")
     if program is None:
-        raise FileNotFoundError("no chromium on the path; install it, or name it in the variable CHROMIUM")
+        raise FileNotFoundError(
+            "no chromium on the path; install it, or name it in the variable CHROMIUM"
+        )
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         process = subprocess.Popen(
-            [program, *_FLAGS, f"--user-data-dir={folder}", "about:blank"], stderr=subprocess.DEVNULL
+            [program, *_FLAGS, f"--user-data-dir={folder}", "about:blank"],
+            stderr=subprocess.DEVNULL,
         )
         try:
             return _visit(_target(Path(folder)), url, (width, height), scheme, seconds)
@@ -72,7 +85,8 @@ def visit(url: str, width: int = 1200, height: int = 800, scheme: str = "light",
 
 def _target(folder: Path) -> str:
     """Address of the debugger of the first page."""
-    end, port = time.monotonic() + _START_S, folder / "DevToolsActivePort"
+    end = time.monotonic() + _START_S
+    port = folder / "DevToolsActivePort"
     while not port.is_file() or not port.read_text().strip():
         if time.monotonic() > end:
             raise TimeoutError(f"Chromium did not start within {_START_S:g} s")
@@ -110,21 +124,36 @@ def _visit(debugger: str, url: str, size: tuple[int, int], scheme: str, seconds:
         for domain in ("Runtime", "Network", "Page", "Log"):
             ask(f"{domain}.enable")
         width, height = size
-        ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500)
-        ask("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 500,
+        )
+        ask(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
         if said := ask("Page.navigate", url=url).get("errorText"):
             errors.append(f"{url}: {said}")
         hear(None, time.monotonic() + seconds)
-        wider = "Math.max(0, document.documentElement.scrollWidth - document.documentElement.clientWidth)"
+        wider = (
+            "Math.max(0, document.documentElement.scrollWidth -"
+            " document.documentElement.clientWidth)"
+        )
         overflow = ask("Runtime.evaluate", expression=wider)["result"]["value"]
         picture = base64.b64decode(ask("Page.captureScreenshot", format="png")["data"])
     return Visit(picture, errors, requests, int(overflow))
 
 
 def _note(said: dict[str, Any], errors: list[str], requests: list[str]) -> None:
-    method, about = said.get("method"), said.get("params", {})
+    method = said.get("method")
+    about = said.get("params", {})
     if method == "Runtime.exceptionThrown":
-        errors.append(about["exceptionDetails"].get("exception", {}).get("description", "exception"))
+        errors.append(
+            about["exceptionDetails"].get("exception", {}).get("description", "exception")
+        )
     elif method == "Runtime.consoleAPICalled" and about["type"] in {"error", "assert"}:
         errors.append(" ".join(str(argument.get("value", "")) for argument in about["args"]))
     elif method == "Log.entryAdded" and about["entry"]["level"] == "error":
@@ -140,7 +169,10 @@ def main(arguments: Sequence[str]) -> None:
     width, height, scheme, seconds = [*others, *defaults[len(others) :]]
     found = visit(url, int(width), int(height), scheme, float(seconds))
     Path(picture).write_bytes(found.picture)
-    print(f"wrote {picture}; {found.overflow} pixels too wide; {len(found.requests)} requests; errors: {found.errors}")
+    print(
+        f"wrote {picture}; {found.overflow} pixels too wide; {len(found.requests)} requests;"
+        f" errors: {found.errors}"
+    )
 
 
 if __name__ == "__main__":

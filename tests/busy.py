@@ -4,6 +4,12 @@ import pytest
 
 once_more = pytest.mark.flaky(
     reruns=2,
-    only_rerun=["no usable reply", "does not answer in 3 tries", "not confirmed by servo", "no command for"],
+    only_rerun=[
+        "no usable reply",
+        "does not answer in 3 tries",
+        "not confirmed by servo",
+        "no command for",
+    ],
 )
-"""At times it lets no process run for 40 ms or more: replies and commands are missing, which rightly is an error."""
+"""At times it lets no process run for 40 ms or more: replies and commands are missing, which
+rightly is an error."""

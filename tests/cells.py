@@ -1,4 +1,5 @@
-"""Cells of comparisons without physics: episodes with given figures, and training seeds of residuals as folders."""
+"""Cells of comparisons without physics: episodes with given figures, and training seeds of
+residuals as folders."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,11 @@ METRIC = "pelvis_error_rms_rad"
 def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, Any]]:
     """Episodes with one metric; None is a fall, with a figure that must not count."""
     return [
-        {"seed": first + i, "termination": "" if value is not None else "fell", METRIC: 9.0 if value is None else value}
+        {
+            "seed": first + i,
+            "termination": "" if value is not None else "fell",
+            METRIC: 9.0 if value is None else value,
+        }
         for i, value in enumerate(values)
     ]
 
@@ -38,30 +43,45 @@ def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:
         **values.pop("config", {}),
     }
     training = {"config": config} if seed is None else {"config": config, "seed": seed}
-    description = ResidualDescription(**{"robot": "walker", "base": "input_output", "training": training, **values})
+    description = ResidualDescription(
+        **{"robot": "walker", "base": "input_output", "training": training, **values}
+    )
     folder.mkdir(parents=True)
     (folder / "residual.json").write_text(description.model_dump_json())
     return folder
 
 
-def cell(title: str, values: dict[str, Sequence[float | None]], scenario: str, member: Member | None = None,
-         reference: Any = 3, time: int = 400) -> Evaluation:  # fmt: skip
-    """A cell of the walker without physics: metrics, and a trace that any signal may be drawn from."""
+def cell(
+    title: str,
+    values: dict[str, Sequence[float | None]],
+    scenario: str,
+    member: Member | None = None,
+    reference: Any = 3,
+    time: int = 400,
+) -> Evaluation:
+    """A cell of the walker without physics: metrics, and a trace that any signal may be drawn
+    from."""
     spec = PolicySpec(name="zero" if member is None else f"residual:{member.folder}", label=title)
-    condition = Condition(env="walker", policy=spec, member=member, scenario=scenario, reference=reference)
+    condition = Condition(
+        env="walker", policy=spec, member=member, scenario=scenario, reference=reference
+    )
     episodes = [
         {**record, "pelvis_error_rms_rad": value, "zmp_deviation_rms_m": value, "policy": title}
-        for key in values for record, value in zip(records(values[key]), values[key], strict=True)
-    ]  # fmt: skip
+        for key in values
+        for record, value in zip(records(values[key]), values[key], strict=True)
+    ]
     t = 0.004 * np.arange(time)
     trace = {name: np.sin(t) for name in condition.environment.traced} | {
-        "time_s": t, "single_support": (t > 0.5).astype(float),
-    }  # fmt: skip
+        "time_s": t,
+        "single_support": (t > 0.5).astype(float),
+    }
     trace["zmp_y"] = np.where(t < 0.1, np.nan, trace["zmp_y"])
     return Evaluation(condition, episodes, trace)
 
 
-def family(values: Sequence[Sequence[float | None]], scenario: str = "soft", **more: Any) -> list[Evaluation]:
+def family(
+    values: Sequence[Sequence[float | None]], scenario: str = "soft", **more: Any
+) -> list[Evaluation]:
     """Cells of the training seeds of a residual, whose folders are made if they are not there."""
     cells = []
     for seed, own in enumerate(values):

@@ -1,11 +1,14 @@
-"""What the cells of a comparison cost beyond their own time, and what a kill costs: `python -m tests.cluster_trials`.
+"""What the cells of a comparison cost beyond their own time, and what a kill costs: `python -m
+tests.cluster_trials`.
 
-    python -m tests.cluster_trials empty            # empty cells, on this machine and on dask with one worker
-    python -m tests.cluster_trials long             # cells of 2 s on both, in turn
-    python -m tests.cluster_trials workers          # kill -9 of a worker of dask, at a random moment of a comparison
-    python -m tests.cluster_trials program          # kill -9 of the program itself, then --resume
+    python -m tests.cluster_trials empty            # empty cells, on this machine and on dask with
+    one worker python -m tests.cluster_trials long             # cells of 2 s on both, in turn
+    python -m tests.cluster_trials workers          # kill -9 of a worker of dask, at a random
+    moment of a comparison python -m tests.cluster_trials program          # kill -9 of the program
+    itself, then --resume
 
-The last two compare the tables with those of a comparison that nobody disturbed, and count how often each cell began.
+The last two compare the tables with those of a comparison that nobody disturbed, and count how
+often each cell began.
 """
 
 import os
@@ -37,10 +40,12 @@ from train.report.summary import write_episodes
 from train.workers.calls import Watch, run_calls
 from train.workers.executors import Executors
 
-ROOT, PROGRAMS = Path(__file__).parents[1], Path(sys.executable).parent
+ROOT = Path(__file__).parents[1]
+PROGRAMS = Path(sys.executable).parent
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-CELLS, TABLES = 12, ("episodes.csv", "statistics.csv")
+CELLS = 12
+TABLES = ("episodes.csv", "statistics.csv")
 
 COUNTED = '''
 import time
@@ -65,7 +70,8 @@ class Counted:
 '''
 """A policy whose cells can be told apart, and last about half a second.
 
-It is given a folder. A file that options name belongs to the key of a cell, and this one changes with every cell.
+It is given a folder. A file that options name belongs to the key of a cell, and this one changes
+with every cell.
 """
 
 
@@ -99,13 +105,25 @@ def _wait_for_port(port: int) -> None:
 
 
 @contextmanager
-def dask_cluster(workers: int, *options: str) -> Iterator[tuple[Executors, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and workers of dask, real processes over TCP; executors on it, and what keeps workers going."""
+def dask_cluster(
+    workers: int, *options: str
+) -> Iterator[tuple[Executors, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and workers of dask, real processes over TCP; executors on it, and what keeps
+    workers going."""
     port = free_port()
     known = {**os.environ, "PYTHONPATH": str(ROOT)}  # the functions of the tests
-    at, dask = f"127.0.0.1:{port}", str(PROGRAMS / "dask")
+    at = f"127.0.0.1:{port}"
+    dask = str(PROGRAMS / "dask")
     with tempfile.TemporaryDirectory() as own:
-        scheduler = [dask, "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        scheduler = [
+            dask,
+            "scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            str(port),
+            "--no-dashboard",
+        ]
         worker = [
             dask,
             "worker",
@@ -128,14 +146,18 @@ def dask_cluster(workers: int, *options: str) -> Iterator[tuple[Executors, list[
                 process.wait()
 
 
-def seconds_of(function: Callable[..., Any], given: list[tuple[Any, ...]], executors: Executors) -> float:
+def seconds_of(
+    function: Callable[..., Any], given: list[tuple[Any, ...]], executors: Executors
+) -> float:
     """How long calls take, once a first one has had the worker load what it needs."""
     with tempfile.TemporaryDirectory() as own, executors.open(len(given), Path(own)) as pool:
         run_calls(empty, [(0,)], pool, Watch())
         begin = time.monotonic()
         outcomes = run_calls(function, given, pool, Watch())
         end = time.monotonic()
-    assert [outcome.value for outcome in outcomes if outcome is not None] == [first for first, *_ in given]
+    assert [outcome.value for outcome in outcomes if outcome is not None] == [
+        first for first, *_ in given
+    ]
     return end - begin
 
 
@@ -149,7 +171,10 @@ def overhead(function: Callable[..., Any], given: list[tuple[Any, ...]], rounds:
     local, dask = (statistics.median(pair[n] for pair in pairs) for n in (0, 1))
     ratio = statistics.median(dask / local for local, dask in pairs)
     each = [1e3 * whole / len(given) for whole in (local, dask)]
-    print(f"{len(given)} calls: local {each[0]:.2f} ms, dask {each[1]:.2f} ms each; median of dask/local {ratio:.3f}")
+    print(
+        f"{len(given)} calls: local {each[0]:.2f} ms, dask {each[1]:.2f} ms each; median of"
+        f" dask/local {ratio:.3f}"
+    )
 
 
 @dataclass(frozen=True)
@@ -165,14 +190,20 @@ class Comparison:
     def conditions(self) -> list[Condition]:
         """Its cells."""
         policies = [
-            PolicySpec(name="counted.py:Counted", label=f"p{n}", options={"cell": n, "folder": str(self.folder)})
+            PolicySpec(
+                name="counted.py:Counted",
+                label=f"p{n}",
+                options={"cell": n, "folder": str(self.folder)},
+            )
             for n in range(CELLS)
         ]
         return [Condition(policy=policy, reference=SINE, episodes=2) for policy in policies]
 
     def play(self, executors: Executors) -> None:
         """As `elastic compare` does: what is not kept is played, then tables are written."""
-        found = run_conditions(self.conditions(), Console(quiet=True), executors, Store(self.folder / "cells"))
+        found = run_conditions(
+            self.conditions(), Console(quiet=True), executors, Store(self.folder / "cells")
+        )
         write_episodes(found, self.folder / TABLES[0])
         write_statistics(changes(found, {}), self.folder / TABLES[1])
 
@@ -202,7 +233,9 @@ class Comparison:
     def tables(self) -> list[bytes] | None:
         """The tables; None where they are missing."""
         files = [self.folder / name for name in TABLES]
-        return [file.read_bytes() for file in files] if all(file.is_file() for file in files) else None
+        return (
+            [file.read_bytes() for file in files] if all(file.is_file() for file in files) else None
+        )
 
 
 def _wait_for_begin(played: Comparison) -> None:
@@ -226,14 +259,16 @@ def _kill_worker(nanny: subprocess.Popen[bytes]) -> bool:
 
 
 def _undisturbed(executors: Executors) -> tuple[list[bytes], float]:
-    """Tables of a comparison that nobody disturbs, and how long its cells take once the workers have loaded all."""
+    """Tables of a comparison that nobody disturbs, and how long its cells take once the workers
+    have loaded all."""
     _ended(Comparison(Path.cwd() / "first").begin(executors))
     whole = Comparison(Path.cwd() / "whole")
     process = whole.begin(executors)
     _wait_for_begin(whole)
     begin = time.monotonic()
     code = _ended(process)
-    lasted, tables = time.monotonic() - begin, whole.tables()
+    lasted = time.monotonic() - begin
+    tables = whole.tables()
     assert code == 0, "the undisturbed comparison failed"
     assert tables is not None
     assert sorted(whole.begun()) == list(range(CELLS))
@@ -251,7 +286,9 @@ def _own_folder() -> Iterator[None]:
 
 def workers(times: int, seed: int) -> None:
     """Kill a worker at a random moment of a comparison, and look at what comes of it."""
-    chance, same, again = random.Random(seed), 0, list[int]()
+    chance = random.Random(seed)
+    same = 0
+    again = list[int]()
     with _own_folder(), dask_cluster(2) as (executors, nannies):
         tables, lasted = _undisturbed(executors)
         for number in range(times):
@@ -260,20 +297,26 @@ def workers(times: int, seed: int) -> None:
             _wait_for_begin(played)
             moment = chance.uniform(0.0, lasted)
             time.sleep(moment)
-            finished, killed = played.finished(), _kill_worker(chance.choice(nannies))
+            finished = played.finished()
+            killed = _kill_worker(chance.choice(nannies))
             code = _ended(process)
             again.append(len(played.begun()) - CELLS)
             is_same = code == 0 and played.tables() == tables
             same += is_same
             print(
-                f"{number}: killed {killed} after {moment:.2f} s, {_said(finished, code, is_same, again)}", flush=True
+                f"{number}: killed {killed} after {moment:.2f} s,"
+                f" {_said(finished, code, is_same, again)}",
+                flush=True,
             )
     print(f"kill -9 of a worker: {_sum(same, again)}; at most 1 is right")
 
 
 def program(times: int, seed: int) -> None:
     """Kill the program itself at a random moment, resume it, and look at what comes of it."""
-    chance, same, again, wasted = random.Random(seed), 0, list[int](), 0
+    chance = random.Random(seed)
+    same = 0
+    again = list[int]()
+    wasted = 0
     with _own_folder(), dask_cluster(2) as (executors, _):
         tables, lasted = _undisturbed(executors)
         for number in range(times):
@@ -293,17 +336,28 @@ def program(times: int, seed: int) -> None:
             wasted += begun - before - (CELLS - finished)
             is_same = code == 0 and played.tables() == tables
             same += is_same
-            print(f"{number}: killed after {moment:.2f} s, {_said(finished, code, is_same, again)}", flush=True)
-    print(f"kill -9 of the program: {_sum(same, again)}; finished cells that were played again: {wasted}")
+            print(
+                f"{number}: killed after {moment:.2f} s, {_said(finished, code, is_same, again)}",
+                flush=True,
+            )
+    print(
+        f"kill -9 of the program: {_sum(same, again)}; finished cells that were played again:"
+        f" {wasted}"
+    )
 
 
 def _said(finished: int, code: int, is_same: bool, again: list[int]) -> str:
-    return f"{finished} cells finished; code {code}, same tables {is_same}, {again[-1]} played again"
+    return (
+        f"{finished} cells finished; code {code}, same tables {is_same}, {again[-1]} played again"
+    )
 
 
 def _sum(same: int, again: list[int]) -> str:
     counts = dict(sorted(Counter(again).items()))
-    return f"{same} of {len(again)} complete and identical; trials by the number of cells that began again: {counts}"
+    return (
+        f"{same} of {len(again)} complete and identical; trials by the number of cells that began"
+        f" again: {counts}"
+    )
 
 
 def main(

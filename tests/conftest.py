@@ -1,4 +1,5 @@
-"""Settings of the whole suite: pictures without a display; hypothesis repeats itself and leaves no files behind."""
+"""Settings of the whole suite: pictures without a display; hypothesis repeats itself and leaves
+no files behind."""
 
 import signal
 
@@ -10,5 +11,7 @@ prefer_egl()
 # a shell's background jobs ignore Ctrl-C, and so would the programs that tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile("repeatable", derandomize=True, database=None, deadline=None, max_examples=60)
+settings.register_profile(
+    "repeatable", derandomize=True, database=None, deadline=None, max_examples=60
+)
 settings.load_profile("repeatable")

@@ -1,12 +1,14 @@
 """Digests of what environments and policies produce, to notice a changed bit.
 
-`python -m tests.fingerprints check` plays all cases, of which the tests play half. `python -m tests.fingerprints write`
-writes fingerprints.json anew. Do that only where results are meant to change. `python -m tests.fingerprints add TEXT`
-adds the new cases whose names hold a text, and leaves the others as they are.
+`python -m tests.fingerprints check` plays all cases, of which the tests play half. `python -m
+tests.fingerprints write` writes fingerprints.json anew. Do that only where results are meant to
+change. `python -m tests.fingerprints add TEXT` adds the new cases whose names hold a text, and
+leaves the others as they are.
 
-Bits depend on the processor too: BLAS and NumPy choose their instructions by it. `numerics` is a digest of a small
-calculation without this project. Where it differs from the recorded one, `Fingerprint.levels` are compared instead. A
-case that was added on another processor than the others has a digest of its own.
+Bits depend on the processor too: BLAS and NumPy choose their instructions by it. `numerics` is a
+digest of a small calculation without this project. Where it differs from the recorded one,
+`Fingerprint.levels` are compared instead. A case that was added on another processor than the
+others has a digest of its own.
 """
 
 import hashlib
@@ -28,14 +30,19 @@ from baselines.policies import sensors_needed
 from elastic_env.world.scenario import scenario_names
 
 RECORDED = Path(__file__).with_name("fingerprints.json")
-STEPS, WORLDS = 300, 7
+STEPS = 300
+WORLDS = 7
 POLICIES = {"testbed": ON_JOINTS, "walker": ON_THE_WALKER}
-RESIDUALS = {"testbed": ("testbed/seed_0",), "walker": ("walker_3s/seed_0", "walker_1600ms_posture/seed_0")}
+RESIDUALS = {
+    "testbed": ("testbed/seed_0",),
+    "walker": ("walker_3s/seed_0", "walker_1600ms_posture/seed_0"),
+}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A rollout: environment with arguments, policy, scenario, number of worlds (1: the scalar environment)."""
+    """A rollout: environment with arguments, policy, scenario, number of worlds (1: the scalar
+    environment)."""
 
     env: str
     policy: str
@@ -63,19 +70,28 @@ def cases() -> list[Case]:
     """Every scenario with one policy, every policy in one scenario, and whole short episodes."""
     found = []
     for env, own in (("testbed", "input"), ("walker", "input_output")):
-        baselines_of = [name for name, known in POLICIES[env].items() if known.track is not Track.WALKS]
+        baselines_of = [
+            name for name, known in POLICIES[env].items() if known.track is not Track.WALKS
+        ]
         policies = [*baselines_of, *(f"residual:{name}" for name in RESIDUALS[env])]
         pairs = [(own, scenario) for scenario in scenario_names(walks=env == "walker")]
         pairs += [(policy, "nominal") for policy in policies if policy != own]
-        found += [Case(env, policy, scenario, worlds) for policy, scenario in pairs for worlds in (1, WORLDS)]
-    sine, walk = '{"reference": {"kind": "sine", "duration_s": 1.0}}', '{"step_period": 1.1, "num_steps": 1}'
+        found += [
+            Case(env, policy, scenario, worlds)
+            for policy, scenario in pairs
+            for worlds in (1, WORLDS)
+        ]
+    sine = '{"reference": {"kind": "sine", "duration_s": 1.0}}'
+    walk = '{"step_period": 1.1, "num_steps": 1}'
     whole = [
         ("testbed", "dynamic", "sensor", sine),
         ("walker", "zero", "ideal", walk),
         ("walker", "input", "soft", walk),
     ]
     return found + [
-        Case(env, policy, scenario, n, arguments) for env, policy, scenario, arguments in whole for n in (1, WORLDS)
+        Case(env, policy, scenario, n, arguments)
+        for env, policy, scenario, arguments in whole
+        for n in (1, WORLDS)
     ]
 
 
@@ -93,18 +109,28 @@ def _made(case: Case) -> Any:
 
 
 def _rollout(case: Case) -> Iterator[dict[str, Any]]:
-    """Everything that comes out of the environment, step by step, to the end of the episode or STEPS."""
+    """Everything that comes out of the environment, step by step, to the end of the episode or
+    STEPS."""
     env = _made(case)
     policy = baselines.make(case.policy, env)
     observation, info = env.reset(seed=7)
     yield {"observation": observation, **info}
-    state, start = None, np.ones(observation.shape[:-1], dtype=np.bool_)
+    state = None
+    start = np.ones(observation.shape[:-1], dtype=np.bool_)
     for _ in range(STEPS if case.arguments == "{}" else 100_000):
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        action, state = policy.predict(
+            observation, state=state, episode_start=start, deterministic=True
+        )
         observation, reward, terminated, truncated, info = env.step(action)
         start = np.zeros_like(start)
-        yield {"observation": observation, "action": action, "reward": reward, "terminated": terminated,
-               "truncated": truncated, **info}  # fmt: skip
+        yield {
+            "observation": observation,
+            "action": action,
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            **info,
+        }
         if np.any(terminated) or np.any(truncated):
             break
     env.close()
@@ -120,30 +146,43 @@ def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]
 
 def fingerprint(case: Case) -> Fingerprint:
     """Play a case."""
-    digest, levels = hashlib.sha256(), dict[str, float]()
+    digest = hashlib.sha256()
+    levels = dict[str, float]()
     for number, step in enumerate(_rollout(case)):
         for key, value in _flat(step):
             digest.update(f"{number}.{key}:{value.dtype}{value.shape}".encode() + value.tobytes())
-            if key in ("observation", "reward", "zmp_deviation", "link_error") or key.startswith("episode_metrics."):
-                levels[key] = levels.get(key, 0.0) + float(np.nansum(np.abs(value.astype(np.float64))))
+            if key in ("observation", "reward", "zmp_deviation", "link_error") or key.startswith(
+                "episode_metrics."
+            ):
+                levels[key] = levels.get(key, 0.0) + float(
+                    np.nansum(np.abs(value.astype(np.float64)))
+                )
     return Fingerprint(digest.hexdigest(), levels)
 
 
 def numerics() -> str:
-    """Digest of linear algebra, elementary functions and physics that this project has no part in."""
+    """Digest of linear algebra, elementary functions and physics that this project has no part
+    in."""
     a = np.random.default_rng(0).normal(size=(64, 64))
-    spec = "<mujoco><worldbody><body><joint axis='0 1 0'/><geom size='.1' pos='1 0 0'/></body></worldbody></mujoco>"
+    spec = (
+        "<mujoco><worldbody><body><joint axis='0 1 0'/><geom size='.1' pos='1 0"
+        " 0'/></body></worldbody></mujoco>"
+    )
     model = mujoco.MjModel.from_xml_string(spec)
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 100)
     parts = (a @ a, np.linalg.solve(a, a[0]), a @ a[0], np.sin(a), np.exp(a), np.tanh(a), data.qpos)
-    return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]
+    return hashlib.sha256(
+        b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    ).hexdigest()[:16]
 
 
 def recorded() -> tuple[str, dict[str, Fingerprint]]:
     """Numerics of the recording processor, and the fingerprints by the names of their cases."""
     content = json.loads(RECORDED.read_text())
-    return content["numerics"], {name: Fingerprint(**values) for name, values in content["cases"].items()}
+    return content["numerics"], {
+        name: Fingerprint(**values) for name, values in content["cases"].items()
+    }
 
 
 def _as_recorded(found: Fingerprint) -> dict[str, Any]:
@@ -158,7 +197,8 @@ def write() -> None:
 
 def add(text: str) -> list[str]:
     """Record the cases that are new and whose names hold a text; their names."""
-    content, here = json.loads(RECORDED.read_text()), numerics()
+    content = json.loads(RECORDED.read_text())
+    here = numerics()
     added = [case for case in cases() if text in case.name and case.name not in content["cases"]]
     for case in added:
         found = replace(fingerprint(case), numerics="" if here == content["numerics"] else here)

@@ -1,4 +1,5 @@
-"""Small models in the manner of public robots, none of them ours: what the transform must cope with."""
+"""Small models in the manner of public robots, none of them ours: what the transform must cope
+with."""
 
 QUADRUPED = """
 <mujoco model="quadruped">
@@ -59,7 +60,8 @@ QUADRUPED = """
     <key time="2" qpos="0 0 0.7 0 1 0 0  0.1 -1.2 0 0.2 -1.5" qvel="1 2 3 4 5 6  7 8 9 10 11"/>
   </keyframe>
 </mujoco>"""
-"""Free base, nested default classes with everything that could leak, inherited ranges, an unnamed hinge, ref."""
+"""Free base, nested default classes with everything that could leak, inherited ranges, an
+unnamed hinge, ref."""
 
 ARM = """
 <mujoco model="arm">
@@ -111,7 +113,8 @@ ARM = """
       mpos="1 2 3" mquat="0 1 0 0"/>
   </keyframe>
 </mujoco>"""
-"""Fixed base in frames, three hinges on one body, activations, mimic equality, bounded masses, mocap."""
+"""Fixed base in frames, three hinges on one body, activations, mimic equality, bounded masses,
+mocap."""
 
 ROVER = """
 <mujoco model="rover">
@@ -147,7 +150,8 @@ ROVER = """
   </sensor>
   <worldbody><site name="box"/></worldbody>
 </mujoco>"""
-"""Free, slide and ball joints beside the hinges, wheels on velocity actuators without names, air and wind."""
+"""Free, slide and ball joints beside the hinges, wheels on velocity actuators without names, air
+and wind."""
 
 FOUR_BAR = """
 <mujoco model="four_bar">

@@ -1,4 +1,5 @@
-"""Kinematics and inertias of the robots of the gallery, so that tests need neither the package nor a network.
+"""Kinematics and inertias of the robots of the gallery, so that tests need neither the package nor
+a network.
 
 python -m tests.gallery_files       # writes tests/gallery anew from the installed package
 """
@@ -12,7 +13,10 @@ from elastic_env.robots.gallery import GALLERY, gallery_file
 FOLDER = Path(__file__).parent / "gallery"
 """What is here of the package's robots."""
 PACKAGED = [name for name, robot in GALLERY.items() if not robot.file.startswith("gymnasium")]
-_KEPT = {"link": ("inertial",), "joint": ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")}
+_KEPT = {
+    "link": ("inertial",),
+    "joint": ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic"),
+}
 
 
 def excerpt(path: Path) -> str:
@@ -31,7 +35,8 @@ def excerpt(path: Path) -> str:
 def main() -> None:
     """Write all of them, and the licences that lie beside them."""
     for name in PACKAGED:
-        source, file = gallery_file(name), FOLDER / GALLERY[name].file
+        source = gallery_file(name)
+        file = FOLDER / GALLERY[name].file
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(excerpt(source), encoding="utf-8")
         licence = source.parents[1] / "LICENSE"

@@ -1,6 +1,7 @@
 """Configurations and residual folders with mistakes in them, drawn from the shipped ones by a seed.
 
-python -m tests.mutations FIRST COUNT     plays cases in this process and prints what was neither taken nor refused
+python -m tests.mutations FIRST COUNT     plays cases in this process and prints what was neither
+taken nor refused
 """
 
 import copy
@@ -33,34 +34,173 @@ CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 RESIDUALS = sorted((ROOT / "baselines" / "trained").glob("*/seed_0"))
 
 NASTY: list[Any] = [
-    None, True, False, 0, -1, 1, 2, 5, 10**6, 10**9, 2**31, 2**63, 10**30, -(10**30), 0.5, -0.5, 1e-300, 1e300, 1e-9,
-    float("nan"), float("inf"), -float("inf"), "", " ", "x", "x" * 300, "../../x", "/", "a/b", "nul\x00byte", "\ud800",
-    "ärger€", "🙂", "2001-99-99", "2001-01-01", "1e3", "json:loads", "no_such:f", ":", "os:sep", "*", "[", "residual:",
-    "residual:*", "residual:/", "residual:x", "-", "+", "ideal+ideal", "soft+soft", "hold", "walker", "testbed", [], {},
-    [[]], [None], [0], [-1.5, 2], ["x"], [1, 2, 3], [0.5, 0.5, 0.5], {"x": 1}, {"kind": "sine"},
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    2,
+    5,
+    10**6,
+    10**9,
+    2**31,
+    2**63,
+    10**30,
+    -(10**30),
+    0.5,
+    -0.5,
+    1e-300,
+    1e300,
+    1e-9,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    "",
+    " ",
+    "x",
+    "x" * 300,
+    "../../x",
+    "/",
+    "a/b",
+    "nul\x00byte",
+    "\ud800",
+    "ärger€",
+    "🙂",
+    "2001-99-99",
+    "2001-01-01",
+    "1e3",
+    "json:loads",
+    "no_such:f",
+    ":",
+    "os:sep",
+    "*",
+    "[",
+    "residual:",
+    "residual:*",
+    "residual:/",
+    "residual:x",
+    "-",
+    "+",
+    "ideal+ideal",
+    "soft+soft",
+    "hold",
+    "walker",
+    "testbed",
+    [],
+    {},
+    [[]],
+    [None],
+    [0],
+    [-1.5, 2],
+    ["x"],
+    [1, 2, 3],
+    [0.5, 0.5, 0.5],
+    {"x": 1},
+    {"kind": "sine"},
     {"kind": "hold", "positions": 900},
-    {"kind": "steps", "moves": 1000}, {"step_period": 3, "num_steps": 10**6}, {"name": "x"}, {"": 0}, [[1, 2], [3]],
-    1e200, -1e9, "a b " * 2500, "'x" * 5000, ["x" * 10_000], {"x" * 10_000: 1}, {"device": "cuda"},
+    {"kind": "steps", "moves": 1000},
+    {"step_period": 3, "num_steps": 10**6},
+    {"name": "x"},
+    {"": 0},
+    [[1, 2], [3]],
+    1e200,
+    -1e9,
+    "a b " * 2500,
+    "'x" * 5000,
+    ["x" * 10_000],
+    {"x" * 10_000: 1},
+    {"device": "cuda"},
     {"log_std_init": 1e9},
-    [1] * 2000, {str(i): i for i in range(2000)}, "a\nb", "\u202e",
-]  # fmt: skip
+    [1] * 2000,
+    {str(i): i for i in range(2000)},
+    "a\nb",
+    "\u202e",
+]
 ADDED = [
-    b"\x00", b"[" * 5000, b"{a: " * 3000, b"&a [*a]", b"!!timestamp x", b"9" * 5000, b"\xff", b"? ", b"- ", b"*a",
-    b"<<: ", b"'", b"\t", b": ", b"1: 2\n", b"x: !!binary aGk=",
-]  # fmt: skip
+    b"\x00",
+    b"[" * 5000,
+    b"{a: " * 3000,
+    b"&a [*a]",
+    b"!!timestamp x",
+    b"9" * 5000,
+    b"\xff",
+    b"? ",
+    b"- ",
+    b"*a",
+    b"<<: ",
+    b"'",
+    b"\t",
+    b": ",
+    b"1: 2\n",
+    b"x: !!binary aGk=",
+]
 KEYS = [
-    "name", "env", "references", "reference", "scenarios", "policies", "options", "env_options", "joint", "stiffness",
-    "timestep_s", "gait", "robot", "reward", "algorithm", "algorithm_options", "policy_kwargs", "n_steps", "net_arch",
-    "worlds", "sweep", "values", "option", "groups", "seeds", "label", "level", "num_envs", "settings", "scale",
-    "learning_rate", "log_std_init", "device", "seed", "policy", "weights", "base", "ranges", "figures", "metric",
+    "name",
+    "env",
+    "references",
+    "reference",
+    "scenarios",
+    "policies",
+    "options",
+    "env_options",
+    "joint",
+    "stiffness",
+    "timestep_s",
+    "gait",
+    "robot",
+    "reward",
+    "algorithm",
+    "algorithm_options",
+    "policy_kwargs",
+    "n_steps",
+    "net_arch",
+    "worlds",
+    "sweep",
+    "values",
+    "option",
+    "groups",
+    "seeds",
+    "label",
+    "level",
+    "num_envs",
+    "settings",
+    "scale",
+    "learning_rate",
+    "log_std_init",
+    "device",
+    "seed",
+    "policy",
+    "weights",
+    "base",
+    "ranges",
+    "figures",
+    "metric",
     "map",
-    "history", "observe", "joints", "decision_period", "bank", "num_steps", "damping", "servo", "gains", "x", "<<", "",
-]  # fmt: skip
+    "history",
+    "observe",
+    "joints",
+    "decision_period",
+    "bank",
+    "num_steps",
+    "damping",
+    "servo",
+    "gains",
+    "x",
+    "<<",
+    "",
+]
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths of all values within a tree."""
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    items = (
+        tree.items()
+        if isinstance(tree, dict)
+        else enumerate(tree)
+        if isinstance(tree, list)
+        else ()
+    )
     return [found for key, value in items for found in [(*path, key), *places(value, (*path, key))]]
 
 
@@ -101,7 +241,8 @@ def change(tree: Any, draw: random.Random) -> Any:
 
 def damage(data: bytes, draw: random.Random) -> bytes:
     """Bytes with some of them flipped, cut, doubled or added."""
-    place, text = draw.randrange(len(data) + 1), bytearray(data)
+    place = draw.randrange(len(data) + 1)
+    text = bytearray(data)
     match draw.randrange(5):
         case 0:
             return data[:place]
@@ -120,7 +261,10 @@ def damage(data: bytes, draw: random.Random) -> bytes:
 def mutated_configuration(draw: random.Random, path: Path) -> Callable[[Path], None]:
     """Write a configuration with mistakes; what reads it, now and then what is not meant to."""
     source = draw.choice(CONFIGS)
-    meant = next((reader for name, reader in READERS.items() if source.name.startswith(name)), read_comparison)
+    meant = next(
+        (reader for name, reader in READERS.items() if source.name.startswith(name)),
+        read_comparison,
+    )
     _mutate(draw, source, path)
     return meant if draw.random() < 0.95 else draw.choice(list(READERS.values()))
 
@@ -139,7 +283,8 @@ def mutated_residual(draw: random.Random, folder: Path) -> None:
     """Write a residual folder with mistakes."""
     source = draw.choice(RESIDUALS)
     shutil.copytree(source, folder)
-    description, weights = folder / "residual.json", folder / "weights.safetensors"
+    description = folder / "residual.json"
+    weights = folder / "weights.safetensors"
     kind = draw.randrange(10)
     if kind < 6:
         tree = json.loads(description.read_text(encoding="utf-8"))
@@ -151,7 +296,9 @@ def mutated_residual(draw: random.Random, folder: Path) -> None:
         file.write_bytes(damage(file.read_bytes(), draw))
     else:
         file, other = draw.sample([description, weights], 2)
-        draw.choice([lambda: file.unlink(), lambda: shutil.copy(file, other), lambda: file.write_bytes(b"")])()
+        draw.choice(
+            [lambda: file.unlink(), lambda: shutil.copy(file, other), lambda: file.write_bytes(b"")]
+        )()
 
 
 def read_comparison(path: Path) -> None:
@@ -173,17 +320,26 @@ def read_bench(path: Path) -> None:
 def read_residual(folder: Path) -> None:
     """All that a comparison does with a residual before and after it simulates."""
     config = CompareConfig(
-        name="x", env="walker", policies=[PolicySpec(name=f"{RESIDUAL}{folder}")], references=[3], scenarios=["ideal"]
+        name="x",
+        env="walker",
+        policies=[PolicySpec(name=f"{RESIDUAL}{folder}")],
+        references=[3],
+        scenarios=["ideal"],
     )
     members = [entrant.member for entrant in expand(config.policies) if entrant.member is not None]
     origin(members)
     try_out(config.conditions())
 
 
-LONGEST_S, LONGEST_ERROR = 10.0, 2200
+LONGEST_S = 10.0
+LONGEST_ERROR = 2200
 """A case that takes longer, or an error of more characters, is a fault."""
 
-READERS: dict[str, Callable[[Path], None]] = {"train": read_training, "bench": read_bench, "": read_comparison}
+READERS: dict[str, Callable[[Path], None]] = {
+    "train": read_training,
+    "bench": read_bench,
+    "": read_comparison,
+}
 """What reads the shipped configurations, by the beginning of their names."""
 
 
@@ -210,25 +366,39 @@ def play(number: int, folder: Path) -> str:
 
 def main(first: int, count: int) -> int:
     """Play cases and say which were faults, and how many were taken; the number of faults."""
-    faults, taken, slowest, longest = 0, 0, (0.0, 0), 0
+    faults = 0
+    taken = 0
+    slowest = (0.0, 0)
+    longest = 0
     with tempfile.TemporaryDirectory() as folder:
         for number in range(first, first + count):
             began = time.monotonic()
             try:
                 outcome = play(number, Path(folder))
-                taken, longest = taken + (outcome == "taken"), max(longest, len(outcome))
+                taken = taken + (outcome == "taken")
+                longest = max(longest, len(outcome))
                 if len(outcome) > LONGEST_ERROR:
                     faults += 1
-                    print(f"case {number}: an error of {len(outcome)} characters, {outcome[:200]!r}", flush=True)
+                    print(
+                        f"case {number}: an error of {len(outcome)} characters, {outcome[:200]!r}",
+                        flush=True,
+                    )
             except Exception:
                 faults += 1
-                print(f"case {number}:\n{''.join(traceback.format_exc().splitlines(keepends=True)[-9:])}", flush=True)
+                print(
+                    "case"
+                    f" {number}:\n{''.join(traceback.format_exc().splitlines(keepends=True)[-9:])}",
+                    flush=True,
+                )
             if time.monotonic() - began > LONGEST_S:
                 faults += 1
                 print(f"case {number}: {time.monotonic() - began:.1f} s", flush=True)
             slowest = max(slowest, (time.monotonic() - began, number))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{count} cases: {faults} faults, {taken} taken; slowest {slowest[0]:.1f} s (case {slowest[1]})")
+    print(
+        f"{count} cases: {faults} faults, {taken} taken; slowest {slowest[0]:.1f} s (case"
+        f" {slowest[1]})"
+    )
     print(f"peak {peak:.0f} MB, longest error {longest} characters")
     return faults
 

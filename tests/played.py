@@ -8,10 +8,12 @@ import baselines
 
 
 def metrics_of(env: Any, policy: str) -> dict[str, Any]:
-    """Figures of an episode that a policy plays in an environment of one world, without a failure."""
+    """Figures of an episode that a policy plays in an environment of one world, without a
+    failure."""
     player = baselines.make(policy, env)
     observation, info = env.reset(seed=0)
-    state, start = None, np.array(True)
+    state = None
+    start = np.array(True)
     while "episode_metrics" not in info:
         action, state = player.predict(observation, state, start)
         observation, *_, info = env.step(action)

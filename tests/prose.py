@@ -3,7 +3,9 @@
 import re
 
 # a full stop ends a sentence where a capital follows; that of J., Eq. and Figs. does not
-_END = re.compile(r"(?<=[.:?!])(?<!\b[A-Z]\.)(?<!Eq\.)(?<!Eqs\.)(?<!Figs\.)\**\s+(?=[A-Z*θδqρμτ\"✕µ]|code\b)")
+_END = re.compile(
+    r"(?<=[.:?!])(?<!\b[A-Z]\.)(?<!Eq\.)(?<!Eqs\.)(?<!Figs\.)\**\s+(?=[A-Z*θδqρμτ\"✕µ]|code\b)"
+)
 _FIGURE = re.compile(r"<!-- (= [^>]*|/) -->")  # marks of a figure within a sentence
 _FENCE = re.compile(r"^(```|:::).*?^\1[`:]*$", re.MULTILINE | re.DOTALL)
 
@@ -11,7 +13,9 @@ _FENCE = re.compile(r"^(```|:::).*?^\1[`:]*$", re.MULTILINE | re.DOTALL)
 def sentences(text: str) -> list[str]:
     """Sentences of the paragraphs and list items of a page."""
     text = _FIGURE.sub("", _FENCE.sub("\n", text))
-    text = re.sub(r"^\$\$.*?\$\$$|<!--.*?-->|!\[[^\]]*\]\([^)]*\)", "\n", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^\$\$.*?\$\$$|<!--.*?-->|!\[[^\]]*\]\([^)]*\)", "\n", text, flags=re.MULTILINE | re.DOTALL
+    )
     blocks: list[str] = []
     for line in text.splitlines():
         is_item = re.match(r"\s*([*-]|\d+\.) ", line) is not None

@@ -1,4 +1,5 @@
-"""Stiffness adapted online, and sensors of the deflection: closed forms, a regression by matrices, and the plant."""
+"""Stiffness adapted online, and sensors of the deflection: closed forms, a regression by
+matrices, and the plant."""
 
 from functools import cache
 from typing import Any
@@ -37,7 +38,9 @@ def by_matrices(h: Array, delta: Array) -> Array:
 def sums_of(h: Array, delta: Array) -> Array:
     """What the observer keeps of measurements, (5, n)."""
     y = delta - h
-    return np.stack([np.full(h.shape[1], float(len(h))), h.sum(0), (h * h).sum(0), y.sum(0), (h * y).sum(0)])
+    return np.stack(
+        [np.full(h.shape[1], float(len(h))), h.sum(0), (h * h).sum(0), y.sum(0), (h * y).sum(0)]
+    )
 
 
 def test_regression_is_that_of_the_normal_equations() -> None:
@@ -49,7 +52,8 @@ def test_regression_is_that_of_the_normal_equations() -> None:
 
 
 def test_joints_without_load_take_after_the_others() -> None:
-    """Catches a prior that keeps them at zero: with three joints at +0.4 the fourth is nearer to them than to 0."""
+    """Catches a prior that keeps them at zero: with three joints at +0.4 the fourth is nearer to
+    them than to 0."""
     h = np.outer(np.sin(np.arange(200.0)), [0.03, 0.03, 0.03, 0.0])
     r = regress(sums_of(h, 1.4 * h), PRIOR)
     np.testing.assert_allclose(r[:3], 0.4, atol=0.01)
@@ -57,8 +61,10 @@ def test_joints_without_load_take_after_the_others() -> None:
 
 
 def test_friction_turns_round_as_dahl_has_it() -> None:
-    """From −F over a displacement s: F (1 − 2 exp(−s/s₀)); many small displacements are one large one."""
-    coulomb, s = np.array([5.4]), 2e-3
+    """From −F over a displacement s: F (1 − 2 exp(−s/s₀)); many small displacements are one
+    large one."""
+    coulomb = np.array([5.4])
+    s = 2e-3
     turned = presliding_friction(-coulomb, np.array([s]), coulomb)
     np.testing.assert_allclose(turned, coulomb * (1.0 - 2.0 * np.exp(-s / PRESLIDING_RAD)))
     slowly = -coulomb
@@ -103,7 +109,8 @@ def test_the_correction_is_filtered_and_joined_with_another() -> None:
     model = scalar().unwrapped.assumed_model
     gains = AdaptationGains(period_s=0.1, filter_s=0.2, limit=0.4)
     inner = Recorded(model.observation_table)
-    policy, state = OnlineStiffness(inner, model, Fixed(), gains), None
+    policy = OnlineStiffness(inner, model, Fixed(), gains)
+    state = None
     for step, observation in enumerate(recording()[:50]):
         further = PolicyInputs(deflection=np.full((1, 12), 0.1) if step == 49 else None)
         _, state = policy.predict(observation, state, step == 0, inputs=further)
@@ -116,11 +123,17 @@ def test_the_correction_is_filtered_and_joined_with_another() -> None:
 
 @cache
 def walked(name: str, scenario: str = "ideal+soft") -> tuple[Any, Any, Array]:
-    """Environment, policy state and last observation after two fast steps, and then the correction of each joint."""
+    """Environment, policy state and last observation after two fast steps, and then the
+    correction of each joint."""
     env = gymnasium.make(
-        "elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=2, scenario=scenario, sensors=sensors_needed(name)
+        "elastic_env/WalkInPlace-v0",
+        step_period=1.6,
+        num_steps=2,
+        scenario=scenario,
+        sensors=sensors_needed(name),
     )
-    policy, state = baselines.make(name, env), None
+    policy = baselines.make(name, env)
+    state = None
     observation, _ = env.reset(seed=4)
     for _ in range(env.unwrapped.task.num_steps - 1):
         action, state = policy.predict(observation, state)
@@ -133,7 +146,9 @@ def correction(state: Any) -> Array:
     return state.correction[0].reshape(2, 6)
 
 
-@pytest.mark.parametrize(("name", "joints"), [("adaptive", [1]), ("torque_sensor", [1]), ("link_encoder", [1, 3])])
+@pytest.mark.parametrize(
+    ("name", "joints"), [("adaptive", [1]), ("torque_sensor", [1]), ("link_encoder", [1, 3])]
+)
 def test_softer_joints_are_found_out(name: str, joints: list[int]) -> None:
     """K × 0.7 bends 0.43 more; asked of the joints that carry most, hip roll and knee."""
     _, state, _ = walked(name)
@@ -141,7 +156,8 @@ def test_softer_joints_are_found_out(name: str, joints: list[int]) -> None:
 
 
 def test_joints_without_a_sensor_stay_as_assumed() -> None:
-    """`hip_sensor` knows of the hips alone: knees and ankles keep the assumed compliance, the load aside."""
+    """`hip_sensor` knows of the hips alone: knees and ankles keep the assumed compliance, the
+    load aside."""
     _, state, _ = walked("hip_sensor")
     found = correction(state)
     assert (found[:, 1] > 0.3).all()
@@ -150,10 +166,12 @@ def test_joints_without_a_sensor_stay_as_assumed() -> None:
 
 @pytest.mark.parametrize("sensor", ["joint_torque", "link_encoder"])
 def test_deflections_are_those_of_the_plant(sensor: str) -> None:
-    """Catches a sign, and a stiffness that is the true one: by torque a soft joint bends 0.7 of what it does."""
+    """Catches a sign, and a stiffness that is the true one: by torque a soft joint bends 0.7 of
+    what it does."""
     env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal+soft", sensors=[sensor])
     observation = first(env)
-    sensors, truth = DeflectionSensors(env.unwrapped.assumed_model, sensor), env.unwrapped.truth()
+    sensors = DeflectionSensors(env.unwrapped.assumed_model, sensor)
+    truth = env.unwrapped.truth()
     scale = 0.7 if sensor == "joint_torque" else 1.0
     found = sensors.deflection(observation[None])
     np.testing.assert_allclose(found, scale * (truth.theta - truth.q), atol=1e-6)
@@ -172,15 +190,19 @@ def test_link_encoders_show_the_links() -> None:
     env.unwrapped.truth()
     policy = baselines.make("link_encoder", env)
     _, state = policy.predict(observation, state)
-    np.testing.assert_allclose(policy.link_estimate(observation, state), env.unwrapped.truth().q[0], atol=1e-6)
+    np.testing.assert_allclose(
+        policy.link_estimate(observation, state), env.unwrapped.truth().q[0], atol=1e-6
+    )
 
 
 def test_a_controller_that_weighs_the_robot_finds_its_load() -> None:
-    """5 kg on 57 kg: 49 N more within three time constants; without the filter it keeps the assumed weight."""
+    """5 kg on 57 kg: 49 N more within three time constants; without the filter it keeps the
+    assumed weight."""
     env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal+payload")
     weights = []
     for filter_s in (0.2, None):
-        policy, state = baselines.make("uncompensated", env, gains={"weight_filter_s": filter_s}), None
+        policy = baselines.make("uncompensated", env, gains={"weight_filter_s": filter_s})
+        state = None
         observation, _ = env.reset(seed=0)
         for _ in range(200):
             action, state = policy.predict(observation, state)
@@ -195,7 +217,8 @@ def test_other_gains_leave_the_weight_measured() -> None:
     env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal+payload")
     last = []
     for gains in (None, {"dcm": 0.4}, {"weight_filter_s": 1.0}, {"weight_filter_s": None}):
-        policy, state = baselines.make("adaptive_posture", env, gains=gains), None
+        policy = baselines.make("adaptive_posture", env, gains=gains)
+        state = None
         observation, _ = env.reset(seed=0)
         for _ in range(300):
             action, state = policy.predict(observation, state)

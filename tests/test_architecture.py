@@ -15,20 +15,38 @@ HEAVY = {"torch", "stable_baselines3", "tensorboard"}
 def test_importing_environment_and_baselines_loads_no_torch() -> None:
     """Catches an import that the source does not show, through a dependency or a registration."""
     code = (
-        "import sys, gymnasium, elastic_env, baselines; gymnasium.make('elastic_env/Testbed-v0');"
-        f"print([name for name in {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio'})} if name in sys.modules])"
+        "import sys, gymnasium, elastic_env, baselines;"
+        " gymnasium.make('elastic_env/Testbed-v0');print([name for name in"
+        f" {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio'})} if name in sys.modules])"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert result.stdout.strip() == "[]"
 
 
 def test_the_three_packages_and_all_their_parts_are_installed() -> None:
-    """Catches a subpackage or a data file that pyproject.toml forgets, so that only editable installs work."""
+    """Catches a subpackage or a data file that pyproject.toml forgets, so that only editable
+    installs work."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    found = set(find_packages(str(ROOT), include=settings["tool"]["setuptools"]["packages"]["find"]["include"]))
+    found = set(
+        find_packages(
+            str(ROOT), include=settings["tool"]["setuptools"]["packages"]["find"]["include"]
+        )
+    )
     files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
     assert found == {".".join(file.parent.relative_to(ROOT).parts) for file in files}
     patterns = settings["tool"]["setuptools"]["package-data"]
-    packed = {file for name in PACKAGES for pattern in patterns[name] for file in (ROOT / name).glob(pattern)}
-    data = {file for name in PACKAGES for file in (ROOT / name).rglob("*") if file.is_file() and file.suffix != ".py"}
+    packed = {
+        file
+        for name in PACKAGES
+        for pattern in patterns[name]
+        for file in (ROOT / name).glob(pattern)
+    }
+    data = {
+        file
+        for name in PACKAGES
+        for file in (ROOT / name).rglob("*")
+        if file.is_file() and file.suffix != ".py"
+    }
     assert {file for file in data - packed if "__pycache__" not in file.parts} == set()

@@ -1,4 +1,5 @@
-"""Stiffness of an arm from static poses: against equilibria of MuJoCo, with intervals that hold the truth."""
+"""Stiffness of an arm from static poses: against equilibria of MuJoCo, with intervals that hold
+the truth."""
 
 import csv
 import json
@@ -45,7 +46,12 @@ K = np.array([2000.0, 1800.0, 1100.0, 900.0, 300.0, 250.0, 180.0])
 OFFSET = np.array([4.0, -6.0, 3.0, 5.0, -4.0, 6.0, -5.0]) * 1e-3
 FRICTION = np.array([2.0, 2.0, 1.5, 1.0, 0.5, 0.4, 0.3])
 COUNT = 2.0 * np.pi / 501_923
-NOISE: dict[Kind, float] = {"end_effector": 3e-4, "link_encoders": 1e-4, "imu": 5e-4, "torques": 0.05}
+NOISE: dict[Kind, float] = {
+    "end_effector": 3e-4,
+    "link_encoders": 1e-4,
+    "imu": 5e-4,
+    "torques": 0.05,
+}
 TURN = Rotation.from_euler("xyz", [0.4, -0.2, 2.0])
 RANGES = {joint: tuple(ARM.joint(joint).range) for joint in JOINTS}
 
@@ -59,14 +65,21 @@ def equilibria(theta: Array, load: Array, model: mujoco.MjModel = ARM) -> Array:
         mujoco.mj_forward(model, data)
         return theta - q - (data.qfrc_bias + load) / K
 
-    return np.array([root(imbalance, row, (row, own), tol=1e-13).x for row, own in zip(theta, load, strict=True)])
+    return np.array(
+        [
+            root(imbalance, row, (row, own), tol=1e-13).x
+            for row, own in zip(theta, load, strict=True)
+        ]
+    )
 
 
 def shown(kind: Kind, q: Array, load: Array) -> Array:
-    """What a sensor without noise shows, by MuJoCo: a tracker that is shifted and an IMU that is mounted askew."""
+    """What a sensor without noise shows, by MuJoCo: a tracker that is shifted and an IMU that is
+    mounted askew."""
     if kind == "link_encoders":
         return q
-    data, rows = mujoco.MjData(ARM), []
+    data = mujoco.MjData(ARM)
+    rows = []
     for row, own in zip(q, load, strict=True):
         data.qpos[:] = row
         mujoco.mj_forward(ARM, data)
@@ -87,23 +100,33 @@ def poses(count: int, generator: np.random.Generator) -> Array:
     return 0.9 * generator.uniform(*ARM.jnt_range.T, size=(count, len(JOINTS)))
 
 
-def log_of(kind: Kind, seed: int, count: int = 40, friction: float = 0.0, **options: Any) -> PoseLog:
+def log_of(
+    kind: Kind, seed: int, count: int = 40, friction: float = 0.0, **options: Any
+) -> PoseLog:
     """The log of an arm of known truth: noise in its usual size, and encoders that count."""
     generator = np.random.default_rng(seed)
     theta = options.get("theta", poses(count, generator))
     direction = generator.choice([-1.0, 1.0], size=theta.shape)
     load = friction * FRICTION * direction
     measured = shown(kind, equilibria(theta, load), load)
-    measured = measured + options.get("noise", 1.0) * NOISE[kind] * generator.standard_normal(measured.shape)
+    measured = measured + options.get("noise", 1.0) * NOISE[kind] * generator.standard_normal(
+        measured.shape
+    )
     columns = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}.get(kind, JOINTS)
-    read = np.round((theta + OFFSET) / COUNT) * COUNT if options.get("noise", 1.0) else theta + OFFSET
-    return PoseLog(JOINTS, read, kind, columns, measured, direction if options.get("sides") else None)
+    read = (
+        np.round((theta + OFFSET) / COUNT) * COUNT if options.get("noise", 1.0) else theta + OFFSET
+    )
+    return PoseLog(
+        JOINTS, read, kind, columns, measured, direction if options.get("sides") else None
+    )
 
 
 def model_of(log: PoseLog, elastic: tuple[str, ...] = JOINTS, **options: Any) -> PoseModel:
     """The model of a log."""
     arm = StaticArm(ARM, JOINTS, "marker", options.get("payload"))
-    return PoseModel(arm, log, Unknowns.of(log, elastic, options.get("frame", "offset"), "payload" in options))
+    return PoseModel(
+        arm, log, Unknowns.of(log, elastic, options.get("frame", "offset"), "payload" in options)
+    )
 
 
 def errors(fit: ArmFit) -> Array:
@@ -115,20 +138,33 @@ LOADED = slice(1, None)  # gravity does not load the vertical axis of the base
 
 
 def test_equilibrium_is_one_of_an_elastic_arm_in_mujoco() -> None:
-    """Catches a spring with the wrong sign, torque at θ in place of q, and a payload that is not where it is said."""
+    """Catches a spring with the wrong sign, torque at θ in place of q, and a payload that is not
+    where it is said."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "arm.xml"))
     body = spec.body("link7").add_body(name="weight", pos=[0.16, 0, 0.16])
-    body.mass, body.ipos, body.inertia, body.explicitinertial = 0.8, [0.0] * 3, [1e-9] * 3, True
+    body.mass = 0.8
+    body.ipos = [0.0] * 3
+    body.inertia = [1e-9] * 3
+    body.explicitinertial = True
     elastic = make_elastic(
-        spec, {joint: ElasticJoint(stiffness=k, rotor_inertia=0.1) for joint, k in zip(JOINTS, K, strict=True)}
+        spec,
+        {
+            joint: ElasticJoint(stiffness=k, rotor_inertia=0.1)
+            for joint, k in zip(JOINTS, K, strict=True)
+        },
     ).compile()
-    log = PoseLog(JOINTS, poses(3, np.random.default_rng(0)), "link_encoders", JOINTS, np.zeros((3, 7)))
+    log = PoseLog(
+        JOINTS, poses(3, np.random.default_rng(0)), "link_encoders", JOINTS, np.zeros((3, 7))
+    )
     model = model_of(log, payload="marker")
     unknowns = np.zeros(model.unknowns.size)
-    unknowns[model.unknowns.slices["compliance"]], unknowns[model.unknowns.slices["payload"]] = 1.0 / K, 0.8
-    at, data = JointAddresses.of(elastic, JOINTS), mujoco.MjData(elastic)
+    unknowns[model.unknowns.slices["compliance"]] = 1.0 / K
+    unknowns[model.unknowns.slices["payload"]] = 0.8
+    at = JointAddresses.of(elastic, JOINTS)
+    data = mujoco.MjData(elastic)
     for theta, q in zip(log.theta, model.link_angles(unknowns)[0], strict=True):
-        data.qpos[at.theta], data.qpos[at.q] = theta, q
+        data.qpos[at.theta] = theta
+        data.qpos[at.q] = q
         mujoco.mj_forward(elastic, data)
         np.testing.assert_allclose(data.qfrc_passive[at.q_dot], data.qfrc_bias[at.q_dot], atol=1e-8)
 
@@ -136,16 +172,21 @@ def test_equilibrium_is_one_of_an_elastic_arm_in_mujoco() -> None:
 @pytest.mark.parametrize("kind", NOISE)
 @pytest.mark.parametrize("frame", ["offset", "pose"])
 def test_derivatives_are_those_of_finite_differences(kind: Kind, frame: str) -> None:
-    """Catches a missing term of the implicit derivative, for every unknown and every measurement."""
+    """Catches a missing term of the implicit derivative, for every unknown and every
+    measurement."""
     model = model_of(log_of(kind, 1, count=3, sides=True), payload="link7", frame=frame)
     unknowns = model.start_with(0.03)
     unknowns += 0.01 * model.scale * np.random.default_rng(2).standard_normal(len(unknowns))
     turn = model.unknowns.slices["rotation"]
     unknowns[turn] = 0.0  # its derivative is that of a first turn
     steps = np.diag(1e-5 * model.scale)
-    numeric = [(model.predicted(unknowns + s)[0] - model.predicted(unknowns - s)[0]) / 2e-5 for s in steps]
+    numeric = [
+        (model.predicted(unknowns + s)[0] - model.predicted(unknowns - s)[0]) / 2e-5 for s in steps
+    ]
     gradient = model.predicted(unknowns)[1] * model.scale
-    np.testing.assert_allclose(gradient, np.stack(numeric, axis=-1), atol=2e-6 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, np.stack(numeric, axis=-1), atol=2e-6 * np.abs(gradient).max()
+    )
 
 
 @pytest.mark.parametrize("kind", ["end_effector", "link_encoders", "imu", "torques"])
@@ -153,15 +194,20 @@ def test_derivatives_are_those_of_finite_differences(kind: Kind, frame: str) -> 
 def test_exact_poses_give_the_truth(kind: Kind, friction: float) -> None:
     """Catches signs, frames and offsets: without noise the truth is what is left."""
     fit = fit_arm(model_of(log_of(kind, 3, noise=0.0, friction=friction, sides=True)))
-    seen = slice(1, 6) if kind == "imu" else LOADED  # the marker's tilt does not depend on how it is turned upright
+    seen = (
+        slice(1, 6) if kind == "imu" else LOADED
+    )  # the marker's tilt does not depend on how it is turned upright
     np.testing.assert_allclose(errors(fit)[seen], 0.0, atol=2e-4)
-    np.testing.assert_allclose(fit.estimate("friction")[0][seen], friction * FRICTION[seen], atol=2e-3)
+    np.testing.assert_allclose(
+        fit.estimate("friction")[0][seen], friction * FRICTION[seen], atol=2e-3
+    )
     if kind != "imu":
         np.testing.assert_allclose(fit.estimate("offset")[0][LOADED], OFFSET[LOADED], atol=2e-5)
 
 
 def test_a_tracker_that_stands_anywhere_is_found() -> None:
-    """Catches a frame whose directions are taken for the model's, and one whose shift is not sought with them."""
+    """Catches a frame whose directions are taken for the model's, and one whose shift is not
+    sought with them."""
     log = log_of("end_effector", 4, noise=0.0)
     turned = TURN.apply(log.measured) + np.array([3.0, 0.0, -1.0])
     fit = fit_arm(model_of(replace(log, measured=turned), frame="pose"))
@@ -185,8 +231,12 @@ def test_payload_is_found_with_the_stiffness() -> None:
 
 
 def test_intervals_hold_the_truth_and_are_no_wider_than_they_must_be() -> None:
-    """Catches an interval of the prior, of half the width, or of noise that friction is not part of."""
-    runs, hits, widths, found = 16, np.zeros(7), [], []
+    """Catches an interval of the prior, of half the width, or of noise that friction is not part
+    of."""
+    runs = 16
+    hits = np.zeros(7)
+    widths = []
+    found = []
     for seed in range(runs):
         fit = fit_arm(model_of(log_of("end_effector", 100 + seed, friction=0.3)))
         compliance, half = fit.estimate("compliance")
@@ -199,8 +249,11 @@ def test_intervals_hold_the_truth_and_are_no_wider_than_they_must_be() -> None:
     assert 0.8 < np.median(ratio) < 1.5
 
 
-def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(tmp_path: Path) -> None:
-    """Catches K beyond 3 % of a joint that is told apart, and a correction that leaves a fifth of the sag."""
+def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(
+    tmp_path: Path,
+) -> None:
+    """Catches K beyond 3 % of a joint that is told apart, and a correction that leaves a fifth
+    of the sag."""
     fit = fit_arm(model_of(log_of("end_effector", 6)))
     result = described(fit, within=0.03, assumed=None)
     told = np.array([not joint.reason for joint in result.joints])
@@ -211,7 +264,8 @@ def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(tmp
     stiffness = parse_yaml((tmp_path / "joints.yaml").read_text())
     compensator = PositionCompensator.from_model(ARM, stiffness)
     wanted = 0.8 * poses(40, np.random.default_rng(7))
-    none, where = np.zeros_like(wanted), lambda q: shown("end_effector", q, np.zeros_like(q))
+    none = np.zeros_like(wanted)
+    where = lambda q: shown("end_effector", q, np.zeros_like(q))  # noqa: E731
     corrected = np.array([compensator.command(row) for row in wanted])
     before, after = (
         np.sqrt(np.mean(np.sum((where(equilibria(command, none)) - where(wanted)) ** 2, axis=1)))
@@ -222,37 +276,52 @@ def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(tmp
 
 
 def test_joints_that_poses_do_not_tell_apart_are_named_with_the_reason() -> None:
-    """Catches a number for a joint that carries nothing, that the sensor does not show, or that has a twin."""
-    why = {joint.joint: joint for joint in described(fit_arm(model_of(log_of("end_effector", 8))), 0.03, 700.0).joints}
+    """Catches a number for a joint that carries nothing, that the sensor does not show, or that
+    has a twin."""
+    why = {
+        joint.joint: joint
+        for joint in described(fit_arm(model_of(log_of("end_effector", 8))), 0.03, 700.0).joints
+    }
     assert why["base_yaw"].reason == "gravity does not load it in these poses"
     assert (why["base_yaw"].source, why["base_yaw"].stiffness_nm_per_rad) == ("assumed", 700.0)
     assert why["base_yaw"].stiffness_high_nm_per_rad is None
     assert "small beside the noise" in why["wrist_roll"].reason
     log = log_of("link_encoders", 8)
     half = replace(log, columns=JOINTS[:-1], measured=log.measured[:, :-1])
-    assert described(fit_arm(model_of(half)), 0.03, None).joints[-1].reason == "the measurement does not show its angle"
+    assert (
+        described(fit_arm(model_of(half)), 0.03, None).joints[-1].reason
+        == "the measurement does not show its angle"
+    )
 
 
 def test_joints_that_move_alike_are_named_together() -> None:
-    """Catches twins that are told apart by the prior: elbow and wrist of a planar arm that only turns its shoulder."""
+    """Catches twins that are told apart by the prior: elbow and wrist of a planar arm that only
+    turns its shoulder."""
     xml = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0"/>
       <inertial mass="1" pos="0.2 0 0" diaginertia="0.01 0.01 0.01"/>
       <body><joint name="b" axis="0 1 0"/><inertial mass="1" pos="0.3 0 0" diaginertia="0.01 0.01 0.01"/>
       <body name="tip" pos="0.4 0 0"><inertial mass="0.1" pos="0 0 0" diaginertia="1e-4 1e-4 1e-4"/></body>
       </body></body></worldbody></mujoco>"""
-    model, generator = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(9)
+    model = mujoco.MjModel.from_xml_string(xml)
+    generator = np.random.default_rng(9)
     arm = StaticArm(model, ("a", "b"), "tip")
     theta = np.stack([generator.uniform(-1.5, 1.5, 30), np.zeros(30)], axis=-1)
     angle = theta.sum(axis=-1) - arm.torque(theta) @ [1e-3, 2e-3]
-    measured = 0.4 * np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], -1) + generator.normal(0, 1e-4, (30, 3))
+    measured = 0.4 * np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], -1) + generator.normal(
+        0, 1e-4, (30, 3)
+    )
     log = PoseLog(("a", "b"), theta, "end_effector", ("x", "y", "z"), measured)
     fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, ("a", "b"), "known", payload=False)))
     reasons = [joint.reason for joint in described(fit, 0.03, 1000.0).joints]
-    assert reasons == ["these poses do not separate it from b", "these poses do not separate it from a"]
+    assert reasons == [
+        "these poses do not separate it from b",
+        "these poses do not separate it from a",
+    ]
 
 
 def test_planned_poses_tell_more_than_random_ones_and_are_free() -> None:
-    """Catches a plan that is no better than chance, poses beyond the ranges, and poses in which the arm touches."""
+    """Catches a plan that is no better than chance, poses beyond the ranges, and poses in which
+    the arm touches."""
     log = log_of("end_effector", 10, sides=True)
     fit = fit_arm(model_of(log))
     candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(11))
@@ -299,7 +368,8 @@ def test_plan_says_in_advance_what_its_poses_then_tell(kind: Kind) -> None:
 
 @pytest.mark.parametrize("kind", ["end_effector", "link_encoders"])
 def test_figure_shows_the_deflections_of_the_springs(kind: Kind) -> None:
-    """Catches deflections in another sign or unit, and residuals that are taken away in place of added."""
+    """Catches deflections in another sign or unit, and residuals that are taken away in place of
+    added."""
     log = log_of(kind, 17)
     exact = equilibria(log.theta - OFFSET, np.zeros_like(log.theta))
     fit = fit_arm(model_of(log))
@@ -328,8 +398,11 @@ def run(*arguments: str) -> None:
     main(["identify", "--robot", str(FOLDER / "arm.xml"), "--end-effector", "marker", *arguments])
 
 
-def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches files that are missing or that nothing reads, and an example log that no longer fits its arm."""
+def test_command_on_the_example_writes_what_the_compensator_takes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches files that are missing or that nothing reads, and an example log that no longer
+    fits its arm."""
     run("--log", str(EXAMPLE), "--plan", "5", "--output", "found", "--assume", "1500")
     said = capsys.readouterr().out
     assert "base_yaw; gravity does not load it" in said
@@ -337,7 +410,9 @@ def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest
     assert {"identification.json", "joints.yaml", "identification.png", "plan.csv"} <= names
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert stiffness["base_yaw"] == {"stiffness": 1500.0}
-    np.testing.assert_allclose([own["stiffness"] for own in stiffness.values()][LOADED], K[LOADED], rtol=0.12)
+    np.testing.assert_allclose(
+        [own["stiffness"] for own in stiffness.values()][LOADED], K[LOADED], rtol=0.12
+    )
     assert PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml").joints == JOINTS
     rows = list(csv.reader(Path("found/plan.csv").read_text().splitlines()))
     assert len(rows) == 6
@@ -345,21 +420,31 @@ def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest
 
 
 def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> None:
-    """Catches a stiff joint that is written as soft as another one, and a file that one of its readers refuses."""
+    """Catches a stiff joint that is written as soft as another one, and a file that one of its
+    readers refuses."""
     run("--log", str(EXAMPLE), "--output", "found")
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert stiffness["base_yaw"] == {"stiffness": math.inf}
     of_base = json.loads(Path("found/identification.json").read_text())["joints"][0]
-    assert (of_base["source"], of_base["stiffness_nm_per_rad"], of_base["friction_nm"]) == ("rigid", None, None)
+    assert (of_base["source"], of_base["stiffness_nm_per_rad"], of_base["friction_nm"]) == (
+        "rigid",
+        None,
+        None,
+    )
     compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
     q = np.full(7, 0.3)
-    np.testing.assert_allclose(compensator.command(q) - q, [0.0, *(compensator.torque(q) / K)[1:]], rtol=0.12)
-    env: Any = gymnasium.make("elastic_env/Robot-v0", model=str(FOLDER / "arm.xml"), joints="found/joints.yaml")
+    np.testing.assert_allclose(
+        compensator.command(q) - q, [0.0, *(compensator.torque(q) / K)[1:]], rtol=0.12
+    )
+    env: Any = gymnasium.make(
+        "elastic_env/Robot-v0", model=str(FOLDER / "arm.xml"), joints="found/joints.yaml"
+    )
     assert env.action_space.shape == (6,)
 
 
 def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
-    """Catches a file that the compensator refuses, since it lacks joints that the docs call rigid."""
+    """Catches a file that the compensator refuses, since it lacks joints that the docs call
+    rigid."""
     run("--log", str(EXAMPLE), "--joints", "elbow", "wrist_*", "--output", "found")
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert set(stiffness) == set(JOINTS)
@@ -367,11 +452,17 @@ def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
     compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
     q = np.full(7, 0.3)
     assert (compensator.command(q) == q).tolist() == [True, True, True, False, True, False, False]
-    assert RESULT.replace(held_joints=("no",)).save(Path())[1].read_text().endswith("'no': held  # not in the log\n")
+    assert (
+        RESULT.replace(held_joints=("no",))
+        .save(Path())[1]
+        .read_text()
+        .endswith("'no': held  # not in the log\n")
+    )
 
 
 def of_elbow(compliance: float, half_width: float) -> JointStiffness:
-    """What is written of a joint whose 1/K is estimated in the middle of an interval; the others are well known."""
+    """What is written of a joint whose 1/K is estimated in the middle of an interval; the others
+    are well known."""
     fit = fit_arm(model_of(log_of("end_effector", 8)))
     own = fit.model.unknowns.slices["compliance"]
     unknowns = fit.unknowns.copy()
@@ -382,25 +473,36 @@ def of_elbow(compliance: float, half_width: float) -> JointStiffness:
 
 
 def test_an_estimate_is_written_as_it_is_and_a_negative_one_as_rigid() -> None:
-    """Catches the largest K of other joints in place of a joint's own, and a negative 1/K in silence."""
+    """Catches the largest K of other joints in place of a joint's own, and a negative 1/K in
+    silence."""
     stiff = of_elbow(1e-5, 2e-5)
     assert (stiff.source, stiff.stiffness_nm_per_rad) == ("no upper end", pytest.approx(1e5))
     assert stiff.stiffness_low_nm_per_rad == pytest.approx(1.0 / 3e-5)
     negative = of_elbow(-1e-5, 2e-5)
-    assert (negative.source, negative.stiffness_nm_per_rad, negative.is_negative) == ("rigid", math.inf, True)
+    assert (negative.source, negative.stiffness_nm_per_rad, negative.is_negative) == (
+        "rigid",
+        math.inf,
+        True,
+    )
 
 
 def test_a_negative_estimate_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a joint that is stiffer than the log can tell, and of which neither file nor output says so."""
+    """Catches a joint that is stiffer than the log can tell, and of which neither file nor
+    output says so."""
     log = log_of("link_encoders", 8)
     measured = log.measured.copy()
     rigid = (log.theta - OFFSET)[:, 3]
     noise = 3e-4 * np.random.default_rng(1).standard_normal(len(log))
-    measured[:, 3] = rigid + 0.01 * (rigid - measured[:, 3]) + noise  # it hardly bends, and to the wrong side
+    measured[:, 3] = (
+        rigid + 0.01 * (rigid - measured[:, 3]) + noise
+    )  # it hardly bends, and to the wrong side
     joints = described(fit_arm(model_of(replace(log, measured=measured))), 0.03, None)
     assert [joint.joint for joint in joints.joints if joint.is_negative] == ["elbow"]
     file = joints.save(tmp_path)[1].read_text()
-    assert "elbow: {stiffness: .inf}  # rigid: stiffer than the log can tell; the estimate is negative" in file
+    assert (
+        "elbow: {stiffness: .inf}  # rigid: stiffer than the log can tell; the estimate is negative"
+        in file
+    )
 
 
 ONE = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="j1" axis="0 1 0" range="-2 2"/>
@@ -412,7 +514,8 @@ TWO = """<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 0.1"><joint
 
 
 def encoders(xml: str, stiffness: list[float], count: int = 12) -> tuple[StaticArm, PoseLog]:
-    """An arm and its log of link encoders in the resolution of micrometres; MuJoCo's torque bends the springs."""
+    """An arm and its log of link encoders in the resolution of micrometres; MuJoCo's torque
+    bends the springs."""
     model = mujoco.MjModel.from_xml_string(xml)
     joints = tuple(model.joint(i).name for i in range(model.njnt))
     q = np.random.default_rng(3).uniform(-1.2, 1.2, (count, len(joints)))
@@ -422,14 +525,18 @@ def encoders(xml: str, stiffness: list[float], count: int = 12) -> tuple[StaticA
         data.qpos[:] = own
         mujoco.mj_forward(model, data)
         row += data.qfrc_bias / stiffness
-    return StaticArm(model, joints), PoseLog(joints, np.round(theta, 6), "link_encoders", joints, np.round(q, 6))
+    return StaticArm(model, joints), PoseLog(
+        joints, np.round(theta, 6), "link_encoders", joints, np.round(q, 6)
+    )
 
 
 def fit_of(arm: StaticArm, log: PoseLog) -> Array:
     """K of all joints, (n,) [N·m/rad]."""
     return (
         1.0
-        / fit_arm(PoseModel(arm, log, Unknowns.of(log, log.joints, "offset", payload=False))).estimate("compliance")[0]
+        / fit_arm(
+            PoseModel(arm, log, Unknowns.of(log, log.joints, "offset", payload=False))
+        ).estimate("compliance")[0]
     )
 
 
@@ -437,15 +544,21 @@ def test_encoders_that_are_swapped_are_named() -> None:
     """Catches a contradiction to the model that is told as noise."""
     arm, log = encoders(ONE.format(z=0.3), [300.0])
     np.testing.assert_allclose(fit_of(arm, log), 300.0, rtol=1e-3)
-    with pytest.raises(ConfigurationError, match=r"deflect against their load: are theta and q swapped.*joint j1\)\?"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"deflect against their load: are theta and q swapped.*joint j1\)\?",
+    ):
         fit_of(arm, replace(log, theta=log.measured, measured=log.theta))
-    with pytest.raises(ConfigurationError, match=r"run against each other: a sign is wrong \(joint j1\)"):
+    with pytest.raises(
+        ConfigurationError, match=r"run against each other: a sign is wrong \(joint j1\)"
+    ):
         fit_of(arm, replace(log, measured=-log.measured))
 
 
 @pytest.mark.parametrize("joint", ["j1", "j2"])
 def test_a_joint_that_turns_the_other_way_is_named(joint: str) -> None:
-    """Catches a wrong sign of one joint of several, by a fit that is bad and one that is good with the sign turned."""
+    """Catches a wrong sign of one joint of several, by a fit that is bad and one that is good
+    with the sign turned."""
     arm, log = encoders(TWO, [300.0, 150.0], count=20)
     np.testing.assert_allclose(fit_of(arm, log), [300.0, 150.0], rtol=2e-3)
     with pytest.raises(ConfigurationError, match=rf"a sign is wrong \(joint .*{joint}.*\)"):
@@ -462,7 +575,8 @@ def test_soft_springs_are_identified() -> None:
 
 
 def test_twins_of_which_one_is_negative_share_what_both_explain() -> None:
-    """Catches a joint that is written as too soft, beside a twin whose negative estimate made up for it."""
+    """Catches a joint that is written as too soft, beside a twin whose negative estimate made up
+    for it."""
     fit = fit_arm(model_of(log_of("end_effector", 8)))
     own = fit.model.unknowns.slices["compliance"]
     information = fit.information.copy()
@@ -477,7 +591,9 @@ def test_twins_of_which_one_is_negative_share_what_both_explain() -> None:
     assert best[5] == pytest.approx(0.01, abs=1e-4)
 
 
-def test_offsets_that_the_poses_do_not_tell_are_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_offsets_that_the_poses_do_not_tell_are_not_shown(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Catches hundreds of milliradians that are the prior's, in table and file."""
     log = log_of("link_encoders", 8)
     without_base = replace(log, columns=JOINTS[1:], measured=log.measured[:, 1:])
@@ -489,10 +605,16 @@ def test_offsets_that_the_poses_do_not_tell_are_not_shown(capsys: pytest.Capture
     assert of_base.split() == ["base_yaw", "–", "–", ">", "100", "%", "–"]
 
 
-@given(names=st.lists(st.text("01no.~e\"'#: -[]{}é", min_size=1, max_size=6), min_size=7, max_size=7, unique=True))
+@given(
+    names=st.lists(
+        st.text("01no.~e\"'#: -[]{}é", min_size=1, max_size=6), min_size=7, max_size=7, unique=True
+    )
+)
 def test_joints_of_any_name_are_read_back(names: list[str]) -> None:
     """Catches names that the file's reader takes for numbers, truth values or YAML."""
-    joints = tuple(joint.replace(joint=name) for joint, name in zip(RESULT.joints, names, strict=True))
+    joints = tuple(
+        joint.replace(joint=name) for joint, name in zip(RESULT.joints, names, strict=True)
+    )
     renamed = RESULT.replace(joints=joints)
     with tempfile.TemporaryDirectory() as folder:
         file = renamed.save(Path(folder))[1]
@@ -500,7 +622,8 @@ def test_joints_of_any_name_are_read_back(names: list[str]) -> None:
 
 
 def test_first_poses_are_planned_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a plan that needs what it is made for, and one that promises a joint that gravity does not load."""
+    """Catches a plan that needs what it is made for, and one that promises a joint that gravity
+    does not load."""
     run("--plan", "8", "--measured-by", "end_effector", "--output", "plan")
     assert "base_yaw" in capsys.readouterr().out
     assert len(Path("plan/plan.csv").read_text().splitlines()) == 9
@@ -517,14 +640,16 @@ def test_example_log_is_that_of_its_script(tmp_path: Path) -> None:
 
 
 def test_samples_of_one_pose_count_once(tmp_path: Path) -> None:
-    """Catches intervals that shrink because a sensor was written down more often, and poses that are lost."""
+    """Catches intervals that shrink because a sensor was written down more often, and poses that
+    are lost."""
     head, rows = table()
     several = [row for row in rows for _ in range(5)]
     for number, row in enumerate(several):
         several[number] = [str(float(row[0]) + 1e-5 * (number % 5 - 2)), *row[1:]]
     with Path("several.csv").open("w", newline="") as file:
         csv.writer(file).writerows([head, *several])
-    once, often = read_log(EXAMPLE, RANGES), read_log(Path("several.csv"), RANGES)
+    once = read_log(EXAMPLE, RANGES)
+    often = read_log(Path("several.csv"), RANGES)
     np.testing.assert_allclose(often.theta, once.theta, atol=1e-12)
     np.testing.assert_allclose(often.measured, once.measured, atol=1e-12)
     np.testing.assert_array_equal(often.direction, once.direction)
@@ -536,7 +661,9 @@ def table() -> tuple[list[str], list[list[str]]]:
     return head, rows
 
 
-def changed(column: str, value: Any, name: str | None = None, pose: int | None = None) -> list[list[str]]:
+def changed(
+    column: str, value: Any, name: str | None = None, pose: int | None = None
+) -> list[list[str]]:
     """The example with a column renamed, or with values that a function or a text replaces."""
     head, rows = table()
     at = next(i for i, own in enumerate(head) if own.startswith(column))
@@ -567,7 +694,13 @@ def both_kinds() -> list[list[str]]:
 def in_degrees() -> list[list[str]]:
     head, rows = table()
     at = [i for i, own in enumerate(head) if own.startswith("theta")]
-    return [head, *[[str(math.degrees(float(v))) if i in at else v for i, v in enumerate(row)] for row in rows]]
+    return [
+        head,
+        *[
+            [str(math.degrees(float(v))) if i in at else v for i, v in enumerate(row)]
+            for row in rows
+        ],
+    ]
 
 
 def same(value: str) -> str:
@@ -575,32 +708,62 @@ def same(value: str) -> str:
 
 
 BAD: Mapping[str, tuple[Any, list[str]]] = {
-    "other joint": (lambda: changed("theta.elbow", same, "theta.elbo [rad]"), ["'elbo'", "Did you mean 'elbow'"]),
-    "few poses": (lambda: [*table()[:1], *table()[1][:9]], ["24 unknowns", "at least 11 poses", "has 9", "--joints"]),
+    "other joint": (
+        lambda: changed("theta.elbow", same, "theta.elbo [rad]"),
+        ["'elbo'", "Did you mean 'elbow'"],
+    ),
+    "few poses": (
+        lambda: [*table()[:1], *table()[1][:9]],
+        ["24 unknowns", "at least 11 poses", "has 9", "--joints"],
+    ),
     "alike": (alike, ["all 40 poses", "alike", "--plan"]),
-    "nan": (lambda: changed("theta.elbow", "nan", pose=4), ["pose 5", "theta.elbow", "finite", "'nan'"]),
-    "text": (lambda: changed("end_effector.y", "far", pose=0), ["pose 1", "end_effector.y", "[m]", "'far'"]),
+    "nan": (
+        lambda: changed("theta.elbow", "nan", pose=4),
+        ["pose 5", "theta.elbow", "finite", "'nan'"],
+    ),
+    "text": (
+        lambda: changed("end_effector.y", "far", pose=0),
+        ["pose 1", "end_effector.y", "[m]", "'far'"],
+    ),
     "degrees": (in_degrees, ["theta.", "beyond", "look like degrees", "radians"]),
-    "unit": (lambda: changed("theta.elbow", same, "theta.elbow [deg]"), ["must be [rad]", "[deg]", "convert"]),
-    "millimetres": (lambda: changed("end_effector.x", same, "end_effector.x [mm]"), ["must be [m]", "[mm]"]),
-    "no measurement": (lambda: kept("end_effector"), ["needs a measurement", "q.JOINT", "end_effector", "torque"]),
+    "unit": (
+        lambda: changed("theta.elbow", same, "theta.elbow [deg]"),
+        ["must be [rad]", "[deg]", "convert"],
+    ),
+    "millimetres": (
+        lambda: changed("end_effector.x", same, "end_effector.x [mm]"),
+        ["must be [m]", "[mm]"],
+    ),
+    "no measurement": (
+        lambda: kept("end_effector"),
+        ["needs a measurement", "q.JOINT", "end_effector", "torque"],
+    ),
     "no encoders": (lambda: kept("theta"), ["no motor encoders", "theta.JOINT"]),
     "both kinds": (both_kinds, ["end_effector, imu", "--measured-by"]),
-    "one axis": (lambda: kept("end_effector.z"), ["end_effector needs exactly", "x, y, z", "got x, y"]),
+    "one axis": (
+        lambda: kept("end_effector.z"),
+        ["end_effector needs exactly", "x, y, z", "got x, y"],
+    ),
     "column": (lambda: changed("end_effector.x", same, "tool_x"), ["'tool_x'", "theta.JOINT"]),
     "twice": (lambda: changed("theta.elbow", same, "theta.wrist_roll"), ["theta.wrist_roll twice"]),
-    "direction": (lambda: changed("direction.elbow", "0.5", pose=2), ["1 (approached from below)", "0.5"]),
+    "direction": (
+        lambda: changed("direction.elbow", "0.5", pose=2),
+        ["1 (approached from below)", "0.5"],
+    ),
     "short line": (lambda: [*table()[:1], ["1", "2"]], ["pose 1", "17 values", "got 2"]),
     "empty": (lambda: [], ["is empty"]),
     "header alone": (lambda: list(table()[:1]), ["1 to 10000 poses", "has 0"]),
     "metres": (
-        lambda: changed("end_effector.x", lambda v: str(1e3 * float(v))), ["end_effector", "spread over", "millimetres"]
+        lambda: changed("end_effector.x", lambda v: str(1e3 * float(v))),
+        ["end_effector", "spread over", "millimetres"],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_log_is_one_sentence_that_says_what_to_do(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_log_is_one_sentence_that_says_what_to_do(
+    case: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches tracebacks, fits of nonsense, and folders left behind."""
     content, words = BAD[case]
     with Path("bad.csv").open("w", newline="") as file:
@@ -627,7 +790,9 @@ REFUSED: Mapping[str, tuple[list[str], list[str]]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_wrong_option_says_what_and_which_choices(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_option_says_what_and_which_choices(
+    case: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches options that are ignored, and names that are not listed."""
     arguments, words = REFUSED[case]
     with pytest.raises(SystemExit) as ended:
@@ -641,15 +806,20 @@ def test_wrong_option_says_what_and_which_choices(case: str, capsys: pytest.Capt
 def test_a_log_that_no_springs_explain_is_refused() -> None:
     """Catches an endless fit, and a stiffness from measurements of another arm."""
     log = log_of("link_encoders", 15)
-    with pytest.raises((ElasticError, ConfigurationError), match=r"signs|rigid|springs|tell no stiffness"):
-        described(fit_arm(model_of(replace(log, measured=2.0 * log.theta - log.measured))), 0.03, None)
+    with pytest.raises(
+        (ElasticError, ConfigurationError), match=r"signs|rigid|springs|tell no stiffness"
+    ):
+        described(
+            fit_arm(model_of(replace(log, measured=2.0 * log.theta - log.measured))), 0.03, None
+        )
 
 
 def test_chosen_joints_alone_are_sought() -> None:
     """Catches a pattern that is ignored: all other joints stay rigid."""
     stiff = np.where(np.isin(JOINTS, ["elbow", "wrist_pitch"]), K, 1e12)
     theta = poses(40, np.random.default_rng(16))
-    data, rows = mujoco.MjData(ARM), []
+    data = mujoco.MjData(ARM)
+    rows = []
 
     def imbalance(q: Array, own: Array) -> Array:
         data.qpos[:] = q

@@ -22,11 +22,14 @@ SAGGING = (
     .replace(
         "<keyframe>",
         "<actuator>"
-        + "".join(f'<position joint="{one}" kp="4000" kv="60"/>' for one in ("base", "shoulder", "elbow"))
+        + "".join(
+            f'<position joint="{one}" kp="4000" kv="60"/>' for one in ("base", "shoulder", "elbow")
+        )
         + "</actuator><keyframe>",
     )
 )
-"""The arm with gravcomp on a body, a spring on a joint, and servos without integral action, which sag themselves."""
+"""The arm with gravcomp on a body, a spring on a joint, and servos without integral action,
+which sag themselves."""
 
 
 def planned(reference: Any, seed: int = 0, **arguments: Any) -> tuple[Any, Plan]:
@@ -50,7 +53,8 @@ def of_tool(q: Array) -> Array:
 
 @pytest.mark.parametrize("kind", ["poses", "moves", "line", "circle"])
 def test_rates_are_derivatives_of_angles(kind: str) -> None:
-    """Catches a chain rule that is left out, and a start in motion: finite differences are the judge."""
+    """Catches a chain rule that is left out, and a start in motion: finite differences are the
+    judge."""
     _, plan = planned(kind)
     centered = (plan.q[2:] - plan.q[:-2]) / 0.008
     np.testing.assert_allclose(plan.q_dot[1:-1], centered, atol=2e-3 * np.abs(plan.q_dot).max())
@@ -69,7 +73,9 @@ def test_the_tool_goes_straight_and_round() -> None:
     assert (way.min(), way.max()) == (pytest.approx(0.0, abs=1e-6), pytest.approx(1.0, abs=1e-6))
     circle = of_tool(planned({"kind": "circle", "radius": 0.06})[1].q[::25])
     plane = circle[:, [0, 2]]
-    fit = np.linalg.lstsq(np.c_[2.0 * plane, np.ones(len(plane))], (plane**2).sum(axis=1), rcond=None)[0]
+    fit = np.linalg.lstsq(
+        np.c_[2.0 * plane, np.ones(len(plane))], (plane**2).sum(axis=1), rcond=None
+    )[0]
     center = np.array([fit[0], 0.0, fit[1]])
     np.testing.assert_allclose(np.linalg.norm(circle - center, axis=1), 0.06, atol=1e-7)
     np.testing.assert_allclose(circle[-1], circle[0], atol=1e-7)
@@ -77,7 +83,8 @@ def test_the_tool_goes_straight_and_round() -> None:
 
 
 def test_poses_are_within_limits_and_at_rest_where_they_count() -> None:
-    """Catches windows that begin before the robot stands, and poses that press a joint against its limit."""
+    """Catches windows that begin before the robot stands, and poses that press a joint against
+    its limit."""
     plant, plan = planned({"kind": "poses", "positions": 30, "settle_s": 0.2})
     assert set(plan.rest[plan.scored]) == set(range(30))
     assert (plan.q_dot[plan.scored] == 0.0).all()
@@ -95,7 +102,9 @@ def test_a_file_is_played_through_its_rows(tmp_path: Path) -> None:
     file = tmp_path / "angles.csv"
     file.write_text("time_s,elbow,base\n5,0.9,0\n6,1.2,0.3\n7,0.8,0.1\n")
     _, plan = planned({"kind": "csv", "file": str(file)})
-    np.testing.assert_allclose(plan.q[[250, 500, 750]][:, [2, 0]], [[0.9, 0.0], [1.2, 0.3], [0.8, 0.1]], atol=1e-9)
+    np.testing.assert_allclose(
+        plan.q[[250, 500, 750]][:, [2, 0]], [[0.9, 0.0], [1.2, 0.3], [0.8, 0.1]], atol=1e-9
+    )
     np.testing.assert_allclose(plan.q[:, 1], 0.6)
     assert not plan.q_dot[[0, 250, -1]].any()
     for text, message in (
@@ -116,8 +125,14 @@ def test_a_file_is_played_through_its_rows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("reference", "message"),
     [
-        ({"kind": "line", "by": [2.0, 0.0, 0.0]}, r"cannot follow the path beyond .* % of it.*out of reach"),
-        ({"kind": "circle", "normal": [0.0, 0.0, 0.0]}, r"normal of a circle must have a length > 0"),
+        (
+            {"kind": "line", "by": [2.0, 0.0, 0.0]},
+            r"cannot follow the path beyond .* % of it.*out of reach",
+        ),
+        (
+            {"kind": "circle", "normal": [0.0, 0.0, 0.0]},
+            r"normal of a circle must have a length > 0",
+        ),
         ({"kind": "csv", "file": "none.csv"}, r"no file of angles at none.csv"),
         ("pose", r"unknown reference 'pose'.*Did you mean 'poses'"),
         ({"kind": "moves", "move_s": 0.02}, r"'moves' can need .* make its moves slower"),
@@ -128,26 +143,44 @@ def test_what_cannot_be_played_says_why(reference: Any, message: str) -> None:
         planned(reference)
 
 
-def errors_at_poses(policy: str, model: str, positions: int, worlds: int, scenario: str) -> dict[str, Array]:
+def errors_at_poses(
+    policy: str, model: str, positions: int, worlds: int, scenario: str
+) -> dict[str, Array]:
     """End-effector and link errors at static poses, of worlds with poses of their own."""
     times = {"move_s": 1.0, "settle_s": 1.6, "measure_s": 0.05}
     reference = {"kind": "poses", "positions": positions, "seed": None, **times}
     servo = {} if model is SAGGING else {"position_gain": 4e4, "integral_gain": 2e5}
-    joint = {"stiffness": 800.0, "damping": 30.0, "rotor_inertia": 0.2, "coulomb_friction": 1.0, "servo": servo}
+    joint = {
+        "stiffness": 800.0,
+        "damping": 30.0,
+        "rotor_inertia": 0.2,
+        "coulomb_friction": 1.0,
+        "servo": servo,
+    }
     env: Any = gymnasium.make_vec(
-        "elastic_env/Robot-v0", num_envs=worlds, vectorization_mode="vector_entry_point", model=model,
+        "elastic_env/Robot-v0",
+        num_envs=worlds,
+        vectorization_mode="vector_entry_point",
+        model=model,
         joints={"*": joint, "wrist": "held"},
-        end_effector="tool", reference=reference, scenario=scenario, timestep_s=0.001,
-    )  # fmt: skip
+        end_effector="tool",
+        reference=reference,
+        scenario=scenario,
+        timestep_s=0.001,
+    )
     player = baselines.make(policy, env)
     observation, info = env.reset(seed=0)
-    state, start = None, np.ones(worlds, dtype=np.bool_)
+    state = None
+    start = np.ones(worlds, dtype=np.bool_)
     while "episode_metrics" not in info:
         action, state = player.predict(observation, state, start)
         observation, *_, info = env.step(action)
         start = np.zeros(worlds, dtype=np.bool_)
     metrics = info["episode_metrics"]
-    return {name: np.asarray(metrics[name]) for name in ("end_effector_error_rms_m", "link_error_peak_rad")}
+    return {
+        name: np.asarray(metrics[name])
+        for name in ("end_effector_error_rms_m", "link_error_peak_rad")
+    }
 
 
 @pytest.mark.parametrize("model", [ARM, SAGGING], ids=["holding", "sagging, gravcomp, springs"])
@@ -160,10 +193,17 @@ def test_static_poses_are_compensated_to_a_hundredth(model: str) -> None:
 
 
 def test_what_friction_leaves_is_within_its_bound() -> None:
-    """Catches a compensator that adds to what friction leaves: F over K, less by how much gravity pulls on."""
+    """Catches a compensator that adds to what friction leaves: F over K, less by how much
+    gravity pulls on."""
     model = mujoco.MjModel.from_xml_string(ARM)
     data = mujoco.MjData(model)
-    data.qpos[:] = [0.0, np.pi / 2, 0.0, 0.0, 0.02]  # stretched out, where its weight has the longest levers
+    data.qpos[:] = [
+        0.0,
+        np.pi / 2,
+        0.0,
+        0.0,
+        0.02,
+    ]  # stretched out, where its weight has the longest levers
     mujoco.mj_forward(model, data)
     steepest = np.abs(data.qfrc_bias[1:3]).sum()
     left = errors_at_poses("input", ARM, 5, 2, "nominal")["link_error_peak_rad"]

@@ -26,7 +26,13 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def written(**case: Any) -> Path:
     """A configuration of one rollout."""
     path = Path("bench.yaml")
-    content = {"env": "testbed", "policy": "input", "reference": QUICK, "figures": {"link_error_rms_rad": None}, **case}
+    content = {
+        "env": "testbed",
+        "policy": "input",
+        "reference": QUICK,
+        "figures": {"link_error_rms_rad": None},
+        **case,
+    }
     path.write_text(f"# mine\n{yaml.safe_dump({'cases': [content]})}  # the end\n")
     return path
 
@@ -45,7 +51,8 @@ def failed(arguments: list[str]) -> bool:
 def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a margin with the wrong sign, an update that accepts something else, and a failure without exit code."""
+    """Catches a margin with the wrong sign, an update that accepts something else, and a failure
+    without exit code."""
     path = written()
     assert failed([str(path)])
     assert "nothing was accepted yet; elastic bench --update" in capsys.readouterr().out
@@ -70,7 +77,11 @@ def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[s
     """Catches nan that counts as small, and a misspelt metric that guards nothing."""
     walk = {"step_period": [0.3, 0.4, 0.3], "num_steps": 2}
     path = written(
-        env="walker", policy="zero", scenario="ideal+soft", reference=walk, figures={"pelvis_roll_rms_rad": 9.0}
+        env="walker",
+        policy="zero",
+        scenario="ideal+soft",
+        reference=walk,
+        figures={"pelvis_roll_rms_rad": 9.0},
     )
     assert failed([str(path)])
     assert "the episode ended as 'fell'" in capsys.readouterr().out
@@ -83,13 +94,16 @@ def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[s
 
 def test_the_shipped_configuration_is_accepted_in_full() -> None:
     """Catches a rollout that nobody has measured, and one without a walk."""
-    config = BenchConfig.model_validate(yaml.safe_load((ROOT / "configs" / "bench.yaml").read_text()))
+    config = BenchConfig.model_validate(
+        yaml.safe_load((ROOT / "configs" / "bench.yaml").read_text())
+    )
     assert all(value is not None for case in config.cases for value in case.figures.values())
     assert {case.env for case in config.cases} == {"testbed", "walker"}
 
 
 def test_the_package_has_its_own_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a bench that works in a checkout alone, and one that would change the installed package."""
+    """Catches a bench that works in a checkout alone, and one that would change the installed
+    package."""
     shipped = configuration(Path("configs/bench.yaml"))
     assert load_yaml(shipped, BenchConfig).cases
     assert shipped.resolve() == (ROOT / "configs" / "bench.yaml").resolve()

@@ -21,7 +21,8 @@ from train.evaluate.episodes import Evaluation, evaluate
 
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 CONDITION, OTHER = (
-    Condition(policy=PolicySpec(name=name), reference=SINE, episodes=2) for name in ("uncompensated", "input")
+    Condition(policy=PolicySpec(name=name), reference=SINE, episodes=2)
+    for name in ("uncompensated", "input")
 )
 
 
@@ -125,11 +126,20 @@ SEALED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "no mappings": (on_episodes(lambda _: [1, 2]), "it has no episodes"),
     "no signal": (lambda arrays: arrays.pop("trace/link_error"), "it has the signals"),
     "short signal": (set_array("trace/link_error", lambda values: values[:-1]), "samples"),
-    "table": (set_array("trace/link_error", lambda values: values[:, None]), "no series of numbers"),
+    "table": (
+        set_array("trace/link_error", lambda values: values[:, None]),
+        "no series of numbers",
+    ),
     "infinite": (set_array("trace/link_error", lambda values: values + np.inf), "not finite"),
     "time": (set_array("trace/time_s", lambda values: 0.0 * values), "its time does not go on"),
-    "deep": (set_array("episodes", lambda _: np.frombuffer(b"[" * 30_000, dtype=np.uint8)), "RecursionError"),
-    "huge text": (set_array("episodes", lambda _: np.zeros(50_000, dtype=np.uint8)), "at most 40000 are read"),
+    "deep": (
+        set_array("episodes", lambda _: np.frombuffer(b"[" * 30_000, dtype=np.uint8)),
+        "RecursionError",
+    ),
+    "huge text": (
+        set_array("episodes", lambda _: np.zeros(50_000, dtype=np.uint8)),
+        "at most 40000 are read",
+    ),
     "no episodes": (lambda arrays: arrays.pop("episodes"), "KeyError"),
 }
 
@@ -146,7 +156,10 @@ def test_what_does_not_fit_its_cell_is_not_taken(name: str, file: Path) -> None:
 def unpacked(size: int) -> bytes:
     """A small archive of a large array."""
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("episodes.npy", "w") as part:
+    with (
+        zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("episodes.npy", "w") as part,
+    ):
         for _ in range(size // 10_000_000):
             part.write(bytes(10_000_000))
     return content.getvalue()
@@ -181,10 +194,14 @@ def test_a_file_that_does_not_fit_is_said_once_and_played_again(
     """Catches a cell that is taken or played again without a word."""
     rewrite(file, CHANGES["figures"])
     out = io.StringIO()
-    found = run_conditions([CONDITION, OTHER], Console(file=out, width=400), store=Store(file.parent))
+    found = run_conditions(
+        [CONDITION, OTHER], Console(file=out, width=400), store=Store(file.parent)
+    )
     assert [e.episodes for e in found] == [e.episodes for e in played]
     said = out.getvalue()
-    assert said.count("kept cells that do not fit are played again: 'uncompensated' in 'nominal'") == 1
+    assert (
+        said.count("kept cells that do not fit are played again: 'uncompensated' in 'nominal'") == 1
+    )
     assert said.count(file.name) == 1
     assert "1 of 2 cells are kept" in said
     kept = Store(file.parent).get(CONDITION)
@@ -194,7 +211,8 @@ def test_a_file_that_does_not_fit_is_said_once_and_played_again(
 
 @pytest.mark.parametrize("label", ["marked.inner:f", "marked.py:f", "broken.py:f", "broken:f"])
 def test_a_label_is_no_code(label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a label, a name or an option that is imported, or read as Python, while a key is made."""
+    """Catches a label, a name or an option that is imported, or read as Python, while a key is
+    made."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     for file in ("marked.py", "marked/__init__.py", "marked/inner.py"):
@@ -214,7 +232,9 @@ def test_a_label_is_no_code(label: str, tmp_path: Path, monkeypatch: pytest.Monk
     assert not {"marked", "marked.inner", "broken"} & sys.modules.keys()
 
 
-def test_a_key_changes_with_a_module_within_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_changes_with_a_module_within_packages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a module that is not found without importing the packages around it."""
     monkeypatch.syspath_prepend(str(tmp_path))
     module = tmp_path / "outer_of_key" / "inner" / "mine.py"

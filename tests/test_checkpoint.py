@@ -1,4 +1,5 @@
-"""Checkpoints: whole or not at all, checked before they are read, and gone on with after a full disk."""
+"""Checkpoints: whole or not at all, checked before they are read, and gone on with after a full
+disk."""
 
 import random
 import resource
@@ -17,7 +18,8 @@ from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.runs.failures import SYSTEM_FAILED, explain
 
-MUTATIONS, FULL_DISKS = 300, 3
+MUTATIONS = 300
+FULL_DISKS = 3
 
 
 def write(checkpoint: Path, text: str) -> None:
@@ -75,7 +77,8 @@ def replace(file: Path, chance: random.Random) -> None:
 
 def test_a_mutated_checkpoint_is_refused_before_it_is_read(trained: Path, tmp_path: Path) -> None:
     """Catches a file that is read without its digest, and a digest that misses some change."""
-    chance, path = random.Random(26), tmp_path / "checkpoint"
+    chance = random.Random(26)
+    path = tmp_path / "checkpoint"
     require_whole(trained / "checkpoint")
     for _ in range(MUTATIONS):
         shutil.copytree(trained / "checkpoint", path, dirs_exist_ok=True)
@@ -111,12 +114,15 @@ def test_a_kill_between_the_moves_loses_nothing(tmp_path: Path) -> None:
 
 
 def test_no_thread_goes_on_writing_behind_a_training_that_was_ended(tmp_path: Path) -> None:
-    """Catches TensorBoard's thread, which would print a traceback where the disk is full, between other words."""
+    """Catches TensorBoard's thread, which would print a traceback where the disk is full,
+    between other words."""
     before = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).run(interrupted_after(32))
     assert [
-        type(thread).__name__ for thread in set(threading.enumerate()) - before if "Writer" in str(type(thread))
+        type(thread).__name__
+        for thread in set(threading.enumerate()) - before
+        if "Writer" in str(type(thread))
     ] == []
 
 
@@ -134,12 +140,18 @@ def full_beyond(size: int) -> Iterator[None]:
 def test_a_full_disk_is_one_sentence_and_the_training_goes_on(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a library that hides a full disk, a thread that prints it, and a file that is half written and used."""
-    config, chance = TrainConfig(**{**SMALL, **PPO}), random.Random(14)
+    """Catches a library that hides a full disk, a thread that prints it, and a file that is half
+    written and used."""
+    config = TrainConfig(**{**SMALL, **PPO})
+    chance = random.Random(14)
     Training(config, 1, tmp_path / "whole").run()
     for number in range(FULL_DISKS):
-        folder, size = tmp_path / str(number), chance.choice([0, 300, 3_000, 30_000, chance.randrange(60_000)])
-        with full_beyond(size), pytest.raises(Exception) as caught:  # noqa: PT011  `explain` judges it
+        folder = tmp_path / str(number)
+        size = chance.choice([0, 300, 3_000, 30_000, chance.randrange(60_000)])
+        with (
+            full_beyond(size),
+            pytest.raises(Exception) as caught,  # noqa: PT011
+        ):
             Training(config, 1, folder).run()
         found = explain(caught.value)
         assert found is not None, caught.value
@@ -147,5 +159,8 @@ def test_a_full_disk_is_one_sentence_and_the_training_goes_on(
         assert found[1] == SYSTEM_FAILED
         Training(config, 1, folder).run()
         for file in ("last/weights.safetensors", "best/weights.safetensors", "progress.csv"):
-            assert (folder / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), (size, file)
+            assert (folder / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), (
+                size,
+                file,
+            )
     assert "Traceback" not in capfd.readouterr().err

@@ -1,4 +1,5 @@
-"""Cells beside each other: kept by their content, moved when a worker is lost, the same wherever they are played."""
+"""Cells beside each other: kept by their content, moved when a worker is lost, the same wherever
+they are played."""
 
 import errno
 import os
@@ -35,7 +36,8 @@ from train.workers.executors import Executors
 from train.workers.versions import VersionsDifferError, require_same
 
 CONDITIONS = [
-    Condition(policy=PolicySpec(name=name), reference=SINE, episodes=2) for name in ("uncompensated", "input")
+    Condition(policy=PolicySpec(name=name), reference=SINE, episodes=2)
+    for name in ("uncompensated", "input")
 ]
 
 
@@ -77,17 +79,24 @@ def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> 
     """Catches calls that are tried for ever, and others that go with it."""
     moved: list[int] = []
     with Executors(jobs=2).open(3, tmp_path) as pool:
-        outcomes = run_calls(always_killed, [(False,), (True,), (False,)], pool, Watch(moved=moved.append))
+        outcomes = run_calls(
+            always_killed, [(False,), (True,), (False,)], pool, Watch(moved=moved.append)
+        )
     assert moved == [1, 1]
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine", None, "fine"]
     assert isinstance(outcomes[1].error, WorkerKilledError)  # type: ignore[union-attr]
 
 
 def processes_of(parent: int) -> set[int]:
-    """Processes of Python that a process has started, without the tracker that Python starts for itself."""
+    """Processes of Python that a process has started, without the tracker that Python starts for
+    itself."""
     lists = Path(f"/proc/{parent}/task").glob("*/children")
     found = [child for file in lists for child in file.read_text().split()]
-    return {int(child) for child in found if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()}
+    return {
+        int(child)
+        for child in found
+        if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+    }
 
 
 def helpers_killed(known: set[int], report: Callable[[int], None]) -> str:
@@ -99,8 +108,10 @@ def helpers_killed(known: set[int], report: Callable[[int], None]) -> str:
 
 
 def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path: Path) -> None:
-    """Catches a call that fails, with an error of its connection, where a helper of the program is killed."""
-    known, reports = processes_of(os.getpid()), list[Any]()
+    """Catches a call that fails, with an error of its connection, where a helper of the program
+    is killed."""
+    known = processes_of(os.getpid())
+    reports = list[Any]()
     watch = Watch(reported=lambda number, value: reports.append((number, value)))
     with Executors(jobs=1).open(2, tmp_path) as pool:
         outcomes = run_calls(helpers_killed, [(known,)] * 2, pool, watch)
@@ -110,7 +121,8 @@ def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path:
 
 def test_a_kept_cell_is_what_was_played(tmp_path: Path) -> None:
     """Catches a digit, a type or an order that the file loses."""
-    store, played = Store(tmp_path / "cells"), evaluate(CONDITIONS[0], num_threads=1)
+    store = Store(tmp_path / "cells")
+    played = evaluate(CONDITIONS[0], num_threads=1)
     assert store.get(CONDITIONS[0]) is None
     store.keep(played)
     found = store.get(CONDITIONS[0])
@@ -123,7 +135,8 @@ def test_a_kept_cell_is_what_was_played(tmp_path: Path) -> None:
 
 def test_only_what_is_missing_is_played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a policy that is added and has all others played again."""
-    store, played = Store(tmp_path), list[str]()
+    store = Store(tmp_path)
+    played = list[str]()
 
     def noted(conditions: Sequence[Condition], *options: Any) -> list[Evaluation]:
         played.extend(condition.policy.name for condition in conditions)
@@ -135,7 +148,9 @@ def test_only_what_is_missing_is_played(tmp_path: Path, monkeypatch: pytest.Monk
     assert played == ["uncompensated", "input"]
 
 
-def test_a_key_changes_with_the_source_of_a_users_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_changes_with_the_source_of_a_users_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a result of an older policy, and of an older module that it imports."""
     monkeypatch.chdir(tmp_path)
     Path("gains.py").write_text("GAIN = 1\n")
@@ -153,14 +168,20 @@ def test_a_key_changes_with_the_source_of_a_users_policy(tmp_path: Path, monkeyp
 def test_a_cell_whose_policy_changed_while_it_was_played_is_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a result of the older policy under the key of the newer one, which --resume would take."""
+    """Catches a result of the older policy under the key of the newer one, which --resume would
+    take."""
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('input', env)\n")
-    condition, store = CONDITIONS[0].replace(policy=PolicySpec(name="mine.py:make")), Store(tmp_path / "cells")
+    Path("mine.py").write_text(
+        "import baselines\n\ndef make(env):\n    return baselines.make('input', env)\n"
+    )
+    condition = CONDITIONS[0].replace(policy=PolicySpec(name="mine.py:make"))
+    store = Store(tmp_path / "cells")
 
     def edited(conditions: Sequence[Condition], *options: Any) -> list[Evaluation]:
         result = evaluate_together(conditions, *options)
-        Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('zero', env)\n")
+        Path("mine.py").write_text(
+            "import baselines\n\ndef make(env):\n    return baselines.make('zero', env)\n"
+        )
         return result
 
     with monkeypatch.context() as context:
@@ -202,7 +223,9 @@ def test_calls_share_the_cores_of_this_machine(
     assert executors.threads_per_call(calls) == threads
 
 
-def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_is_not_there_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("train.workers.dask_cluster._CONNECT_S", 0.5)
     port = free_port()
     with (
@@ -225,7 +248,10 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     (tmp_path / "other.py").write_text(OTHER_NUMPY)
     with (
         dask_cluster(1, "--no-nanny", "--preload", str(tmp_path / "other.py")) as (executors, _),
-        pytest.raises(VersionsDifferError, match=r"on tcp://.*: numpy 1\.0\.7 there, .* here; install the same commit"),
+        pytest.raises(
+            VersionsDifferError,
+            match=r"on tcp://.*: numpy 1\.0\.7 there, .* here; install the same commit",
+        ),
         executors.open(1, tmp_path),
     ):
         pass
@@ -243,11 +269,13 @@ policies: [uncompensated, input, dynamic]
 def test_a_disk_that_takes_no_more_keeps_the_cells_before(
     code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a cell that is half written and used, cells that go with the failure, and a traceback."""
+    """Catches a cell that is half written and used, cells that go with the failure, and a
+    traceback."""
     monkeypatch.chdir(tmp_path)
     Path("c.yaml").write_text(COMPARED)
     main(["compare", "c.yaml", "--output", "whole", "--jobs", "1"])
-    flushed, kept = flush, Path("run/cells")
+    flushed = flush
+    kept = Path("run/cells")
 
     def full(path: Path) -> None:
         if path.parent == kept and len(list(kept.glob("*.npz"))) == 2:
@@ -283,9 +311,13 @@ run_conditions([Condition(policy=PolicySpec(name=name)) for name in ("uncompensa
 def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
     """Catches an EOFError of a process that says nothing, and tracebacks of the processes."""
     (tmp_path / "script.py").write_text(UNGUARDED)
-    run = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
     assert run.returncode == 1
-    assert 2 <= run.stdout.count("run\n") <= 3  # the second worker may be ended before it comes that far
+    assert (
+        2 <= run.stdout.count("run\n") <= 3
+    )  # the second worker may be ended before it comes that far
     assert run.stderr.count("Traceback") == 1
     assert 'must do so below if __name__ == "__main__":' in run.stderr.splitlines()[-1]
 
@@ -293,7 +325,8 @@ def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
 def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a seed that begins anew, or goes on from another state, where another worker takes it over."""
+    """Catches a seed that begins anew, or goes on from another state, where another worker takes
+    it over."""
     config = TrainConfig(**{**SMALL, **PPO, "seeds": [3], "decisions": 384})
     own = tmp_path / "run" / "seed_3"
 
@@ -313,11 +346,20 @@ def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
 
 
 def test_a_scheduler_at_a_public_address_gets_a_warning() -> None:
-    """Catches a scheduler on the Internet, which runs the code of whoever reaches it, without a word."""
+    """Catches a scheduler on the Internet, which runs the code of whoever reaches it, without a
+    word."""
     for address in ("8.8.8.8:8786", "[2001:4860:4860::8888]:8786"):
-        with pytest.warns(UserWarning, match="public address, by plain TCP: whoever reaches it runs code"):
+        with pytest.warns(
+            UserWarning, match="public address, by plain TCP: whoever reaches it runs code"
+        ):
             warn_of_public(address)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for address in ("127.0.0.1:8786", "10.1.2.3:8786", "192.168.0.7:8786", "[::1]:8786", "no.such.invalid:1"):
+        for address in (
+            "127.0.0.1:8786",
+            "10.1.2.3:8786",
+            "192.168.0.7:8786",
+            "[::1]:8786",
+            "no.such.invalid:1",
+        ):
             warn_of_public(address)

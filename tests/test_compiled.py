@@ -1,4 +1,5 @@
-"""Compiled functions: the numbers that their Python code says, and nothing kept of code that has changed."""
+"""Compiled functions: the numbers that their Python code says, and nothing kept of code that has
+changed."""
 
 import ast
 import copy
@@ -30,36 +31,56 @@ from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.world.metrics", "elastic_env.world.control_kernels",
-    "elastic_env.rigid.tree.kernels", "elastic_env.rigid.leg_kernels", "elastic_env.rigid.tree.end_effector",
-    "baselines.compensation.compensators", "baselines.compensation.contact_torque", "baselines.walking.controller",
-    "baselines.walking.posture", "baselines.walking.zmp_shift", "baselines.estimation.bending",
+    "elastic_env.world.metrics",
+    "elastic_env.world.control_kernels",
+    "elastic_env.rigid.tree.kernels",
+    "elastic_env.rigid.leg_kernels",
+    "elastic_env.rigid.tree.end_effector",
+    "baselines.compensation.compensators",
+    "baselines.compensation.contact_torque",
+    "baselines.walking.controller",
+    "baselines.walking.posture",
+    "baselines.walking.zmp_shift",
+    "baselines.estimation.bending",
     "baselines.residual.network",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_a_kernel_calls_functions_of_its_own_file_alone(name: str) -> None:
-    """Catches code that Numba keeps although what it calls, or a constant that it uses, has changed in another file."""
+    """Catches code that Numba keeps although what it calls, or a constant that it uses, has
+    changed in another file."""
     module = importlib.import_module(name)
     tree = ast.parse(Path(str(module.__file__)).read_text())
     imported = {
         alias.asname or alias.name
         for node in tree.body
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(("elastic_env", "baselines", "train"))
+        if isinstance(node, ast.ImportFrom)
+        and str(node.module).startswith(("elastic_env", "baselines", "train"))
         for alias in node.names
     }
     functions = [f for f in tree.body if isinstance(f, ast.FunctionDef) and f.decorator_list]
-    compiled_ones = [f for f in functions if ast.unparse(f.decorator_list[0]) in ("compiled", "within_compiled")]
+    compiled_ones = [
+        f for f in functions if ast.unparse(f.decorator_list[0]) in ("compiled", "within_compiled")
+    ]
     assert compiled_ones
     for function in compiled_ones:
-        used = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+        used = {
+            node.id
+            for part in function.body
+            for node in ast.walk(part)
+            if isinstance(node, ast.Name)
+        }
         assert not used & imported, function.name
 
 
 def test_every_compiled_function_is_looked_at() -> None:
     """Catches a kernel in a file that the test above does not know."""
-    files = [file for package in ("elastic_env", "baselines", "train") for file in (ROOT / package).rglob("*.py")]
+    files = [
+        file
+        for package in ("elastic_env", "baselines", "train")
+        for file in (ROOT / package).rglob("*.py")
+    ]
     signs = "\n@compiled", "\n@within_compiled", "numba.njit", "register_jitable("
     found = {file for file in files if any(sign in file.read_text() for sign in signs)}
     known = {ROOT / f"{name.replace('.', '/')}.py" for name in KERNELS}
@@ -112,7 +133,8 @@ assert four_times(1.5) == 6.0
 
 
 def test_a_function_of_the_users_can_call_one_of_ours(tmp_path: Path) -> None:
-    """Catches a thread that waits for the compiler's lock, which the function that is compiled holds."""
+    """Catches a thread that waits for the compiler's lock, which the function that is compiled
+    holds."""
     path = tmp_path / "users.py"
     path.write_text(USERS)
     subprocess.run([sys.executable, str(path)], check=True, timeout=60)
@@ -136,8 +158,10 @@ def eight_times(value):
 
 
 def test_a_command_says_once_that_functions_of_ours_are_compiled(tmp_path: Path) -> None:
-    """Catches a wait that nobody explains, a line for every function, and one where the code is loaded."""
-    path, said = tmp_path / "kept.py", []
+    """Catches a wait that nobody explains, a line for every function, and one where the code is
+    loaded."""
+    path = tmp_path / "kept.py"
+    said = []
     path.write_text(KEPT)
     for _ in range(2):
         spec = importlib.util.spec_from_file_location("kept", path)
@@ -153,24 +177,34 @@ def test_a_command_says_once_that_functions_of_ours_are_compiled(tmp_path: Path)
             assert kept.four_times(1.5) == 6.0
         kept.four_times(np.float32(1.5))  # compiled, and out of the command
         said.append(console.file.getvalue())  # type: ignore[attr-defined]
-    line = "compiling, once after an installation or an update: the first use takes some seconds longer\n"
+    line = (
+        "compiling, once after an installation or an update: the first use takes some seconds"
+        " longer\n"
+    )
     assert said == ["", line, "", ""]
 
 
 def test_a_library_says_nothing_of_what_it_compiles() -> None:
     """Catches output in programs of others."""
-    code = "from elastic_env.core.compiled import compiled; assert compiled(lambda value: 2.0 * value)(1.5) == 3.0"
+    code = (
+        "from elastic_env.core.compiled import compiled; assert compiled(lambda value: 2.0 *"
+        " value)(1.5) == 3.0"
+    )
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert (ran.stdout, ran.stderr) == (b"", b"")
 
 
 def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
-    """Catches a Ctrl-C that comes where C code has called Python, which drops its exception: a motion would go on."""
+    """Catches a Ctrl-C that comes where C code has called Python, which drops its exception: a
+    motion would go on."""
     times = 0
 
     def interrupt(frame: Any, event: str, _: Any) -> None:
         nonlocal times
-        called_by_c = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")  # compiling, loading
+        called_by_c = (
+            "_raw_object_cache_notify",
+            "_raw_object_cache_getbuffer",
+        )  # compiling, loading
         if event == "call" and frame.f_code.co_name in called_by_c and times == 0:
             times += 1
             signal.raise_signal(signal.SIGINT)
@@ -192,7 +226,8 @@ def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
 
 
 def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a first step, or first steps that are scored, which let a servo wait for the compiler."""
+    """Catches a first step, or first steps that are scored, which let a servo wait for the
+    compiler."""
     used: list[Any] = []
     names = ("command", "begin_links", "sense_links", "show_joints")
     for owner, name in (*((kernels, name) for name in names), (metrics, "_add_in_order")):
@@ -218,7 +253,9 @@ def test_division_by_zero_is_as_in_numpy() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["nominal", "sensor", "spread", "imu"])
-def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_compiled_control_step_does_what_its_python_code_says(
+    scenario: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches code that is compiled to something else, and what was compiled before a change."""
     worlds = gymnasium.make_vec("elastic_env/WalkInPlace-v0", num_envs=2, scenario=scenario)
     worlds.reset(seed=4)
@@ -242,7 +279,9 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
 
         return both
 
-    compiled_ones = {name: function for name, function in vars(kernels).items() if hasattr(function, "py_func")}
+    compiled_ones = {
+        name: function for name, function in vars(kernels).items() if hasattr(function, "py_func")
+    }
     for name in ("command", "sense_walk"):
         monkeypatch.setattr(kernels, name, compared(compiled_ones[name]))
     for k in range(20):
@@ -280,17 +319,23 @@ assert np.isfinite(row).all() and len(row) == 95
 
 
 def test_compiled_policies_do_what_their_python_code_says() -> None:
-    """Catches a policy's code that is compiled to something else, and what was compiled before a change.
+    """Catches a policy's code that is compiled to something else, and what was compiled before a
+    change.
 
     Also an import or an environment that fails when Numba is switched off, as for a debugger.
     """
     said = [
         subprocess.run(
-            [sys.executable, "-c", PLAYED], check=True, capture_output=True, text=True,
+            [sys.executable, "-c", PLAYED],
+            check=True,
+            capture_output=True,
+            text=True,
             env={**os.environ, "NUMBA_DISABLE_JIT": switch},
         ).stdout
         for switch in "01"
-    ]  # fmt: skip
-    compiled_ones, plain = (np.array([line.split() for line in text.splitlines()], dtype=np.float64) for text in said)
+    ]
+    compiled_ones, plain = (
+        np.array([line.split() for line in text.splitlines()], dtype=np.float64) for text in said
+    )
     assert compiled_ones.shape == (6, 38)
     np.testing.assert_allclose(compiled_ones, plain, rtol=1e-7, atol=1e-12)

@@ -48,10 +48,16 @@ class Outer(Model):
         ({"rate": np.inf}, r"Outer\.rate must be a finite number > 0 \[Hz\], got inf"),
         ({"rate": "fast"}, r"Outer\.rate must be .*number.* \[Hz\], got 'fast'"),
         ({"rate": None}, r"Outer\.rate must be .*number.* \[Hz\], got None"),
-        ({"rate": 1.0, "offset": np.nan}, r"Outer\.offset must be a finite number \[rad\], got nan"),
+        (
+            {"rate": 1.0, "offset": np.nan},
+            r"Outer\.offset must be a finite number \[rad\], got nan",
+        ),
         ({"rate": 1.0, "count": 0}, r"Outer\.count must be .*>= 1, got 0"),
         ({"rate": 1.0, "count": 2.5}, r"Outer\.count must be a whole number >= 1, got 2\.5"),
-        ({"rate": 1.0, "raet": 2.0}, r"unknown parameter of Outer 'raet'; choose one of: rate, count.*'rate'"),
+        (
+            {"rate": 1.0, "raet": 2.0},
+            r"unknown parameter of Outer 'raet'; choose one of: rate, count.*'rate'",
+        ),
         (
             {"rate": 1.0, "inner": {"length": 3.0}},
             r"Outer\.inner\.length must be a finite number > 0 and <= 2 \[m\], got 3\.0",
@@ -63,7 +69,9 @@ class Outer(Model):
         ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be a mapping of parameters, got 5"),
     ],
 )
-def test_a_wrong_value_names_parameter_unit_bound_and_itself(values: dict[str, object], message: str) -> None:
+def test_a_wrong_value_names_parameter_unit_bound_and_itself(
+    values: dict[str, object], message: str
+) -> None:
     """Catches an error message without one of the four, also where models are nested."""
     with pytest.raises(ConfigurationError, match=message):
         Outer(**values)
@@ -103,17 +111,24 @@ def test_text_and_truth_are_no_numbers(values: dict[str, object]) -> None:
     """Catches "2" taken for 2, and True for 1, also where numbers stand in lists and mappings."""
     (name,) = values
     with pytest.raises(
-        ConfigurationError, match=rf"^Numbers\.{name}[.\w]* must be a valid (number|integer), got (b?['\"]|True|False)"
+        ConfigurationError,
+        match=rf"^Numbers\.{name}[.\w]* must be a valid (number|integer), got (b?['\"]|True|False)",
     ):
         Numbers(**values)
 
 
 def test_numbers_may_be_those_of_numpy() -> None:
-    """Catches arrays that are refused, and a float32 that becomes a neighbour of what is written."""
+    """Catches arrays that are refused, and a float32 that becomes a neighbour of what is
+    written."""
     model = Numbers(
-        one=np.float32(1.6), count=np.int64(3), several=np.array([0.8, 0.6], dtype=np.float32), fixed=np.arange(2),
-        named={"a": np.uint8(4)}, path_or_number="1", anything="2",
-    )  # fmt: skip
+        one=np.float32(1.6),
+        count=np.int64(3),
+        several=np.array([0.8, 0.6], dtype=np.float32),
+        fixed=np.arange(2),
+        named={"a": np.uint8(4)},
+        path_or_number="1",
+        anything="2",
+    )
     assert (model.one, model.count, model.several, model.fixed) == (1.6, 3, [0.8, 0.6], (0.0, 1.0))
     assert (model.named, model.path_or_number, model.anything) == ({"a": 4}, "1", "2")
     assert type(model.one) is float
@@ -122,7 +137,9 @@ def test_numbers_may_be_those_of_numpy() -> None:
         Numbers(one=np.float32("nan"))
 
 
-@pytest.mark.parametrize("text", ["1e3", "1E3", "+1e+3", "1.0e3", "10.e2", ".1e4", "1000", "1e3 # a remark"])
+@pytest.mark.parametrize(
+    "text", ["1e3", "1E3", "+1e+3", "1.0e3", "10.e2", ".1e4", "1000", "1e3 # a remark"]
+)
 def test_numbers_with_an_exponent_are_numbers(text: str) -> None:
     """Catches the YAML of 2005, in which 1e3 is text."""
     assert parse_yaml(text) == 1000
@@ -146,7 +163,9 @@ def test_models_are_frozen_and_their_copies_validated() -> None:
         outer.rate = 3.0  # type: ignore[misc]
     assert outer.replace(count=5) == Outer(rate=2.0, count=5)
     assert outer.count == 3
-    with pytest.raises(ConfigurationError, match=r"Outer\.rate must be a finite number > 0 \[Hz\], got -3\.0"):
+    with pytest.raises(
+        ConfigurationError, match=r"Outer\.rate must be a finite number > 0 \[Hz\], got -3\.0"
+    ):
         outer.replace(rate=-3.0)
     with pytest.raises(ConfigurationError, match="unknown parameter of Outer 'rte'"):
         outer.replace(rte=3.0)
@@ -160,18 +179,26 @@ def test_errors_are_value_errors() -> None:
 
 def test_unknown_names_list_the_choices_and_suggest_the_closest() -> None:
     """Catches a hint that is no choice, and one where nothing is close."""
-    assert str(unknown_name("policy", "inptu", ["zero", "input"])) == (
-        "unknown policy 'inptu'; choose one of: zero, input. Did you mean 'input'?"
+    assert (
+        str(unknown_name("policy", "inptu", ["zero", "input"]))
+        == "unknown policy 'inptu'; choose one of: zero, input. Did you mean 'input'?"
     )
-    assert str(unknown_name("policy", "xyz", ["zero", "input"])) == "unknown policy 'xyz'; choose one of: zero, input."
-    assert "pip install -c constraints.txt '.[train]'" in str(missing_extra("torch", "train", "training"))
+    assert (
+        str(unknown_name("policy", "xyz", ["zero", "input"]))
+        == "unknown policy 'xyz'; choose one of: zero, input."
+    )
+    assert "pip install -c constraints.txt '.[train]'" in str(
+        missing_extra("torch", "train", "training")
+    )
 
 
 def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
     """Catches numbers that YAML reads as text, such as 1e3, and nested parameters that are lost."""
     file = tmp_path / "outer.yaml"
     file.write_text("rate: 1e3\ncount: 4\ninner:\n  length: 1.5\nname: tëst\n", encoding="utf-8")
-    assert load_yaml(file, Outer) == Outer(rate=1000.0, count=4, inner=Inner(length=1.5), name="tëst")
+    assert load_yaml(file, Outer) == Outer(
+        rate=1000.0, count=4, inner=Inner(length=1.5), name="tëst"
+    )
     assert load_yaml(str(file), Outer).rate == 1000.0
 
 
@@ -185,7 +212,10 @@ def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
         ("rate: !!python/object/apply:os.getcwd []\n", r"outer\.yaml is not valid YAML"),
         ("rate: -1\n", r"in .*outer\.yaml: rate must be a finite number > 0 \[Hz\], got -1"),
         ("rate: .nan\n", r"in .*outer\.yaml: rate must be a finite number > 0 \[Hz\], got nan"),
-        ("rate: 1\nspeed: 2\n", r"in .*outer\.yaml: unknown parameter 'speed'; choose one of: rate, count"),
+        (
+            "rate: 1\nspeed: 2\n",
+            r"in .*outer\.yaml: unknown parameter 'speed'; choose one of: rate, count",
+        ),
         (
             "rate: 1\ninner: {width: 1}\n",
             r"in .*outer\.yaml: .*unknown parameter of inner 'width'; choose one of: length",
@@ -194,8 +224,11 @@ def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
         ("rate: 1\nnull: 3\n", r"outer\.yaml.*parameter.*None"),
     ],
 )
-def test_a_wrong_yaml_file_names_itself_and_the_problem(tmp_path: Path, content: str, message: str) -> None:
-    """Catches a traceback in place of an explanation, code in a file that runs, and keys that are no names."""
+def test_a_wrong_yaml_file_names_itself_and_the_problem(
+    tmp_path: Path, content: str, message: str
+) -> None:
+    """Catches a traceback in place of an explanation, code in a file that runs, and keys that
+    are no names."""
     file = tmp_path / "outer.yaml"
     file.write_text(content)
     with pytest.raises(ConfigurationError, match=message):
@@ -214,7 +247,8 @@ def test_a_missing_file_lists_those_beside_it(tmp_path: Path) -> None:
     """Catches a mistyped path that leaves one searching."""
     (tmp_path / "compare.yaml").write_text("rate: 1\n")
     with pytest.raises(
-        ConfigurationError, match=r"no configuration file at .*cmpare\.yaml; found beside it: .*compare\.yaml"
+        ConfigurationError,
+        match=r"no configuration file at .*cmpare\.yaml; found beside it: .*compare\.yaml",
     ):
         load_yaml(tmp_path / "cmpare.yaml", Outer)
     with pytest.raises(ConfigurationError, match="no configuration file at"):
@@ -225,12 +259,15 @@ def test_a_missing_file_lists_those_beside_it(tmp_path: Path) -> None:
 
 def test_a_configuration_of_the_testbed_survives_its_own_dump() -> None:
     """Catches a resolved configuration, stored beside results, that cannot be read back."""
-    config = TestbedConfig(reference={"kind": "multisine", "seed": 4}, scenario={"name": "own", "stiffness_scale": 0.5})
+    config = TestbedConfig(
+        reference={"kind": "multisine", "seed": 4}, scenario={"name": "own", "stiffness_scale": 0.5}
+    )
     assert TestbedConfig(**config.model_dump()) == config
 
 
 def test_every_parameter_has_a_unit_or_is_no_number() -> None:
-    """Catches a number that nobody can read: all numeric parameters of the testbed carry their unit."""
+    """Catches a number that nobody can read: all numeric parameters of the testbed carry their
+    unit."""
 
     def numbers_without_unit(model: type[Model], seen: set[type]) -> list[str]:
         missing = []
@@ -240,7 +277,9 @@ def test_every_parameter_has_a_unit_or_is_no_number() -> None:
             default = field.default
             if isinstance(default, Model) and type(default) not in seen:
                 missing += numbers_without_unit(type(default), seen | {type(default)})
-            elif isinstance(default, int | float) and not isinstance(default, bool) and not has_unit:
+            elif (
+                isinstance(default, int | float) and not isinstance(default, bool) and not has_unit
+            ):
                 missing.append(f"{model.__name__}.{name}")
         return missing
 
@@ -248,24 +287,32 @@ def test_every_parameter_has_a_unit_or_is_no_number() -> None:
 
 
 def test_every_option_is_documented() -> None:
-    """Catches an argument or a key that docs/options.md does not have, or that it has and nothing takes."""
+    """Catches an argument or a key that docs/options.md does not have, or that it has and
+    nothing takes."""
     arguments = {*signature(configure_testbed).parameters, *signature(configure_walk).parameters}
     keys = {
-        name for model in (PolicyOptions, CompareConfig, TrainConfig, ResidualSettings) for name in model.model_fields
+        name
+        for model in (PolicyOptions, CompareConfig, TrainConfig, ResidualSettings)
+        for name in model.model_fields
     }
     text = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
     quoted = set(re.findall(r"`(\w+)`", text))
     assert arguments | keys <= quoted
     first_cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    assert {name for cell in first_cells for name in re.findall(r"`(\w+)`", cell)} <= arguments | keys
+    assert {
+        name for cell in first_cells for name in re.findall(r"`(\w+)`", cell)
+    } <= arguments | keys
 
 
 MANY = {str(number): number for number in range(2000)}
 
 
-@pytest.mark.parametrize("argument", [{"reward": MANY}, {"reward": [1] * 2000}, {"gait": [1] * 2000}, {"robot": MANY}])
+@pytest.mark.parametrize(
+    "argument", [{"reward": MANY}, {"reward": [1] * 2000}, {"gait": [1] * 2000}, {"robot": MANY}]
+)
 def test_an_error_is_short_whatever_was_given(argument: dict[str, Any]) -> None:
-    """Catches an error that repeats all of a long list, or names each of two thousand unknown parameters."""
+    """Catches an error that repeats all of a long list, or names each of two thousand unknown
+    parameters."""
     with pytest.raises(ConfigurationError) as raised:
         configure_walk(**argument)
     assert len(str(raised.value)) < 2000

@@ -1,4 +1,5 @@
-"""Joint torques of the standing walker against MuJoCo, Pinocchio, differences, published numbers and its springs."""
+"""Joint torques of the standing walker against MuJoCo, Pinocchio, differences, published numbers
+and its springs."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -74,8 +75,10 @@ def posed(q: Array, attitude: Array) -> mujoco.MjData:
 
 
 def torque_of_mujoco(data: mujoco.MjData, points: Array, forces: Array) -> tuple[Array, Array]:
-    """What holds the robot at rest under forces on its feet at points, (2, 3) each: on the base (6,), joints (12,)."""
-    rigid, effort = model().biped.rigid, data.qfrc_bias.copy()
+    """What holds the robot at rest under forces on its feet at points, (2, 3) each: on the base
+    (6,), joints (12,)."""
+    rigid = model().biped.rigid
+    effort = data.qfrc_bias.copy()
     for side, point, force in zip("lr", points, forces, strict=True):
         jacobian = np.zeros((3, rigid.nv))
         mujoco.mj_jac(rigid, data, jacobian, None, point, rigid.body(f"{side}_foot").id)
@@ -89,10 +92,12 @@ def center_of_mass(data: mujoco.MjData) -> Array:
 
 
 def standing_over(point: Array, lift: tuple[float, float] = (0.0, 0.0)) -> Array:
-    """Joint angles with level pelvis, hip axes at 0.66 m, that put the COM of the robot over a point, (12,) [rad]."""
+    """Joint angles with level pelvis, hip axes at 0.66 m, that put the COM of the robot over a
+    point, (12,) [rad]."""
     biped = model().biped
     ankles = np.column_stack([biped.footholds, ANKLE_HEIGHT_M + np.array(lift)])
-    body, pelvis = FloatingBody(biped.rigid, LEG_JOINTS), np.array([*point, 0.66])
+    body = FloatingBody(biped.rigid, LEG_JOINTS)
+    pelvis = np.array([*point, 0.66])
     for _ in range(60):
         q = biped.joint_angles(pelvis, ankles)
         pelvis[:2] += point - pelvis[:2] - body.center_of_mass(q[None])[0, :2]
@@ -101,7 +106,10 @@ def standing_over(point: Array, lift: tuple[float, float] = (0.0, 0.0)) -> Array
 
 def central_differences(gravity: GravityModel, q: Array, step: float = 1e-5) -> Array:
     """∂τ_i/∂q_j of every row, (N, 12, 12) [N·m/rad]."""
-    columns = [gravity.gravity_torque(q + step * e) - gravity.gravity_torque(q - step * e) for e in np.eye(12)]
+    columns = [
+        gravity.gravity_torque(q + step * e) - gravity.gravity_torque(q - step * e)
+        for e in np.eye(12)
+    ]
     return np.stack(columns, axis=-1) / (2.0 * step)
 
 
@@ -112,13 +120,15 @@ def random_loads(generator: np.random.Generator, n: int) -> Array:
         load_share=generator.uniform(0.0, 1.0, (n, 1)),
         zmp_reference=generator.uniform(-0.1, 0.1, (n, 2)),
         imu_attitude=generator.uniform(-0.3, 0.3, (n, 2)),
-        wrench=generator.uniform(-1.0, 1.0, (n, 12)) * np.tile([50.0, 50.0, 500.0, 20.0, 20.0, 5.0], 2),
+        wrench=generator.uniform(-1.0, 1.0, (n, 12))
+        * np.tile([50.0, 50.0, 500.0, 20.0, 20.0, 5.0], 2),
     )
 
 
 @SIDES
 def test_com_is_the_multibody_torque_in_single_support(side: int) -> None:
-    """Catches a wrong sign, lever, frame or share of Eq. 4: MuJoCo's robot on one foot, COM over the ZMP, is at rest.
+    """Catches a wrong sign, lever, frame or share of Eq. 4: MuJoCo's robot on one foot, COM over
+    the ZMP, is at rest.
 
     Any attitude and any posture: the vertical through the COM meets the sole where the force acts.
     """
@@ -126,28 +136,35 @@ def test_com_is_the_multibody_torque_in_single_support(side: int) -> None:
     force = np.zeros((2, 3))
     force[side, 2] = WEIGHT_N
     for _ in range(20):
-        q, attitude = generator.uniform(-0.5, 0.5, 12), generator.uniform(-0.3, 0.3, 2)
+        q = generator.uniform(-0.5, 0.5, 12)
+        attitude = generator.uniform(-0.3, 0.3, 2)
         data = posed(q, attitude)
         foot = data.body(f"{'lr'[side]}_foot")
         R = foot.xmat.reshape(3, 3)
-        com, down = R.T @ (center_of_mass(data) - foot.xpos), -R[2]
+        com = R.T @ (center_of_mass(data) - foot.xpos)
+        down = -R[2]
         in_sole = com - down * (com[2] + ANKLE_HEIGHT_M) / down[2]
         point = foot.xpos + R @ in_sole
         base, expected = torque_of_mujoco(data, np.tile(point, (2, 1)), force)
         np.testing.assert_allclose(base, 0.0, rtol=0.0, atol=1e-9)
         zmp = model().biped.footholds[side] + in_sole[:2]
         observation = rows(1, load_share=side, zmp_reference=zmp, imu_attitude=attitude)
-        torque = make_gravity(model(), "com").at(observation, level=False).gravity_torque(q[None])[0]
+        torque = (
+            make_gravity(model(), "com").at(observation, level=False).gravity_torque(q[None])[0]
+        )
         np.testing.assert_allclose(torque, expected, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.9, 1.0])
 def test_com_is_the_multibody_torque_in_double_support(share: float) -> None:
-    """Catches Eq. 5 with the shares swapped, and a share that is not taken at a point of its own foot.
+    """Catches Eq. 5 with the shares swapped, and a share that is not taken at a point of its own
+    foot.
 
-    MuJoCo's robot on both feet, the ZMP between them and 0.03 m ahead: nothing is left over for the base.
+    MuJoCo's robot on both feet, the ZMP between them and 0.03 m ahead: nothing is left over for the
+    base.
     """
-    footholds, ahead = model().biped.footholds, np.array([0.03, 0.0])
+    footholds = model().biped.footholds
+    ahead = np.array([0.03, 0.0])
     weights = np.array([1.0 - share, share])
     zmp = weights @ footholds + ahead
     q = standing_over(zmp)
@@ -156,19 +173,26 @@ def test_com_is_the_multibody_torque_in_double_support(share: float) -> None:
     points = np.array([data.body(f"{side}_foot").xpos + below for side in "lr"])
     base, expected = torque_of_mujoco(data, points, weights[:, None] * [0.0, 0.0, WEIGHT_N])
     np.testing.assert_allclose(base, 0.0, rtol=0.0, atol=1e-9)
-    gravity = make_gravity(model()).at(rows(1, load_share=share, zmp_reference=zmp))  # the default is "com"
+    gravity = make_gravity(model()).at(
+        rows(1, load_share=share, zmp_reference=zmp)
+    )  # the default is "com"
     np.testing.assert_allclose(gravity.gravity_torque(q[None])[0], expected, rtol=0.0, atol=1e-9)
 
 
 def test_com_is_equation_4_with_explicit_jacobians() -> None:
-    """Catches J^T F that is not from the COM to the contact points: Pinocchio's COM and the closed form of the legs.
+    """Catches J^T F that is not from the COM to the contact points: Pinocchio's COM and the closed
+    form of the legs.
 
-    The ground's forces μF and (1 − μ)F act at fixed points of the feet; the Jacobians are central differences.
+    The ground's forces μF and (1 − μ)F act at fixed points of the feet; the Jacobians are central
+    differences.
     """
-    generator, biped = np.random.default_rng(3), model().biped
-    body, step = FloatingBody(biped.rigid, LEG_JOINTS), 1e-5
+    generator = np.random.default_rng(3)
+    biped = model().biped
+    body = FloatingBody(biped.rigid, LEG_JOINTS)
+    step = 1e-5
     for _ in range(5):
-        q, share = generator.uniform(-0.5, 0.5, 12), float(generator.uniform())
+        q = generator.uniform(-0.5, 0.5, 12)
+        share = float(generator.uniform())
         weights = np.array([1.0 - share, share])
         ahead = generator.uniform(-0.05, 0.05, 2)
 
@@ -188,7 +212,8 @@ def test_com_is_equation_4_with_explicit_jacobians() -> None:
 
 
 def test_unloaded_legs_weigh_what_pinocchio_says() -> None:
-    """Catches a leg without weight where its foot is not loaded: Pinocchio's gravity torque of a robot in the air."""
+    """Catches a leg without weight where its foot is not loaded: Pinocchio's gravity torque of a
+    robot in the air."""
     q = np.random.default_rng(4).uniform(-0.6, 0.6, (10, 12))
     zero = np.zeros_like(q)
     body = FloatingBody(model().biped.rigid, LEG_JOINTS)
@@ -207,7 +232,8 @@ def test_unloaded_legs_weigh_what_pinocchio_says() -> None:
 def test_com_has_the_published_torques_of_the_stance_leg(
     inward: float, hip_roll: float, ankle_roll: float, knee: float, hip_pitch: float
 ) -> None:
-    """Catches a contact that does not follow the ZMP: left stance, right foot 0.05 m up, ZMP inward of the ankle."""
+    """Catches a contact that does not follow the ZMP: left stance, right foot 0.05 m up, ZMP
+    inward of the ankle."""
     zmp = model().biped.footholds[0] - [0.0, inward]
     q = standing_over(zmp, (0.0, 0.05))
     torque = make_gravity(model(), "com").at(rows(1, zmp_reference=zmp)).gravity_torque(q[None])[0]
@@ -218,27 +244,36 @@ def test_com_has_the_published_torques_of_the_stance_leg(
 
 
 def test_contact_at_the_ankle_axes_leaves_the_ankles_without_torque() -> None:
-    """Catches `ankle` and `lumped` with the force at the ZMP, and legs that weigh something in `lumped`.
+    """Catches `ankle` and `lumped` with the force at the ZMP, and legs that weigh something in
+    `lumped`.
 
-    Left stance with the ZMP 0.02 m inward: 60.4 N·m at the hip, not 71.5, and nothing but the foot on the ankle.
+    Left stance with the ZMP 0.02 m inward: 60.4 N·m at the hip, not 71.5, and nothing but the foot
+    on the ankle.
     """
     zmp = model().biped.footholds[0] - [0.0, 0.02]
     q = standing_over(zmp, (0.0, 0.05))
     observation = rows(1, zmp_reference=zmp)
-    com, ankle, lumped = (make_gravity(model(), m).at(observation).gravity_torque(q[None])[0] for m in METHODS)
-    left, hip = slice(4, 6), OF_LEFT["hip_roll"]
+    com, ankle, lumped = (
+        make_gravity(model(), m).at(observation).gravity_torque(q[None])[0] for m in METHODS
+    )
+    left = slice(4, 6)
+    hip = OF_LEFT["hip_roll"]
     np.testing.assert_allclose(lumped[left], 0.0, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(lumped[6:], 0.0, rtol=0.0, atol=1e-12)  # the right leg: no load, no weight
+    np.testing.assert_allclose(
+        lumped[6:], 0.0, rtol=0.0, atol=1e-12
+    )  # the right leg: no load, no weight
     assert lumped[hip] == pytest.approx(60.4, abs=0.1)
     assert np.abs(ankle[left]).max() < 0.1
     np.testing.assert_allclose(ankle[6:], com[6:], rtol=0.0, atol=1e-12)
-    # the force at the ankle and not at the ZMP: 0.02 m times the weight on every roll axis of the leg
+    # the force at the ankle and not at the ZMP: 0.02 m times the weight on every roll axis of the
+    # leg
     np.testing.assert_allclose((com - ankle)[[hip, 5]], 0.02 * WEIGHT_N, rtol=1e-9)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients_of_the_gravity_torque_are_its_derivatives(method: str) -> None:
-    """Catches a transposed or incomplete block, legs that couple, a contact point that stays when its foot moves."""
+    """Catches a transposed or incomplete block, legs that couple, a contact point that stays
+    when its foot moves."""
     generator = np.random.default_rng(5)
     q = generator.uniform(-0.6, 0.6, (6, 12))
     gravity = make_gravity(model(), method).at(random_loads(generator, 6), level=False)
@@ -251,7 +286,8 @@ def test_gradients_of_the_gravity_torque_are_its_derivatives(method: str) -> Non
 
 
 def test_gradient_of_the_measured_wrench_turns_with_the_foot() -> None:
-    """Catches the Hessian of a fixed force for a wrench that is measured in the foot: its gradient is not symmetric."""
+    """Catches the Hessian of a fixed force for a wrench that is measured in the foot: its
+    gradient is not symmetric."""
     generator = np.random.default_rng(6)
     q = generator.uniform(-0.6, 0.6, (6, 12))
     load = WrenchTorque(model()).at(random_loads(generator, 6))
@@ -265,12 +301,15 @@ def test_gradient_of_the_measured_wrench_turns_with_the_foot() -> None:
 
 @pytest.mark.parametrize("method", [*METHODS, "wrench"])
 def test_rows_of_a_batch_are_the_single_walkers_exactly(method: str) -> None:
-    """Catches loads of one world that reach another, and results that depend on the size of the batch."""
+    """Catches loads of one world that reach another, and results that depend on the size of the
+    batch."""
     generator = np.random.default_rng(7)
-    q, observation = generator.uniform(-0.6, 0.6, (5, 12)), random_loads(generator, 5)
+    q = generator.uniform(-0.6, 0.6, (5, 12))
+    observation = random_loads(generator, 5)
     source = WrenchTorque(model()) if method == "wrench" else make_gravity(model(), method)
     together = source.at(observation, level=False)
-    torque, gradient = together.gravity_torque(q), together.gravity_gradient(q)
+    torque = together.gravity_torque(q)
+    gradient = together.gravity_gradient(q)
     for i in range(5):
         alone = source.at(observation[i : i + 1], level=False)
         np.testing.assert_array_equal(torque[i], alone.gravity_torque(q[i : i + 1])[0])
@@ -278,9 +317,11 @@ def test_rows_of_a_batch_are_the_single_walkers_exactly(method: str) -> None:
 
 
 def test_gravity_in_the_pelvis_is_the_turned_vertical() -> None:
-    """Catches a flipped roll or pitch, and the rotations in the wrong order: R^T g for any yaw, pitch, roll."""
+    """Catches a flipped roll or pitch, and the rotations in the wrong order: R^T g for any yaw,
+    pitch, roll."""
     generator = np.random.default_rng(8)
-    attitudes, yaws = generator.uniform(-1.2, 1.2, (30, 2)), generator.uniform(-3.0, 3.0, 30)
+    attitudes = generator.uniform(-1.2, 1.2, (30, 2))
+    yaws = generator.uniform(-3.0, 3.0, 30)
     R = np.stack([rotation(attitude, yaw) for attitude, yaw in zip(attitudes, yaws, strict=True)])
     expected = R.swapaxes(-1, -2) @ [0.0, 0.0, -9.81]
     turned = [gravity_in_pelvis(*attitude, 9.81) for attitude in attitudes]
@@ -292,10 +333,13 @@ def test_gravity_in_the_pelvis_is_the_turned_vertical() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_level_ignores_the_imu(method: str) -> None:
-    """Catches an input compensation that leans with the robot: the commanded posture has a level pelvis."""
+    """Catches an input compensation that leans with the robot: the commanded posture has a level
+    pelvis."""
     q = np.random.default_rng(9).uniform(-0.5, 0.5, (1, 12))
     gravity = make_gravity(model(), method)
-    tilted, upright = (rows(1, load_share=0.3, imu_attitude=attitude) for attitude in ([0.1, -0.2], [0.0, 0.0]))
+    tilted, upright = (
+        rows(1, load_share=0.3, imu_attitude=attitude) for attitude in ([0.1, -0.2], [0.0, 0.0])
+    )
     level = gravity.at(tilted).gravity_torque(q)
     np.testing.assert_array_equal(level, gravity.at(upright).gravity_torque(q))
     assert np.abs(gravity.at(tilted, level=False).gravity_torque(q) - level).max() > 5.0
@@ -304,7 +348,9 @@ def test_level_ignores_the_imu(method: str) -> None:
 @pytest.mark.parametrize("method", ["symbolic", "hinge", "tree"])
 def test_unknown_method_of_a_walker_lists_the_choices(method: str) -> None:
     """Catches a silent fallback to `com`, also for the methods of the robot on a fixed base."""
-    with pytest.raises(ConfigurationError, match=rf"gravity method of a walker '{method}'.*com, ankle, lumped"):
+    with pytest.raises(
+        ConfigurationError, match=rf"gravity method of a walker '{method}'.*com, ankle, lumped"
+    ):
         make_gravity(model(), method)  # type: ignore[arg-type]
 
 
@@ -316,32 +362,41 @@ def test_a_robot_without_feet_has_no_contact_method(method: str) -> None:
 
 
 def test_a_robot_without_feet_has_no_wrenches() -> None:
-    """Catches an output compensator that falls back to gravity where there is no force-torque sensor."""
+    """Catches an output compensator that falls back to gravity where there is no force-torque
+    sensor."""
     with pytest.raises(ConfigurationError, match=r"'wrench' needs a walker"):
         GravityCompensator(pendulum(), output="wrench")
 
 
 @cache
 def at_rest(seed: int | None) -> SimpleNamespace:
-    """The elastic robot at rest, by MuJoCo alone: its `observation`, `theta`, `q`, and torque `tau` of the springs.
+    """The elastic robot at rest, by MuJoCo alone: its `observation`, `theta`, `q`, and torque `tau`
+    of the springs.
 
     Args:
         seed: Of random offsets of all commands, or None for the commanded posture of the plan.
     """
-    plant, plan = WalkConfig(scenario=make_scenario("ideal")).true_model(), model().plan
+    plant = WalkConfig(scenario=make_scenario("ideal")).true_model()
+    plan = model().plan
     plant.tendon_damping[:] = 50.0  # so that it stands still soon
-    at, data = JointAddresses.of(plant, LEG_JOINTS), mujoco.MjData(plant)
+    at = JointAddresses.of(plant, LEG_JOINTS)
+    data = mujoco.MjData(plant)
     offset = np.zeros(12) if seed is None else np.random.default_rng(seed).uniform(-0.02, 0.02, 12)
-    data.qpos[:3], data.ctrl[:] = plan.pelvis[0], plan.q[0] + offset
+    data.qpos[:3] = plan.pelvis[0]
+    data.ctrl[:] = plan.q[0] + offset
     data.qpos[at.theta] = data.qpos[at.q] = plan.q[0]
     mujoco.mj_step(plant, data, 6000)
     mujoco.mj_forward(plant, data)
     assert np.abs(data.qvel).max() < 1e-3
-    theta, q = data.qpos[at.theta], data.qpos[at.q]
+    theta = data.qpos[at.theta]
+    q = data.qpos[at.q]
     _, pitch, roll = Rotation.from_quat(data.qpos[3:7], scalar_first=True).as_euler("ZYX")
-    # MuJoCo's sensors give what the leg does to the foot; the robot's, what the foot does to the leg
+    # MuJoCo's sensors give what the leg does to the foot; the robot's, what the foot does to the
+    # leg
     observation = rows(1, encoder_angle=theta, imu_attitude=[roll, pitch], wrench=-data.sensordata)
-    return SimpleNamespace(observation=observation, theta=theta[None], q=q[None], tau=model().stiffness * (theta - q))
+    return SimpleNamespace(
+        observation=observation, theta=theta[None], q=q[None], tau=model().stiffness * (theta - q)
+    )
 
 
 RESTING = pytest.mark.parametrize("seed", [None, 1, 2], ids=["planned", "posture 1", "posture 2"])
@@ -349,7 +404,8 @@ RESTING = pytest.mark.parametrize("seed", [None, 1, 2], ids=["planned", "posture
 
 @RESTING
 def test_torque_of_the_measured_wrenches_is_that_of_the_springs(seed: int | None) -> None:
-    """Catches a wrench of the wrong sign or frame, and a foot beyond its sensor that is weighed twice or not at all."""
+    """Catches a wrench of the wrong sign or frame, and a foot beyond its sensor that is weighed
+    twice or not at all."""
     rest = at_rest(seed)
     load = WrenchTorque(model()).at(rest.observation)
     np.testing.assert_allclose(load.gravity_torque(rest.q)[0], rest.tau, rtol=0.0, atol=0.05)
@@ -357,7 +413,8 @@ def test_torque_of_the_measured_wrenches_is_that_of_the_springs(seed: int | None
 
 @RESTING
 def test_equation_12_with_the_measured_wrenches_finds_the_links(seed: int | None) -> None:
-    """Catches a wrong torque or gradient where it matters: the links of a sagging robot within 0.1 mrad."""
+    """Catches a wrong torque or gradient where it matters: the links of a sagging robot within
+    0.1 mrad."""
     rest = at_rest(seed)
     load = WrenchTorque(model()).at(rest.observation)
     estimate = taylor_link_angle(rest.theta, model().stiffness, load)
@@ -367,14 +424,18 @@ def test_equation_12_with_the_measured_wrenches_finds_the_links(seed: int | None
 
 @SIDES
 def test_a_hanging_foot_pulls_on_its_sensor_and_is_weighed_once(side: int) -> None:
-    """Catches the weight of the foot counted twice: a leg in the air, whose sensor shows −m g of its foot.
+    """Catches the weight of the foot counted twice: a leg in the air, whose sensor shows −m g of
+    its foot.
 
     MuJoCo's rigid robot gives the torque of the whole leg, the foot included.
     """
-    generator, rigid = np.random.default_rng(10 + side), model().biped.rigid
-    name, leg = f"{'lr'[side]}_foot", slice(6 * side, 6 * side + 6)
+    generator = np.random.default_rng(10 + side)
+    rigid = model().biped.rigid
+    name = f"{'lr'[side]}_foot"
+    leg = slice(6 * side, 6 * side + 6)
     for _ in range(5):
-        q, attitude = generator.uniform(-0.5, 0.5, 12), generator.uniform(-0.3, 0.3, 2)
+        q = generator.uniform(-0.5, 0.5, 12)
+        attitude = generator.uniform(-0.3, 0.3, 2)
         data = posed(q, attitude)
         R = data.body(name).xmat.reshape(3, 3)
         pull = R.T @ [0.0, 0.0, -9.81 * rigid.body(name).mass[0]]
@@ -382,12 +443,16 @@ def test_a_hanging_foot_pulls_on_its_sensor_and_is_weighed_once(side: int) -> No
         wrench[side] = pull, np.cross(rigid.body(name).ipos, pull)
         load = WrenchTorque(model()).at(rows(1, imu_attitude=attitude, wrench=wrench.ravel()))
         _, expected = torque_of_mujoco(data, np.zeros((2, 3)), np.zeros((2, 3)))
-        np.testing.assert_allclose(load.gravity_torque(q[None])[0, leg], expected[leg], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            load.gravity_torque(q[None])[0, leg], expected[leg], rtol=0.0, atol=1e-9
+        )
 
 
 def test_planned_torque_is_that_of_the_control_step() -> None:
-    """Catches a row of another time, or of another world: on the reference it is the plan's inverse dynamics itself."""
-    plan, steps = model().plan, np.array([1, 400, 777, 1500])
+    """Catches a row of another time, or of another world: on the reference it is the plan's
+    inverse dynamics itself."""
+    plan = model().plan
+    steps = np.array([1, 400, 777, 1500])
     observation = rows(4, clock=0.0, reference_angle=plan.q[steps])
     observation[:, model().observation_table.names.index("clock.time")] = plan.timing.time[steps]
     planned = PlannedTorque(model(), make_gravity(model())).at(observation)
@@ -398,9 +463,13 @@ def test_planned_torque_is_that_of_the_control_step() -> None:
 
 def test_planned_torque_beside_the_reference_differs_by_the_static_torque() -> None:
     """Catches an offset that is ignored, or whose static difference has the wrong sign."""
-    plan, steps = model().plan, np.array([400, 777])
+    plan = model().plan
+    steps = np.array([400, 777])
     observation = rows(
-        2, reference_angle=plan.q[steps], load_share=plan.share[steps][:, None], zmp_reference=plan.zmp[steps]
+        2,
+        reference_angle=plan.q[steps],
+        load_share=plan.share[steps][:, None],
+        zmp_reference=plan.zmp[steps],
     )
     observation[:, model().observation_table.names.index("clock.time")] = plan.timing.time[steps]
     gravity = make_gravity(model(), "com")
@@ -415,24 +484,36 @@ def test_planned_torque_beside_the_reference_differs_by_the_static_torque() -> N
 
 
 def test_output_compensator_finds_the_links_of_the_sagging_robot() -> None:
-    """Catches Eq. 12 without the gradient or the attitude: uncompensated, links stand up to 26 mrad off their motors.
+    """Catches Eq. 12 without the gradient or the attitude: uncompensated, links stand up to 26 mrad
+    off their motors.
 
-    Told where the ZMP really is, Eqs. 4 to 6 know all torques in the sagittal plane; across, the feet squeeze the legs.
+    Told where the ZMP really is, Eqs. 4 to 6 know all torques in the sagittal plane; across, the
+    feet squeeze the legs.
     """
-    env: Any = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=24.0, num_steps=1, scenario="ideal")
+    env: Any = gymnasium.make(
+        "elastic_env/WalkInPlace-v0", step_period=24.0, num_steps=1, scenario="ideal"
+    )
     observation, info = env.reset(seed=0)
     truth = env.unwrapped.truth()
     observation[model().observation_table.group("zmp_reference")] = info["zmp_x"], info["zmp_y"]
-    estimate = GravityCompensator(model(), "taylor").at(observation[None]).link_angle(truth.theta, np.zeros((1, 0)))
-    error, sagittal = np.abs(estimate - truth.q)[0], [2, 3, 4, 8, 9, 10]
+    estimate = (
+        GravityCompensator(model(), "taylor")
+        .at(observation[None])
+        .link_angle(truth.theta, np.zeros((1, 0)))
+    )
+    error = np.abs(estimate - truth.q)[0]
+    sagittal = [2, 3, 4, 8, 9, 10]
     assert np.abs(truth.theta - truth.q).max() > 0.02
     assert error[sagittal].max() < 1e-4
     assert error.max() < 1.5e-3
 
 
 def test_output_compensator_finds_the_links_of_the_compensated_robot() -> None:
-    """Catches an estimate that trusts the encoders: with Eq. 9 on the command they lead the links by over 20 mrad."""
-    env: Any = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=24.0, num_steps=1, scenario="ideal")
+    """Catches an estimate that trusts the encoders: with Eq. 9 on the command they lead the
+    links by over 20 mrad."""
+    env: Any = gymnasium.make(
+        "elastic_env/WalkInPlace-v0", step_period=24.0, num_steps=1, scenario="ideal"
+    )
     policy = baselines.make("input_open", env)
     observation, _ = env.reset(seed=0)
     state = None
@@ -440,7 +521,11 @@ def test_output_compensator_finds_the_links_of_the_compensated_robot() -> None:
         action, state = policy.predict(observation, state, step == 0)
         observation, *_ = env.step(action)
     truth = env.unwrapped.truth()
-    estimate = GravityCompensator(model(), "taylor").at(observation[None]).link_angle(truth.theta, np.zeros((1, 0)))
+    estimate = (
+        GravityCompensator(model(), "taylor")
+        .at(observation[None])
+        .link_angle(truth.theta, np.zeros((1, 0)))
+    )
     assert np.abs(truth.theta - truth.q).max() > 0.02
     np.testing.assert_allclose(estimate, truth.q, rtol=0.0, atol=1e-3)
 

@@ -19,10 +19,16 @@ def read(file: Path) -> Any:
 
 @pytest.mark.parametrize(
     "text",
-    ["a,b\n1,2\n3,4\n", "\ufeffa,b\r\n1,2\r\n3,4", "a , b\n\n 1 ,2\n,\n3,4.0e0\n\n", '"a","b"\n"1","2"\n3,4\n'],
+    [
+        "a,b\n1,2\n3,4\n",
+        "\ufeffa,b\r\n1,2\r\n3,4",
+        "a , b\n\n 1 ,2\n,\n3,4.0e0\n\n",
+        '"a","b"\n"1","2"\n3,4\n',
+    ],
 )
 def test_tables_are_read_however_they_were_saved(tmp_path: Path, text: str) -> None:
-    """Catches byte order marks, line ends, empty lines, quotation marks and spaces that change a table."""
+    """Catches byte order marks, line ends, empty lines, quotation marks and spaces that change a
+    table."""
     file = tmp_path / "t.csv"
     file.write_bytes(text.encode())
     table = read(file)
@@ -32,17 +38,29 @@ def test_tables_are_read_however_they_were_saved(tmp_path: Path, text: str) -> N
 
 WRONG: dict[str, tuple[bytes, str]] = {
     "semicolons": (b"a;b\n1;2\n", "separated by semicolons; use commas, and points in numbers"),
-    "decimal commas": (b"a;b\n1,5;2,5\n", "separated by semicolons; use commas, and points in numbers"),
+    "decimal commas": (
+        b"a;b\n1,5;2,5\n",
+        "separated by semicolons; use commas, and points in numbers",
+    ),
     "tabs": (b"a\tb\n1\t2\n", "separated by tabs; use commas, and points in numbers"),
     "bars": (b"a|b\n1|2\n", "separated by bars; use commas"),
-    "rows of another kind": (b"a,b\n1;2\n", "pose 1: its values are separated by semicolons; use commas"),
-    "commas in numbers": (b"a,b\n1,5,2,5\n", "2 values are needed.*got 4; were its numbers.*decimal commas"),
+    "rows of another kind": (
+        b"a,b\n1;2\n",
+        "pose 1: its values are separated by semicolons; use commas",
+    ),
+    "commas in numbers": (
+        b"a,b\n1,5,2,5\n",
+        "2 values are needed.*got 4; were its numbers.*decimal commas",
+    ),
     "quoted commas": (
         b'a,b\n"1,5",2\n',
         "column a: a finite number is needed, got '1,5'; write .* a point",
     ),
     "text": (b"a,b\n1,2\nx,4\n", "rows of numbers: pose 2, column a: .*got 'x'; give a number"),
-    "infinite": (b"a,b\n1,inf\n", "pose 1, column b: a finite number is needed, got 'inf'; measure it again"),
+    "infinite": (
+        b"a,b\n1,inf\n",
+        "pose 1, column b: a finite number is needed, got 'inf'; measure it again",
+    ),
     "huge": (b"a,b\n1,1e999\n", "a finite number is needed, got '1e999'"),
     "underscore": (b"a,b\n1_0,2\n", "a finite number is needed, got '1_0'"),
     "ragged": (b"a,b\n1,2,3\n", "pose 1: 2 values are needed, one a column, got 3"),
@@ -53,8 +71,14 @@ WRONG: dict[str, tuple[bytes, str]] = {
     "NUL": (b"a,b\n1,\0\n", "number is needed|NUL"),
     "empty": (b"\n\n", "is empty"),
     "header alone": (b"a,b\n", "1 to 1000 poses, a line each, it has 0"),
-    "many rows": (b"a,b\n" + b"1,2\n" * 100_000, "1 to 1000 poses, a line each, it has more than 1000"),
-    "many columns": (b",".join(b"c%d" % i for i in range(1001)) + b"\n", "at most 1000 columns, it has 1001"),
+    "many rows": (
+        b"a,b\n" + b"1,2\n" * 100_000,
+        "1 to 1000 poses, a line each, it has more than 1000",
+    ),
+    "many columns": (
+        b",".join(b"c%d" % i for i in range(1001)) + b"\n",
+        "at most 1000 columns, it has 1001",
+    ),
     "long line": (b"a," * 1_000_000, "lines of at most 200000 characters"),
     "open quotation mark": (b'a,b\n"1,2\n' + b"3,4\n" * 100_000, "is no CSV file"),
     "large": (b"a" * (LARGEST_BYTES + 1), "at most 20000000 bytes"),
@@ -63,7 +87,8 @@ WRONG: dict[str, tuple[bytes, str]] = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_what_is_no_table_is_one_sentence(tmp_path: Path, case: str) -> None:
-    """Catches tracebacks, a wrong separator that is told as a wrong measurement, and files without bounds."""
+    """Catches tracebacks, a wrong separator that is told as a wrong measurement, and files
+    without bounds."""
     content, message = WRONG[case]
     file = tmp_path / "t.csv"
     file.write_bytes(content)

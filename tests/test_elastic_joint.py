@@ -1,4 +1,5 @@
-"""The transform to elastic joints: closed forms, energy, MuJoCo's own rigid model, and models that are not ours."""
+"""The transform to elastic joints: closed forms, energy, MuJoCo's own rigid model, and models
+that are not ours."""
 
 from pathlib import Path
 
@@ -12,7 +13,13 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import JointAddresses, link_name, motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import (
+    JointAddresses,
+    link_name,
+    motor_name,
+    servo_name,
+    spring_name,
+)
 from elastic_env.joint.make_elastic import Form, make_elastic
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
 from tests.foreign import ARM, FOUR_BAR, MODELS, QUADRUPED, ROVER
@@ -22,18 +29,28 @@ STEP_S = 5e-4
 FRICTIONLESS = H54_200_S500_R.replace(coulomb_friction=0.0)
 CONSERVATIVE = FRICTIONLESS.replace(damping=0.0, servo=None)
 FOREIGN = ElasticJoint(stiffness=800.0, damping=3.0, rotor_inertia=0.07)
-HOLDING = Servo(position_gain=3000.0, velocity_gain=60.0, integral_gain=20_000.0, torque_limit=200.0, speed_limit=4.0)
+HOLDING = Servo(
+    position_gain=3000.0,
+    velocity_gain=60.0,
+    integral_gain=20_000.0,
+    torque_limit=200.0,
+    speed_limit=4.0,
+)
 ASSETS = sorted((Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets").glob("*.xml"))
 
 
 def hinges(spec: mujoco.MjSpec) -> list[str]:
     """Names of all named hinges."""
-    return [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name]
+    return [
+        joint.name
+        for joint in spec.joints
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name
+    ]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Motion of the testbed
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def link_motion(joint: ElasticJoint, form: Form, duration_s: float) -> Array:
@@ -41,7 +58,8 @@ def link_motion(joint: ElasticJoint, form: Form, duration_s: float) -> Array:
     model = elastic_spec(PENDULUM, joint, form, STEP_S).compile()
     data = mujoco.MjData(model)
     motor, hinge = (model.joint(name).qposadr[0] for name in (motor_name(JOINT), JOINT))
-    data.qpos[motor], data.qpos[hinge] = 0.3, 0.28 if form == "tendon" else -0.02
+    data.qpos[motor] = 0.3
+    data.qpos[hinge] = 0.28 if form == "tendon" else -0.02
     q = []
     for k in range(round(duration_s / (8 * STEP_S))):
         data.ctrl[:] = 0.3 + 0.5 * np.sin(3.0 * k * 8 * STEP_S)
@@ -61,15 +79,18 @@ def link_motion(joint: ElasticJoint, form: Form, duration_s: float) -> Array:
     ids=["damped", "undamped", "viscous", "coulomb"],
 )
 def test_tendon_and_series_form_move_alike(joint: ElasticJoint, bound: float) -> None:
-    """Catches a spring, damper, friction or servo that acts on the wrong side in one of the forms (5 s of motion)."""
-    tendon, series = link_motion(joint, "tendon", 5.0), link_motion(joint, "series", 5.0)
+    """Catches a spring, damper, friction or servo that acts on the wrong side in one of the
+    forms (5 s of motion)."""
+    tendon = link_motion(joint, "tendon", 5.0)
+    series = link_motion(joint, "series", 5.0)
     assert np.ptp(tendon) > 0.9  # it did move
     assert np.abs(tendon - series).max() < bound
 
 
 @pytest.mark.parametrize("form", ["tendon", "series"])
 def test_free_motion_keeps_its_energy(form: Form) -> None:
-    """Catches hidden damping or friction, and a spring force that is not the gradient of ½ K δ² (10 s of swinging)."""
+    """Catches hidden damping or friction, and a spring force that is not the gradient of ½ K δ²
+    (10 s of swinging)."""
     spec = elastic_spec(PENDULUM, CONSERVATIVE, form, STEP_S)
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     model = spec.compile()
@@ -78,7 +99,9 @@ def test_free_motion_keeps_its_energy(form: Form) -> None:
     energies = []
     for _ in range(6):
         mujoco.mj_forward(model, data)  # the energy of a step belongs to its beginning
-        energies.append(data.energy.sum() + PENDULUM.gravity_torque)  # counted from the hanging position
+        energies.append(
+            data.energy.sum() + PENDULUM.gravity_torque
+        )  # counted from the hanging position
         mujoco.mj_step(model, data, round(2.0 / STEP_S))
     np.testing.assert_allclose(energies, energies[0], rtol=1e-6)
     assert energies[0] > 20.0
@@ -86,9 +109,14 @@ def test_free_motion_keeps_its_energy(form: Form) -> None:
 
 @pytest.mark.parametrize("form", ["tendon", "series"])
 @pytest.mark.parametrize("stiffness", [300.0, 1001.0, 3000.0])
-@pytest.mark.parametrize("rotor_inertia", [H54_200_S500_R.rotor_inertia, 1e9], ids=["free", "locked"])
-def test_vibration_has_the_frequency_of_the_closed_form(form: Form, stiffness: float, rotor_inertia: float) -> None:
-    """Catches a wrong K, B or I: δ = δ₀ cos ωt, ω = √(K(1/B + 1/I)), and √(K/I) behind a rotor that cannot move."""
+@pytest.mark.parametrize(
+    "rotor_inertia", [H54_200_S500_R.rotor_inertia, 1e9], ids=["free", "locked"]
+)
+def test_vibration_has_the_frequency_of_the_closed_form(
+    form: Form, stiffness: float, rotor_inertia: float
+) -> None:
+    """Catches a wrong K, B or I: δ = δ₀ cos ωt, ω = √(K(1/B + 1/I)), and √(K/I) behind a rotor
+    that cannot move."""
     joint = CONSERVATIVE.replace(stiffness=stiffness, rotor_inertia=rotor_inertia)
     spec = elastic_spec(PENDULUM, joint, form, STEP_S, gravity=0.0)
     model = spec.compile()
@@ -96,11 +124,15 @@ def test_vibration_has_the_frequency_of_the_closed_form(form: Form, stiffness: f
     motor, hinge = (model.joint(name).qposadr[0] for name in (motor_name(JOINT), JOINT))
     data.qpos[hinge] = -0.01
     omega = np.sqrt(stiffness * (1.0 / rotor_inertia + 1.0 / PENDULUM.inertia))
-    t = np.arange(1, 401) * 10 * STEP_S  # 2 s: a frequency off by 0.1 % ends 0.05 to 0.2 rad out of phase
+    t = (
+        np.arange(1, 401) * 10 * STEP_S
+    )  # 2 s: a frequency off by 0.1 % ends 0.05 to 0.2 rad out of phase
     deflection = np.empty(len(t))
     for k in range(len(t)):
         mujoco.mj_step(model, data, 10)
-        deflection[k] = data.qpos[motor] - data.qpos[hinge] if form == "tendon" else -data.qpos[hinge]
+        deflection[k] = (
+            data.qpos[motor] - data.qpos[hinge] if form == "tendon" else -data.qpos[hinge]
+        )
     np.testing.assert_allclose(deflection, 0.01 * np.cos(omega * t), rtol=0.0, atol=1e-7)
 
 
@@ -110,15 +142,23 @@ def test_dead_band_passes_no_torque_and_then_the_spring_of_the_rest() -> None:
     model = elastic_spec(PENDULUM, joint).compile()
     data = mujoco.MjData(model)
     at = JointAddresses.of(model, [JOINT])
-    for deflection, torque in [(-0.012, -2.002), (-0.0099, 0.0), (0.0, 0.0), (0.0099, 0.0), (0.012, 2.002)]:
-        data.qpos[at.q], data.qpos[at.theta] = 0.4, 0.4 + deflection
+    for deflection, torque in [
+        (-0.012, -2.002),
+        (-0.0099, 0.0),
+        (0.0, 0.0),
+        (0.0099, 0.0),
+        (0.012, 2.002),
+    ]:
+        data.qpos[at.q] = 0.4
+        data.qpos[at.theta] = 0.4 + deflection
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(data.qfrc_passive[at.q_dot], torque, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(data.qfrc_passive[at.theta_dot], -torque, rtol=0.0, atol=1e-12)
 
 
 def test_friction_holds_the_link_without_creeping() -> None:
-    """Catches friction on the rotor or the tendon, and MuJoCo's default constraint, which lets go in seconds."""
+    """Catches friction on the rotor or the tendon, and MuJoCo's default constraint, which lets
+    go in seconds."""
     model = elastic_spec(PENDULUM, H54_200_S500_R).compile()
     data = mujoco.MjData(model)
     at = JointAddresses.of(model, [JOINT])
@@ -131,7 +171,8 @@ def test_friction_holds_the_link_without_creeping() -> None:
 
 
 def test_friction_lets_go_where_the_torque_exceeds_it() -> None:
-    """Catches friction that sticks to any load: pushed from zero g beyond 5.4 N·m, the link slides on."""
+    """Catches friction that sticks to any load: pushed from zero g beyond 5.4 N·m, the link
+    slides on."""
     model = elastic_spec(PENDULUM, H54_200_S500_R, gravity=0.0).compile()
     data = mujoco.MjData(model)
     at = JointAddresses.of(model, [JOINT])
@@ -143,12 +184,15 @@ def test_friction_lets_go_where_the_torque_exceeds_it() -> None:
 
 
 def test_rigid_form_is_the_plain_hinge_with_armature() -> None:
-    """Catches all that the rigid form changes beside the rotor's inertia: the motion is MuJoCo's to the last bit."""
+    """Catches all that the rigid form changes beside the rotor's inertia: the motion is MuJoCo's
+    to the last bit."""
     spec = rigid_spec(PENDULUM)
     spec.option.timestep = STEP_S
     spec.joint(JOINT).armature = CONSERVATIVE.rotor_inertia
-    plain, rigid = spec.compile(), elastic_spec(PENDULUM, CONSERVATIVE, "rigid", STEP_S).compile()
-    expected, data = mujoco.MjData(plain), mujoco.MjData(rigid)
+    plain = spec.compile()
+    rigid = elastic_spec(PENDULUM, CONSERVATIVE, "rigid", STEP_S).compile()
+    expected = mujoco.MjData(plain)
+    data = mujoco.MjData(rigid)
     for world in (expected, data):
         world.qpos[0] = 1.2
     mujoco.mj_step(plain, expected, 2000)
@@ -172,25 +216,43 @@ def test_a_stiff_joint_moves_like_the_rigid_one() -> None:
 
 def test_the_servo_saturates_at_its_torque_limit() -> None:
     """Catches a limit that is not enforced, or an integrator that winds up far beyond it."""
-    servo = Servo(position_gain=500.0, velocity_gain=20.0, integral_gain=5000.0, torque_limit=30.0, speed_limit=2.0)
+    servo = Servo(
+        position_gain=500.0,
+        velocity_gain=20.0,
+        integral_gain=5000.0,
+        torque_limit=30.0,
+        speed_limit=2.0,
+    )
     model = elastic_spec(PENDULUM, FRICTIONLESS.replace(servo=servo)).compile()
     data = mujoco.MjData(model)
     data.ctrl[:] = 1.5  # needs 60 N·m
     mujoco.mj_step(model, data, round(3.0 / STEP_S))
     np.testing.assert_allclose(data.actuator_force, 30.0, rtol=1e-12)
     assert servo.integral_gain * servo.integral_limit == pytest.approx(30.0 + 20.0 * 2.0)
-    error = data.ctrl[0] - data.joint(motor_name(JOINT)).qpos[0]  # MuJoCo stops after the step that passes the limit
+    error = (
+        data.ctrl[0] - data.joint(motor_name(JOINT)).qpos[0]
+    )  # MuJoCo stops after the step that passes the limit
     assert servo.integral_limit <= data.act[0] <= servo.integral_limit + 1.5 * error * STEP_S
 
 
 def test_the_servo_is_a_pid_on_the_rotor() -> None:
     """Catches a gain in the wrong slot, and feedback from the link angle, which no servo sees."""
-    servo = Servo(position_gain=500.0, velocity_gain=20.0, integral_gain=70.0, torque_limit=1000.0, speed_limit=2.0)
+    servo = Servo(
+        position_gain=500.0,
+        velocity_gain=20.0,
+        integral_gain=70.0,
+        torque_limit=1000.0,
+        speed_limit=2.0,
+    )
     model = elastic_spec(PENDULUM, FRICTIONLESS.replace(servo=servo)).compile()
     data = mujoco.MjData(model)
     at = JointAddresses.of(model, [JOINT])
-    data.qpos[at.theta], data.qpos[at.q], data.qvel[at.theta_dot], data.qvel[at.q_dot] = 0.2, 0.9, 0.5, -3.0
-    data.ctrl[:], data.act[:] = 0.3, 0.4
+    data.qpos[at.theta] = 0.2
+    data.qpos[at.q] = 0.9
+    data.qvel[at.theta_dot] = 0.5
+    data.qvel[at.q_dot] = -3.0
+    data.ctrl[:] = 0.3
+    data.act[:] = 0.4
     mujoco.mj_forward(model, data)
     expected = 500.0 * (0.3 - 0.2) - 20.0 * 0.5 + 70.0 * 0.4
     np.testing.assert_allclose(data.qfrc_actuator[at.theta_dot], expected, rtol=1e-13)
@@ -198,46 +260,60 @@ def test_the_servo_is_a_pid_on_the_rotor() -> None:
     np.testing.assert_allclose(data.act_dot, 0.1, rtol=1e-12)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Models that are not ours
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def foreign_cases() -> list[object]:
     """All models with the hinges that become elastic; Gymnasium's with every hinge they have."""
-    cases: list[object] = [pytest.param(xml, names, id=name) for name, (xml, names) in MODELS.items()]
+    cases: list[object] = [
+        pytest.param(xml, names, id=name) for name, (xml, names) in MODELS.items()
+    ]
     return cases + [pytest.param(path, None, id=path.stem) for path in ASSETS]
 
 
 def load(source: str | Path) -> mujoco.MjSpec:
     """A specification from MJCF text or from a file."""
-    return mujoco.MjSpec.from_string(source) if isinstance(source, str) else mujoco.MjSpec.from_file(str(source))
+    return (
+        mujoco.MjSpec.from_string(source)
+        if isinstance(source, str)
+        else mujoco.MjSpec.from_file(str(source))
+    )
 
 
-def correspondence(rigid: mujoco.MjModel, elastic: mujoco.MjModel, form: Form) -> tuple[Array, Array]:
-    """T_q and T_v with which undeflected states of the elastic model are T_q qpos and T_v qvel of the rigid one.
+def correspondence(
+    rigid: mujoco.MjModel, elastic: mujoco.MjModel, form: Form
+) -> tuple[Array, Array]:
+    """T_q and T_v with which undeflected states of the elastic model are T_q qpos and T_v qvel of
+    the rigid one.
 
-    Every old joint stands for itself, every rotor for the hinge that it drives; in the series form the hinge is the
-    deflection, and that is zero.
+    Every old joint stands for itself, every rotor for the hinge that it drives; in the series form
+    the hinge is the deflection, and that is zero.
     """
     names = [rigid.joint(i).name for i in range(rigid.njnt)]
     driver = {motor_name(name): i for i, name in enumerate(names) if name}
     new = [elastic.joint(j).name for j in range(elastic.njnt)]
     old = iter(range(rigid.njnt))
-    T_q, T_v = np.zeros((elastic.nq, rigid.nq)), np.zeros((elastic.nv, rigid.nv))
+    T_q = np.zeros((elastic.nq, rigid.nq))
+    T_v = np.zeros((elastic.nv, rigid.nv))
     for j, name in enumerate(new):
         i = driver[name] if name in driver else next(old)
         if form == "series" and name not in driver and motor_name(name) in new:
             continue
         for T, kind in ((T_q, "qpos"), (T_v, "dof")):
-            rows, columns = (_columns(model, index, kind) for model, index in ((elastic, j), (rigid, i)))
+            rows, columns = (
+                _columns(model, index, kind) for model, index in ((elastic, j), (rigid, i))
+            )
             T[rows, columns] = 1.0
     assert next(old, None) is None
     return T_q, T_v
 
 
 def _columns(model: mujoco.MjModel, joint: int, kind: str) -> npt.NDArray[np.int64]:
-    starts, total = (model.jnt_qposadr, model.nq) if kind == "qpos" else (model.jnt_dofadr, model.nv)
+    starts, total = (
+        (model.jnt_qposadr, model.nq) if kind == "qpos" else (model.jnt_dofadr, model.nv)
+    )
     return np.arange(starts[joint], starts[joint + 1] if joint + 1 < model.njnt else total)
 
 
@@ -251,17 +327,22 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 def random_states(
     rigid: mujoco.MjModel, elastic: mujoco.MjModel, form: Form, count: int = 4
 ) -> list[tuple[mujoco.MjData, mujoco.MjData, Array]]:
-    """The same random undeflected states in both models, forwarded, and the map T_v of their velocities."""
+    """The same random undeflected states in both models, forwarded, and the map T_v of their
+    velocities."""
     T_q, T_v = correspondence(rigid, elastic, form)
     generator = np.random.default_rng(7)
     states = []
     for _ in range(count):
-        expected, data = mujoco.MjData(rigid), mujoco.MjData(elastic)
+        expected = mujoco.MjData(rigid)
+        data = mujoco.MjData(elastic)
         mujoco.mj_integratePos(rigid, expected.qpos, generator.uniform(-0.5, 0.5, rigid.nv), 1.0)
         expected.qvel[:] = generator.uniform(-2.0, 2.0, rigid.nv)
-        expected.ctrl[:], expected.act[:] = generator.uniform(-1, 1, rigid.nu), generator.uniform(-1, 1, rigid.na)
-        data.qpos[:], data.qvel[:] = T_q @ expected.qpos, T_v @ expected.qvel
-        data.ctrl[: rigid.nu], data.act[: rigid.na] = expected.ctrl, expected.act
+        expected.ctrl[:] = generator.uniform(-1, 1, rigid.nu)
+        expected.act[:] = generator.uniform(-1, 1, rigid.na)
+        data.qpos[:] = T_q @ expected.qpos
+        data.qvel[:] = T_v @ expected.qvel
+        data.ctrl[: rigid.nu] = expected.ctrl
+        data.act[: rigid.na] = expected.act
         mujoco.mj_forward(rigid, expected)
         mujoco.mj_forward(elastic, data)
         states.append((expected, data, T_v))
@@ -269,9 +350,13 @@ def random_states(
 
 
 def elastic_from(
-    source: str | Path, names: list[str] | None, joint: ElasticJoint = FOREIGN, form: Form = "tendon"
+    source: str | Path,
+    names: list[str] | None,
+    joint: ElasticJoint = FOREIGN,
+    form: Form = "tendon",
 ) -> tuple[mujoco.MjModel, mujoco.MjModel, list[str]]:
-    """Rigid and elastic model, at a step that follows the springs, and the names of the elastic hinges."""
+    """Rigid and elastic model, at a step that follows the springs, and the names of the elastic
+    hinges."""
     spec = load(source)
     spec.option.timestep = STEP_S
     chosen = names if names is not None else hinges(spec)
@@ -287,19 +372,41 @@ FORMS_OF_ALL = [
 @pytest.mark.parametrize("form", FORMS_OF_ALL)
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-def test_total_mass_and_names_are_kept(source: str | Path, names: list[str] | None, form: Form) -> None:
-    """Catches rotors that weigh something, bodies that vanish and elements that change their order."""
+def test_total_mass_and_names_are_kept(
+    source: str | Path, names: list[str] | None, form: Form
+) -> None:
+    """Catches rotors that weigh something, bodies that vanish and elements that change their
+    order."""
     rigid, elastic, _ = elastic_from(source, names, form=form)
     assert elastic.body_mass.sum() == pytest.approx(rigid.body_mass.sum(), rel=0.0, abs=1e-9)
-    kinds = ["body", "joint", "geom", "site", "camera", "light", "actuator", "sensor", "equality", "tendon", "key"]
+    kinds = [
+        "body",
+        "joint",
+        "geom",
+        "site",
+        "camera",
+        "light",
+        "actuator",
+        "sensor",
+        "equality",
+        "tendon",
+        "key",
+    ]
     for kind in kinds:
         old, new = (_element_names(model, kind) for model in (rigid, elastic))
-        assert [name for name in new if name in old and name] == [name for name in old if name], kind
+        assert [name for name in new if name in old and name] == [name for name in old if name], (
+            kind
+        )
         assert new.count("") >= old.count(""), kind
 
 
 def _element_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    counts = {"joint": model.njnt, "camera": model.ncam, "actuator": model.nactuator, "equality": model.neq}
+    counts = {
+        "joint": model.njnt,
+        "camera": model.ncam,
+        "actuator": model.nactuator,
+        "equality": model.neq,
+    }
     count = counts.get(kind, getattr(model, f"n{kind}", 0))
     return [getattr(model, kind)(i).name for i in range(count)]
 
@@ -310,10 +417,11 @@ def _element_names(model: mujoco.MjModel, kind: str) -> list[str]:
 def test_undeflected_dynamics_are_those_of_the_rigid_model(
     source: str | Path, names: list[str] | None, form: Form
 ) -> None:
-    """Catches all that a rotor may bring along: weight, drag in air or water, defaults of its class, lost actuators.
+    """Catches all that a rotor may bring along: weight, drag in air or water, defaults of its
+    class, lost actuators.
 
-    Where θ = q, the elastic model is the rigid one with B for the armature: Tᵀ M T, Tᵀ c, Tᵀ (passive forces) and
-    Tᵀ (actuator forces) must be MuJoCo's for the model as it was.
+    Where θ = q, the elastic model is the rigid one with B for the armature: Tᵀ M T, Tᵀ c, Tᵀ
+    (passive forces) and Tᵀ (actuator forces) must be MuJoCo's for the model as it was.
     """
     rigid, elastic, chosen = elastic_from(source, names, form=form)
     added = np.zeros(rigid.nv)
@@ -324,7 +432,9 @@ def test_undeflected_dynamics_are_those_of_the_rigid_model(
         np.testing.assert_allclose(T.T @ mass_matrix(elastic, data) @ T, M, rtol=1e-10, atol=1e-9)
         for force in ("qfrc_bias", "qfrc_passive", "qfrc_actuator"):
             projected = T.T @ getattr(data, force)
-            np.testing.assert_allclose(projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force)
+            np.testing.assert_allclose(
+                projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force
+            )
 
 
 @pytest.mark.parametrize(
@@ -334,11 +444,16 @@ def test_undeflected_dynamics_are_those_of_the_rigid_model(
         pytest.param(ARM, ["roll", "elbow", "left_finger"], id="arm"),
         pytest.param(FOUR_BAR, MODELS["four_bar"][1], id="four_bar"),
         pytest.param(ROVER, ["pan"], id="rover"),
-        pytest.param(ASSETS[[path.stem for path in ASSETS].index("walker2d_v5")], None, id="walker2d_v5"),
+        pytest.param(
+            ASSETS[[path.stem for path in ASSETS].index("walker2d_v5")], None, id="walker2d_v5"
+        ),
     ],
 )
-def test_undeflected_dynamics_of_the_series_form(source: str | Path, names: list[str] | None) -> None:
-    """Catches springs, damping or actuators of a hinge that the series form loses when it splits the hinge."""
+def test_undeflected_dynamics_of_the_series_form(
+    source: str | Path, names: list[str] | None
+) -> None:
+    """Catches springs, damping or actuators of a hinge that the series form loses when it splits
+    the hinge."""
     spec = load(source)
     chosen = names if names is not None else [name for name in hinges(spec) if name != "rooty"]
     rigid, elastic, _ = elastic_from(source, chosen, form="series")
@@ -351,7 +466,9 @@ def test_undeflected_dynamics_of_the_series_form(source: str | Path, names: list
         np.testing.assert_allclose(T.T @ mass_matrix(elastic, data) @ T, M, rtol=1e-10, atol=1e-9)
         for force in ("qfrc_bias", "qfrc_passive", "qfrc_actuator"):
             projected = T.T @ getattr(data, force)
-            np.testing.assert_allclose(projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force)
+            np.testing.assert_allclose(
+                projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force
+            )
         for name in chosen:
             q = expected.qpos[rigid.joint(name).qposadr[0]]
             assert data.tendon(link_name(name)).length[0] == pytest.approx(q, abs=1e-12)
@@ -359,8 +476,11 @@ def test_undeflected_dynamics_of_the_series_form(source: str | Path, names: list
 
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(source: str | Path, names: list[str] | None) -> None:
-    """Catches sensors that read the rotor, limits that moved or lost their unit, and collisions of rotors."""
+def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(
+    source: str | Path, names: list[str] | None
+) -> None:
+    """Catches sensors that read the rotor, limits that moved or lost their unit, and collisions
+    of rotors."""
     rigid, elastic, chosen = elastic_from(source, names)
     by_acceleration = mujoco.mjtStage.mjSTAGE_ACC
     for expected, data, _ in random_states(rigid, elastic, "tendon"):
@@ -369,20 +489,26 @@ def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(source: str | 
             if rigid.sensor_needstage[sensor] != by_acceleration:
                 first = rigid.sensor_adr[sensor]
                 columns = slice(first, first + rigid.sensor_dim[sensor])
-                np.testing.assert_allclose(data.sensordata[columns], expected.sensordata[columns], rtol=0.0, atol=1e-9)
+                np.testing.assert_allclose(
+                    data.sensordata[columns], expected.sensordata[columns], rtol=0.0, atol=1e-9
+                )
     for name in chosen:
         assert elastic.joint(name).limited[0] == rigid.joint(name).limited[0]
         np.testing.assert_array_equal(elastic.joint(name).range, rigid.joint(name).range)
         assert not elastic.joint(motor_name(name)).limited[0]
     np.testing.assert_array_equal(elastic.actuator_ctrlrange[: rigid.nu], rigid.actuator_ctrlrange)
-    np.testing.assert_array_equal(elastic.actuator_forcerange[: rigid.nactuator], rigid.actuator_forcerange)
+    np.testing.assert_array_equal(
+        elastic.actuator_forcerange[: rigid.nactuator], rigid.actuator_forcerange
+    )
 
 
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 def test_foreign_models_run(source: str | Path, names: list[str] | None) -> None:
     """Catches models that compile and then blow up."""
-    _, model, _ = elastic_from(source, names, ElasticJoint(stiffness=2000.0, damping=5.0, rotor_inertia=0.05))
+    _, model, _ = elastic_from(
+        source, names, ElasticJoint(stiffness=2000.0, damping=5.0, rotor_inertia=0.05)
+    )
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.2
     mujoco.mj_step(model, data, 100)
@@ -404,7 +530,8 @@ def test_the_given_specification_is_not_changed(xml: str, names: list[str]) -> N
 @pytest.mark.parametrize("form", ["tendon", "rigid"])
 @pytest.mark.parametrize(("xml", "names"), list(MODELS.values()), ids=list(MODELS))
 def test_the_elastic_specification_survives_saving(xml: str, names: list[str], form: Form) -> None:
-    """Catches a model that compiles here and not from its own MJCF, the form in which robots are passed on.
+    """Catches a model that compiles here and not from its own MJCF, the form in which robots are
+    passed on.
 
     Bounds of masses aside: in a file they hold for rotors too.
     """
@@ -417,17 +544,24 @@ def test_the_elastic_specification_survives_saving(xml: str, names: list[str], f
     forces = []
     for each in (model, loaded):
         data = mujoco.MjData(each)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = model.qpos0, 0.3, 0.2
+        data.qpos[:] = model.qpos0
+        data.qvel[:] = 0.3
+        data.ctrl[:] = 0.2
         mujoco.mj_forward(each, data)
         forces.append(data.qfrc_smooth.copy())
-    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-4, atol=1e-4)  # the text has six digits
+    np.testing.assert_allclose(
+        forces[1], forces[0], rtol=1e-4, atol=1e-4
+    )  # the text has six digits
 
 
 @pytest.mark.parametrize("rule", ["keep", "replace"])
 @pytest.mark.parametrize("form", ["tendon", "series", "rigid"])
 @pytest.mark.parametrize("name", ["quadruped", "arm", "four_bar"])
-def test_keyframes_keep_the_links_and_start_without_deflection(name: str, form: Form, rule: str) -> None:
-    """Catches keyframe vectors that are shifted by the new joints, rotors left at zero, and lost controls."""
+def test_keyframes_keep_the_links_and_start_without_deflection(
+    name: str, form: Form, rule: str
+) -> None:
+    """Catches keyframe vectors that are shifted by the new joints, rotors left at zero, and lost
+    controls."""
     xml, names = MODELS[name]
     chosen = [n for n in names if form != "series" or n not in ("yaw", "pitch")]
     spec = mujoco.MjSpec.from_string(xml)
@@ -461,7 +595,8 @@ def _survives(model: mujoco.MjModel, actuator: int, replaced: list[str], rule: s
 
 @pytest.mark.parametrize("form", ["tendon", "rigid"])
 def test_replaced_actuators_make_room_for_the_servo(form: Form) -> None:
-    """Catches two actuators on one joint, a servo added uninvited, and sensors of the deleted actuator left hanging."""
+    """Catches two actuators on one joint, a servo added uninvited, and sensors of the deleted
+    actuator left hanging."""
     spec = mujoco.MjSpec.from_string(QUADRUPED)
     joint = FOREIGN.replace(servo=HOLDING)
     kept = make_elastic(spec, {"front_hip": joint}, form).compile()
@@ -489,9 +624,11 @@ NASTY = """<mujoco><compiler angle="degree"/><option timestep="0.001"/>
 PLAIN = """<mujoco><compiler angle="degree"/><option timestep="0.001"/>
   <worldbody><body name="base"><body name="b"><joint name="h" {hinge}/>{inertial}</body></body></worldbody></mujoco>"""
 GIVEN = {
-    "hinge": """pos="0 0 0" axis="0 1 0" ref="0" limited="false" margin="0" actuatorfrcrange="-25 25"
+    "hinge": (
+        """pos="0 0 0" axis="0 1 0" ref="0" limited="false" margin="0" actuatorfrcrange="-25 25"
         actuatorgravcomp="false" armature="0" damping="0 0 0" stiffness="0 0 0" springref="0" springyield="0"
-        frictionloss="0" """,
+        frictionloss="0" """
+    ),
     "inertial": '<inertial pos="0 0 -0.3" mass="2" diaginertia="0.1 0.1 0.1"/>',
 }
 
@@ -509,16 +646,26 @@ GIVEN = {
 )
 @pytest.mark.parametrize("form", ["tendon", "series"])
 def test_defaults_of_the_model_do_not_leak(form: Form, actuator: str, integral_gain: float) -> None:
-    """Catches any attribute of rotor, spring or servo that is left to the model's default class, down to plasticity.
+    """Catches any attribute of rotor, spring or servo that is left to the model's default class,
+    down to plasticity.
 
-    All attributes of the hinge are given, so with and without defaults the joint must move alike, bit for bit.
+    All attributes of the hinge are given, so with and without defaults the joint must move alike,
+    bit for bit.
     """
     servo = Servo(
-        position_gain=500.0, velocity_gain=20.0, integral_gain=integral_gain, torque_limit=30.0, speed_limit=3.0
+        position_gain=500.0,
+        velocity_gain=20.0,
+        integral_gain=integral_gain,
+        torque_limit=30.0,
+        speed_limit=3.0,
     )
-    joint = FOREIGN.replace(servo=servo, backlash=0.01 if form == "tendon" else 0.0, viscous_friction=0.1)
+    joint = FOREIGN.replace(
+        servo=servo, backlash=0.01 if form == "tendon" else 0.0, viscous_friction=0.1
+    )
     nasty, plain = (
-        make_elastic(mujoco.MjSpec.from_string(xml.format(actuator=actuator, **GIVEN)), {"h": joint}, form).compile()
+        make_elastic(
+            mujoco.MjSpec.from_string(xml.format(actuator=actuator, **GIVEN)), {"h": joint}, form
+        ).compile()
         for xml in (NASTY, PLAIN)
     )
     worlds = [mujoco.MjData(model) for model in (nasty, plain)]
@@ -531,13 +678,20 @@ def test_defaults_of_the_model_do_not_leak(form: Form, actuator: str, integral_g
 
 
 def _suspects(nasty: mujoco.MjModel, plain: mujoco.MjModel, form: Form) -> list[str]:
-    """Fields of the elements we made that differ between two models, appearance and addresses aside."""
+    """Fields of the elements we made that differ between two models, appearance and addresses
+    aside."""
     tendon = spring_name("h") if form == "tendon" else link_name("h")
-    elements = [("jnt", "joint", motor_name("h")), ("tendon", "tendon", tendon), ("actuator", "actuator", "h_servo")]
+    elements = [
+        ("jnt", "joint", motor_name("h")),
+        ("tendon", "tendon", tendon),
+        ("actuator", "actuator", "h_servo"),
+    ]
     irrelevant = ("adr", "id", "group", "rgba", "width", "user", "num", "signature")
     suspects = []
     for prefix, kind, name in elements:
-        fields = [f for f in dir(plain) if f.startswith(f"{prefix}_") and not f.endswith(irrelevant)]
+        fields = [
+            f for f in dir(plain) if f.startswith(f"{prefix}_") and not f.endswith(irrelevant)
+        ]
         a, b = (getattr(model, kind)(name).id for model in (nasty, plain))
         values = [(f, getattr(nasty, f)[a], getattr(plain, f)[b]) for f in fields]
         suspects += [f"{f}: {x} instead of {y}" for f, x, y in values if not np.array_equal(x, y)]
@@ -546,7 +700,8 @@ def _suspects(nasty: mujoco.MjModel, plain: mujoco.MjModel, form: Form) -> list[
 
 @pytest.mark.parametrize("child_in_degrees", [True, False])
 def test_angles_of_an_attached_model_keep_their_unit(child_in_degrees: bool) -> None:
-    """Catches a rotor whose ref is read in the parent's unit: an arm written in radians on a base in degrees."""
+    """Catches a rotor whose ref is read in the parent's unit: an arm written in radians on a
+    base in degrees."""
     unit = "degree" if child_in_degrees else "radian"
     value = {"degree": "30", "radian": str(np.deg2rad(30.0))}[unit]
     child = mujoco.MjSpec.from_string(
@@ -560,11 +715,14 @@ def test_angles_of_an_attached_model_keep_their_unit(child_in_degrees: bool) -> 
     model = make_elastic(parent, {"arm_h": FOREIGN}).compile()
     np.testing.assert_allclose(model.qpos0, np.deg2rad(30.0), rtol=1e-14)
     np.testing.assert_allclose(model.joint("arm_h").range, [0.0, np.deg2rad(30.0)], rtol=1e-14)
-    np.testing.assert_allclose(model.actuator("arm_p").ctrlrange, [0.0, np.deg2rad(30.0)], rtol=1e-14)
+    np.testing.assert_allclose(
+        model.actuator("arm_p").ctrlrange, [0.0, np.deg2rad(30.0)], rtol=1e-14
+    )
 
 
 def test_at_rest_the_springs_carry_what_the_rigid_robot_needs() -> None:
-    """Catches a deflection that is not τ/K: the arm settles where MuJoCo's inverse dynamics says so."""
+    """Catches a deflection that is not τ/K: the arm settles where MuJoCo's inverse dynamics says
+    so."""
     spec = mujoco.MjSpec.from_string(ARM)
     rigid = spec.compile()
     names = ["yaw", "pitch", "roll", "elbow"]
@@ -592,7 +750,8 @@ def at_rigid(model: mujoco.MjModel, names: list[str]) -> list[int]:
 
 
 def test_legs_of_a_floating_robot_conserve_its_momentum() -> None:
-    """Catches rotors that push against the world: motors of a free base can move its legs, not its center of mass."""
+    """Catches rotors that push against the world: motors of a free base can move its legs, not
+    its center of mass."""
     spec = mujoco.MjSpec.from_string(QUADRUPED)
     spec.option.gravity = np.zeros(3)
     joints = dict.fromkeys(MODELS["quadruped"][1], FOREIGN.replace(rotor_inertia=0.02))
@@ -606,7 +765,9 @@ def test_legs_of_a_floating_robot_conserve_its_momentum() -> None:
         mujoco.mj_step(model, data, 40)
         mujoco.mj_forward(model, data)
         mujoco.mj_subtreeVel(model, data)
-        np.testing.assert_allclose(model.body_subtreemass[0] * data.subtree_linvel[0], 0.0, atol=1e-5)
+        np.testing.assert_allclose(
+            model.body_subtreemass[0] * data.subtree_linvel[0], 0.0, atol=1e-5
+        )
         np.testing.assert_allclose(data.subtree_angmom[0], 0.0, atol=1e-5)
     assert np.abs(data.qpos - start)[7:].max() > 0.3
     assert data.ncon == 0
@@ -643,7 +804,8 @@ def test_a_closed_loop_stays_closed() -> None:
 
 
 def test_a_mimic_equality_still_couples_the_links() -> None:
-    """Catches an equality that compares a link with a rotor: the finger follows the link, not the motor."""
+    """Catches an equality that compares a link with a rotor: the finger follows the link, not
+    the motor."""
     spec = mujoco.MjSpec.from_string(ARM)
     soft = ElasticJoint(stiffness=0.2, damping=0.01, rotor_inertia=0.001)
     model = make_elastic(spec, {"left_finger": soft}).compile()
@@ -651,7 +813,8 @@ def test_a_mimic_equality_still_couples_the_links() -> None:
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.ctrl[model.actuator("grip").id] = 0.6
     mujoco.mj_step(model, data, 200)
-    left, right = data.joint("left_finger").qpos[0], data.joint("right_finger").qpos[0]
+    left = data.joint("left_finger").qpos[0]
+    right = data.joint("right_finger").qpos[0]
     rotor = data.joint(motor_name("left_finger")).qpos[0]
     assert abs(rotor - left) > 0.01
     assert right == pytest.approx(0.1 - 0.8 * left + 0.05 * left**2, abs=2e-3)
@@ -686,7 +849,8 @@ def test_the_force_range_of_a_hinge_limits_its_rotor() -> None:
 
 @pytest.mark.parametrize("speed", [5.0, -8.0])
 def test_wheels_on_velocity_actuators_roll(speed: float) -> None:
-    """Catches unnamed actuators that stay on the link; the springs wind up by the torque over K, not without end."""
+    """Catches unnamed actuators that stay on the link; the springs wind up by the torque over K,
+    not without end."""
     spec = mujoco.MjSpec.from_string(ROVER)
     spec.option.density = spec.option.viscosity = 0.0
     joint = ElasticJoint(stiffness=40.0, damping=0.3, rotor_inertia=0.01)
@@ -704,26 +868,35 @@ def test_wheels_on_velocity_actuators_roll(speed: float) -> None:
 
 
 def test_joint_addresses_find_rotor_and_link() -> None:
-    """Catches addresses in the order of the model instead of the order asked for; rigid: both are the hinge."""
+    """Catches addresses in the order of the model instead of the order asked for; rigid: both
+    are the hinge."""
     spec = mujoco.MjSpec.from_string(QUADRUPED)
     names = ["rear_knee", "front_hip"]
     model = make_elastic(spec, {"front_hip": FOREIGN}).compile()
     at = JointAddresses.of(model, names)
     assert at.q.tolist() == [model.joint(name).qposadr[0] for name in names]
-    expected = [model.joint("rear_knee").qposadr[0], model.joint(motor_name("front_hip")).qposadr[0]]
+    expected = [
+        model.joint("rear_knee").qposadr[0],
+        model.joint(motor_name("front_hip")).qposadr[0],
+    ]
     assert at.theta.tolist() == expected
-    assert at.theta_dot.tolist() == [address - 1 for address in expected]  # a free joint has one qpos more than dofs
+    assert at.theta_dot.tolist() == [
+        address - 1 for address in expected
+    ]  # a free joint has one qpos more than dofs
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Errors
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_an_unknown_hinge_lists_the_hinges() -> None:
-    """Catches a silent no-op, and an error without the choices; joints that are no hinges are not among them."""
+    """Catches a silent no-op, and an error without the choices; joints that are no hinges are
+    not among them."""
     spec = mujoco.MjSpec.from_string(ROVER)
-    with pytest.raises(ConfigurationError, match=r"unknown hinge 'lft'; choose one of: left, right, pan\..*'left'"):
+    with pytest.raises(
+        ConfigurationError, match=r"unknown hinge 'lft'; choose one of: left, right, pan\..*'left'"
+    ):
         make_elastic(spec, {"lft": FOREIGN})
     with pytest.raises(ConfigurationError, match="unknown hinge 'root'"):
         make_elastic(spec, {"root": FOREIGN})
@@ -732,18 +905,26 @@ def test_an_unknown_hinge_lists_the_hinges() -> None:
 def test_an_unknown_form_or_rule_lists_the_choices() -> None:
     """Catches a form that falls through to another one."""
     spec = mujoco.MjSpec.from_string(ROVER)
-    with pytest.raises(ConfigurationError, match="unknown form 'tendons'; choose one of: tendon, series, rigid"):
+    with pytest.raises(
+        ConfigurationError, match="unknown form 'tendons'; choose one of: tendon, series, rigid"
+    ):
         make_elastic(spec, {"left": FOREIGN}, "tendons")
-    with pytest.raises(ConfigurationError, match="unknown actuator rule 'drop'; choose one of: keep, replace"):
+    with pytest.raises(
+        ConfigurationError, match="unknown actuator rule 'drop'; choose one of: keep, replace"
+    ):
         make_elastic(spec, {"left": FOREIGN}, actuators="drop")
 
 
 def test_the_series_form_refuses_what_it_cannot_represent() -> None:
     """Catches backlash that is silently dropped, and a hinge in the middle of a body's joints."""
     spec = mujoco.MjSpec.from_string(ARM)
-    with pytest.raises(ConfigurationError, match=r"backlash of 'elbow' is 0\.01 rad; use the tendon form"):
+    with pytest.raises(
+        ConfigurationError, match=r"backlash of 'elbow' is 0\.01 rad; use the tendon form"
+    ):
         make_elastic(spec, {"elbow": FOREIGN.replace(backlash=0.01)}, "series")
-    with pytest.raises(ConfigurationError, match=r"'yaw' to be the last joint of its body 'upper_arm'.*'roll'"):
+    with pytest.raises(
+        ConfigurationError, match=r"'yaw' to be the last joint of its body 'upper_arm'.*'roll'"
+    ):
         make_elastic(spec, {"yaw": FOREIGN}, "series")
 
 
@@ -751,19 +932,26 @@ def test_the_series_form_refuses_what_it_cannot_represent() -> None:
 def test_an_elastic_hinge_is_not_made_elastic_again(form: Form) -> None:
     """Catches a second spring in series with the first."""
     once = make_elastic(mujoco.MjSpec.from_string(QUADRUPED), {"front_hip": FOREIGN}, form)
-    with pytest.raises(ConfigurationError, match=r"'front_hip_\w+' already exists .* elastic already"):
+    with pytest.raises(
+        ConfigurationError, match=r"'front_hip_\w+' already exists .* elastic already"
+    ):
         make_elastic(once, {"front_hip": FOREIGN})
 
 
 @pytest.mark.parametrize(
     "element",
-    ['<body name="h_motor"><geom size="0.1"/></body>', '<body name="h_spring"><geom size="0.1"/></body>'],
+    [
+        '<body name="h_motor"><geom size="0.1"/></body>',
+        '<body name="h_spring"><geom size="0.1"/></body>',
+    ],
     ids=["motor", "spring"],
 )
 def test_a_body_may_have_any_name(element: str) -> None:
-    """Catches a clash with a body of the robot: names of bodies, joints and tendons are separate in MuJoCo.
+    """Catches a clash with a body of the robot: names of bodies, joints and tendons are separate in
+    MuJoCo.
 
-    A motor housing is often a body of its own, called after its joint. Either the transform copes, or it says so.
+    A motor housing is often a body of its own, called after its joint. Either the transform copes,
+    or it says so.
     """
     xml = f"""<mujoco><worldbody><body><joint name="h" axis="0 1 0"/><geom size="0.1" pos="0 0 0.3"/>{element}</body>
       </worldbody></mujoco>"""

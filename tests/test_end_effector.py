@@ -17,7 +17,8 @@ from train.commands.cli import main
 
 NAMES = list(ORDER)
 SITED = TREE.replace(
-    '<body name="shank"', '<site name="sole" pos="0.1 0.2 -0.3" quat="0.8 0.1 -0.3 0.2"/><body name="shank"'
+    '<body name="shank"',
+    '<site name="sole" pos="0.1 0.2 -0.3" quat="0.8 0.1 -0.3 0.2"/><body name="shank"',
 )
 
 
@@ -37,7 +38,8 @@ def of_mujoco(model: mujoco.MjModel, q: Array, name: str) -> tuple[Array, Array]
 
 @pytest.mark.parametrize("name", ["sole", "shank", "box"])
 def test_its_pose_is_that_of_mujoco(name: str) -> None:
-    """Catches anchors, references, turned frames and columns that are mixed up: MuJoCo's kinematics are the judge."""
+    """Catches anchors, references, turned frames and columns that are mixed up: MuJoCo's
+    kinematics are the judge."""
     model = mujoco.MjModel.from_xml_string(SITED)
     position, R = EndEffector(model, NAMES, name).pose(poses(12).reshape(3, 4, -1))
     for q, p, turned in zip(poses(12), position.reshape(-1, 3), R.reshape(-1, 3, 3), strict=True):
@@ -48,9 +50,11 @@ def test_its_pose_is_that_of_mujoco(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["sole", "box"])
 def test_its_jacobian_is_that_of_mujoco(name: str) -> None:
-    """Catches columns of other joints and a lever about another point, also where joints do not move the tool."""
+    """Catches columns of other joints and a lever about another point, also where joints do not
+    move the tool."""
     model = mujoco.MjModel.from_xml_string(SITED)
-    data, tool = mujoco.MjData(model), EndEffector(model, NAMES, name)
+    data = mujoco.MjData(model)
+    tool = EndEffector(model, NAMES, name)
     dofs = [int(model.joint(joint).dofadr[0]) for joint in NAMES]
     for q, moved, turned in zip(poses(5), *tool.jacobian(poses(5)), strict=True):
         expected_p, _ = of_mujoco(model, q, name)
@@ -72,8 +76,10 @@ def test_its_errors_are_those_of_mujoco() -> None:
         q = q_ref + size * poses(6)[::-1]
         distance, tilt = EndEffector(model, NAMES, "sole").errors(q_ref, q)
         for row in range(6):
-            (p, R), (p_ref, R_ref) = of_mujoco(model, q[row], "sole"), of_mujoco(model, q_ref[row], "sole")
-            between, turn = np.zeros(4), np.zeros(3)
+            p, R = of_mujoco(model, q[row], "sole")
+            p_ref, R_ref = of_mujoco(model, q_ref[row], "sole")
+            between = np.zeros(4)
+            turn = np.zeros(3)
             mujoco.mju_mat2Quat(between, (R_ref.T @ R).ravel())
             mujoco.mju_quat2Vel(turn, between, 1.0)
             assert distance[row] == pytest.approx(np.linalg.norm(p - p_ref), rel=1e-6)
@@ -82,7 +88,10 @@ def test_its_errors_are_those_of_mujoco() -> None:
 
 def test_what_is_no_end_effector_says_why() -> None:
     """Catches a KeyError, and an end effector that cannot move."""
-    with pytest.raises(ConfigurationError, match=r"unknown site or body for end_effector 'hnd'.*Did you mean 'hand'"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"unknown site or body for end_effector 'hnd'.*Did you mean 'hand'",
+    ):
         JointRobot("lost", rigid_arm, ARM.joints, end_effector="hnd").robot.make()
     fixed = rigid_arm()
     fixed.worldbody.add_site(name="table")
@@ -95,15 +104,21 @@ def test_the_commands_judge_by_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     source = Path(__file__).with_name("three_joints.py").read_text()
     source = source.replace('JointRobot("arm"', 'JointRobot("handed_arm"')
-    (tmp_path / "handed.py").write_text(source.replace('imu="hand")', 'imu="hand", end_effector="hand")'))
+    (tmp_path / "handed.py").write_text(
+        source.replace('imu="hand")', 'imu="hand", end_effector="hand")')
+    )
     (tmp_path / "arm.yaml").write_text(
-        "name: arm\nenv: handed.py:ARM\nreferences: [{kind: sine, amplitude: 0.3, duration_s: 1.0, onset_s: 0.5}]\n"
-        "scenarios: [ideal]\npolicies: [uncompensated, dynamic]\n"
+        "name: arm\nenv: handed.py:ARM\nreferences: [{kind: sine, amplitude: 0.3, duration_s: 1.0,"
+        " onset_s: 0.5}]\nscenarios: [ideal]\npolicies: [uncompensated, dynamic]\n"
     )
     main(["compare", "arm.yaml", "--jobs", "1"])
     folder = tmp_path / "runs" / "arm"
     without, compensated = csv.DictReader((folder / "episodes.csv").open())
     assert 1e-3 < float(without["end_effector_error_rms_m"]) < 0.1
-    assert float(compensated["end_effector_error_rms_m"]) < 0.05 * float(without["end_effector_error_rms_m"])
-    assert float(compensated["end_effector_tilt_rms_rad"]) < 0.05 * float(without["end_effector_tilt_rms_rad"])
+    assert float(compensated["end_effector_error_rms_m"]) < 0.05 * float(
+        without["end_effector_error_rms_m"]
+    )
+    assert float(compensated["end_effector_tilt_rms_rad"]) < 0.05 * float(
+        without["end_effector_tilt_rms_rad"]
+    )
     assert "end effector error" in (folder / "report.html").read_text()

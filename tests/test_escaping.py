@@ -1,4 +1,5 @@
-"""A label of a user stays text in every format of results: read back by parsers that are not ours."""
+"""A label of a user stays text in every format of results: read back by parsers that are not
+ours."""
 
 import csv
 import html
@@ -37,20 +38,39 @@ from train.runs.escaping import (
 from train.runs.progress import show_progress
 
 NASTY = [
-    "<!--<script>", "</script><b>", "a|b", "a\nb", "=cmd|' /C calc'!A0", "-1+2", "@x", "\tx", "&lt;", "\u2028", "ok",
-]  # fmt: skip
+    "<!--<script>",
+    "</script><b>",
+    "a|b",
+    "a\nb",
+    "=cmd|' /C calc'!A0",
+    "-1+2",
+    "@x",
+    "\tx",
+    "&lt;",
+    "\u2028",
+    "ok",
+]
 """Labels that mean something to a browser, a spreadsheet or Markdown."""
 
 COMMANDS = [
     *map(chr, [*range(9), *range(0x0B, 0x20), *range(0x7F, 0xA0)]),
-    "\u061c", "\u200e", "\u200f", "\u202a", "\u202d", "\u202e", "\u2066", "\u2069", "\udc9b",
-]  # fmt: skip
+    "\u061c",
+    "\u200e",
+    "\u200f",
+    "\u202a",
+    "\u202d",
+    "\u202e",
+    "\u2066",
+    "\u2069",
+    "\udc9b",
+]
 """What a terminal obeys, what turns the order of letters around, and half a character."""
 HOSTILE = "a" + "".join(COMMANDS) + "]8;;http://x[31mb"
 
 
 def test_a_text_keeps_its_letters_and_loses_its_commands() -> None:
-    """Catches U+009B, a carriage return, and letters of other scripts that are taken for commands."""
+    """Catches U+009B, a carriage return, and letters of other scripts that are taken for
+    commands."""
     assert visible(HOSTILE) == "a" + "�" * len(COMMANDS) + "]8;;http://x[31mb"
     assert visible("τ_J 関節 שלום 🤖 a\tb\n") == "τ_J 関節 שלום 🤖 a\tb\n"
 
@@ -75,21 +95,26 @@ PRINTED: dict[str, Callable[[PlainConsole], None]] = {
     "object": lambda console: console.print(Text(HOSTILE)),
     "table": lambda console: console.print(table_of(HOSTILE)),
     "rule": lambda console: console.rule(HOSTILE),
-    "error": lambda console: console.print(Text.assemble(("error:", "bold red"), HOSTILE), soft_wrap=True),
+    "error": lambda console: console.print(
+        Text.assemble(("error:", "bold red"), HOSTILE), soft_wrap=True
+    ),
 }
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
 @pytest.mark.parametrize("name", PRINTED)
 def test_a_console_obeys_no_text(name: str, is_terminal: bool) -> None:
-    """Catches a label that moves the cursor, sets the title of the window, or turns a line around."""
+    """Catches a label that moves the cursor, sets the title of the window, or turns a line
+    around."""
     console = PlainConsole(file=io.StringIO(), width=400, force_terminal=is_terminal)
     written = shown_by(console, PRINTED[name])
     assert "�]8;;http://x[31mb" in written
     assert not set(COMMANDS) & set(written)
 
 
-@pytest.mark.parametrize("text", ["[/bold] x", "[link=file:///x]y[/link]", "\\[mm] [bold]x", "a:smile:b"])
+@pytest.mark.parametrize(
+    "text", ["[/bold] x", "[link=file:///x]y[/link]", "\\[mm] [bold]x", "a:smile:b"]
+)
 def test_a_printed_text_is_no_markup(text: str) -> None:
     """Catches a path or a label that ends a command with an error of Rich's, or becomes a link."""
     console = PlainConsole(file=io.StringIO(), width=100, force_terminal=True)
@@ -124,27 +149,52 @@ def test_files_obey_no_text(tmp_path: Path) -> None:
 
 
 LINKS = [
-    r"a \ b", r"a\\", r"\*",
-    "[a](http://x)", "![a](http://x/y.png)", "![a][b]", "[a][b]", "[a]: http://x", "http://x.y", "HTTPS://x.y",
-    "www.x.org", "ftp://x.y", "\\[a](x)", "[a\\](x)", "[a](<x>)", "<http://x>", "![](x)", "[![a](b)](c)",
-]  # fmt: skip
+    r"a \ b",
+    r"a\\",
+    r"\*",
+    "[a](http://x)",
+    "![a](http://x/y.png)",
+    "![a][b]",
+    "[a][b]",
+    "[a]: http://x",
+    "http://x.y",
+    "HTTPS://x.y",
+    "www.x.org",
+    "ftp://x.y",
+    "\\[a](x)",
+    "[a\\](x)",
+    "[a](<x>)",
+    "<http://x>",
+    "![](x)",
+    "[![a](b)](c)",
+]
 
 
 @pytest.mark.parametrize("label", LINKS)
 def test_a_label_is_no_link_of_markdown(label: str) -> None:
-    """Catches a report that loads a picture from elsewhere, or leads there, read by a parser that is not ours."""
+    """Catches a report that loads a picture from elsewhere, or leads there, read by a parser
+    that is not ours."""
     parser = MarkdownIt("commonmark")
-    assert re.search("(http|https|ftp)://|www[.]", markdown_text(label), re.IGNORECASE) is None, "links of GitHub's"
+    assert re.search("(http|https|ftp)://|www[.]", markdown_text(label), re.IGNORECASE) is None, (
+        "links of GitHub's"
+    )
     for text in (markdown_text(label), f"* {markdown_text(label)}", f"# {markdown_text(label)}"):
         tokens = [part for token in parser.parse(text) for part in (token, *(token.children or ()))]
-        assert not {"link_open", "image", "html_inline", "html_block"} & {token.type for token in tokens}
-        (shown,) = ["".join(part.content for part in t.children or ()) for t in tokens if t.type == "inline"]
+        assert not {"link_open", "image", "html_inline", "html_block"} & {
+            token.type for token in tokens
+        }
+        (shown,) = [
+            "".join(part.content for part in t.children or ()) for t in tokens if t.type == "inline"
+        ]
         assert shown == label
 
 
 def test_intervals_stay_as_they_are_in_markdown() -> None:
     """Catches brackets that are escaped for nothing in every table."""
-    assert markdown_text("12.3 [11.0, 13.5] residual:seed_[0-4] a_b") == "12.3 [11.0, 13.5] residual:seed_[0-4] a_b"
+    assert (
+        markdown_text("12.3 [11.0, 13.5] residual:seed_[0-4] a_b")
+        == "12.3 [11.0, 13.5] residual:seed_[0-4] a_b"
+    )
 
 
 class Scripts(HTMLParser):
@@ -170,7 +220,8 @@ class Scripts(HTMLParser):
 
 @pytest.mark.parametrize("label", NASTY)
 def test_nothing_after_a_chart_is_swallowed(label: str) -> None:
-    """Catches a label that ends the script element, or begins a comment in which its end is lost."""
+    """Catches a label that ends the script element, or begins a comment in which its end is
+    lost."""
     page = Scripts()
     text = script_json({"name": label})
     page.feed(f'<script type="application/json">{text}</script><h2>next</h2>')
@@ -183,14 +234,21 @@ def test_nothing_after_a_chart_is_swallowed(label: str) -> None:
 
 @given(st.text(), st.text())
 def test_a_markdown_table_keeps_its_cells(first: str, second: str) -> None:
-    """Catches a newline or a bar that makes another row or cell, and HTML that a viewer would take for such."""
+    """Catches a newline or a bar that makes another row or cell, and HTML that a viewer would
+    take for such."""
     lines = markdown_table(["a", "b"], ["---", "---:"], [[first, second]]).split("\n")
     assert len(lines) == 3
     assert lines[2].replace("\\|", "").count("|") == 3
     assert "<" not in lines[2]
 
 
-@given(st.lists(st.one_of(st.text(alphabet=st.characters(blacklist_categories=["Cs"])), st.floats(), st.integers())))
+@given(
+    st.lists(
+        st.one_of(
+            st.text(alphabet=st.characters(blacklist_categories=["Cs"])), st.floats(), st.integers()
+        )
+    )
+)
 def test_no_cell_of_a_csv_file_is_a_formula(row: list[object]) -> None:
     """Catches text that a spreadsheet runs, and numbers that become text."""
     file = io.StringIO()
@@ -212,7 +270,8 @@ def test_a_chart_shows_a_label_as_it_is(label: str) -> None:
 
 
 def page_of(text: str) -> str:
-    """A page that has a text in every place where one can stand, in thirteen elements and a chart."""
+    """A page that has a text in every place where one can stand, in thirteen elements and a
+    chart."""
     page = Page(text, text)
     page.section(text, text)
     page.add("heading", text, folded=text)
@@ -226,7 +285,8 @@ def page_of(text: str) -> str:
 @pytest.mark.parametrize("label", NASTY)
 def test_a_page_shows_a_label_as_it_is(label: str) -> None:
     """Catches a template that does not escape, and one that escapes what is escaped."""
-    page, plain = Scripts(), Scripts()
+    page = Scripts()
+    plain = Scripts()
     page.feed(page_of(label))
     plain.feed(page_of("plain"))
     assert page.tags == plain.tags
@@ -234,11 +294,14 @@ def test_a_page_shows_a_label_as_it_is(label: str) -> None:
     assert json.loads(page.scripts[1]) == {"name": label}
 
 
-@pytest.mark.parametrize(("to", "text"), [
-    ("markdown", "| a\\|&lt;b&gt;� |\n| --- |\n| =1+a\\|&lt;b&gt;� |"),
-    ("csv", "a|<b>�\r\n'=1+a|<b>�\r\n"),
-    ("html", "<td class=\"words\">=1+a|&lt;b&gt;�</td>"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("to", "text"),
+    [
+        ("markdown", "| a\\|&lt;b&gt;� |\n| --- |\n| =1+a\\|&lt;b&gt;� |"),
+        ("csv", "a|<b>�\r\n'=1+a|<b>�\r\n"),
+        ("html", '<td class="words">=1+a|&lt;b&gt;�</td>'),
+    ],
+)
 def test_a_table_is_escaped_at_its_one_outlet(to: Any, text: str) -> None:
     """Catches a format in which the text of a label is a command, a tag or a formula."""
     assert text in render(ReportTable.plain(["a|<b>\x1b"], [["=1+a|<b>\x1b"]]), to)

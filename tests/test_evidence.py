@@ -1,4 +1,5 @@
-"""How far a cautious residual may act: the closed form, and what gets through where the model is right and wrong."""
+"""How far a cautious residual may act: the closed form, and what gets through where the model is
+right and wrong."""
 
 from functools import cache
 from typing import Any
@@ -18,7 +19,8 @@ from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualWrapper
 from elastic_env.core.errors import ConfigurationError
 
-HIP_ROLLS, PERIOD = [1, 7], 25
+HIP_ROLLS = [1, 7]
+PERIOD = 25
 
 
 @pytest.mark.parametrize(
@@ -33,40 +35,65 @@ HIP_ROLLS, PERIOD = [1, 7], 25
         ((0.2, -0.2), np.sqrt(0.04 - ERROR_SCALE**2) / 2.0, 0.0, 0.5),
     ],
 )
-def test_evidence_is_the_closed_form(model_error: Any, uncertainty: float, load: float, expected: float) -> None:
-    """Catches a sign that counts, a leg that does not, an error that counts though it is unsure, a wrong sum."""
+def test_evidence_is_the_closed_form(
+    model_error: Any, uncertainty: float, load: float, expected: float
+) -> None:
+    """Catches a sign that counts, a leg that does not, an error that counts though it is unsure,
+    a wrong sum."""
     g = evidence(np.array(model_error), np.full(2, uncertainty), np.array(load))
     np.testing.assert_allclose(g, expected)
 
 
 def decided(envs: Any, cautious: bool) -> ResidualPolicy:
     """A policy that decides a residual of one whatever it sees, on the hip rolls."""
-    chosen = ResidualSettings(scale=0.05, joints=("hip_roll",), observe=("clock",), cautious=cautious)
-    corrected = Corrected(baselines.make("input_output", envs), envs.unwrapped.assumed_model, chosen)
+    chosen = ResidualSettings(
+        scale=0.05, joints=("hip_roll",), observe=("clock",), cautious=cautious
+    )
+    corrected = Corrected(
+        baselines.make("input_output", envs), envs.unwrapped.assumed_model, chosen
+    )
     width = Features(corrected).width
-    tensors = {"mean": np.zeros(width), "std": np.ones(width), "weight0": np.zeros((2, width)), "bias0": np.ones(2)}
-    return ResidualPolicy(corrected, Network(ResidualDescription(robot="walker", base="input_output"), tensors))
+    tensors = {
+        "mean": np.zeros(width),
+        "std": np.ones(width),
+        "weight0": np.zeros((2, width)),
+        "bias0": np.ones(2),
+    }
+    return ResidualPolicy(
+        corrected, Network(ResidualDescription(robot="walker", base="input_output"), tensors)
+    )
 
 
 def worlds(scenario: str, num_steps: int) -> Any:
     """Two fast walks."""
     return gymnasium.make_vec(
-        "elastic_env/WalkInPlace-v0", 2, vectorization_mode="vector_entry_point", autoreset_mode="Disabled",
-        scenario=scenario, step_period=1.6, num_steps=num_steps, num_threads=1,
-    )  # fmt: skip
+        "elastic_env/WalkInPlace-v0",
+        2,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="Disabled",
+        scenario=scenario,
+        step_period=1.6,
+        num_steps=num_steps,
+        num_threads=1,
+    )
 
 
 @cache
 def walk(scenario: str, cautious: bool) -> tuple[Any, Any]:
-    """Evidence at every decision of a short walk, and at its end the correction by a residual that is always one.
+    """Evidence at every decision of a short walk, and at its end the correction by a residual that
+    is always one.
 
     Returns:
         (decisions, 2 worlds) and (2 worlds, 12).
     """
     envs = worlds(scenario, num_steps=2)
-    policy, model = decided(envs, cautious), envs.unwrapped.assumed_model
+    policy = decided(envs, cautious)
+    model = envs.unwrapped.assumed_model
     source = Evidence(model, PERIOD * model.control_period_s)
-    (observation, _), state, memory, seen = envs.reset(seed=0), None, source.begin(2), []
+    observation, _ = envs.reset(seed=0)
+    state = None
+    memory = source.begin(2)
+    seen = []
     for step in range(envs.unwrapped.task.num_steps):
         if step % PERIOD == 0:
             g, memory = source.observe(observation, memory)
@@ -78,7 +105,8 @@ def walk(scenario: str, cautious: bool) -> tuple[Any, Any]:
 
 @pytest.mark.parametrize("scenario", ["nominal", "sensor"])
 def test_a_right_model_leaves_no_evidence(scenario: str) -> None:
-    """Catches a load that is not averaged, which swings by more than a payload with every fast step."""
+    """Catches a load that is not averaged, which swings by more than a payload with every fast
+    step."""
     seen, correction = walk(scenario, True)
     assert seen.mean() < 0.05
     assert (seen[-1] < 0.1).all()
@@ -86,12 +114,16 @@ def test_a_right_model_leaves_no_evidence(scenario: str) -> None:
 
 
 @pytest.mark.parametrize("scenario", ["soft", "payload"])
-def test_a_wrong_model_leaves_evidence_and_a_cautious_residual_acts_as_far_as_that(scenario: str) -> None:
+def test_a_wrong_model_leaves_evidence_and_a_cautious_residual_acts_as_far_as_that(
+    scenario: str,
+) -> None:
     """Catches caution that does not arrive at the correction."""
     seen, correction = walk(scenario, True)
     assert (seen[0] < 0.1).all()
     assert (seen[-1] > 0.5).all()
-    np.testing.assert_allclose(correction[:, HIP_ROLLS], 0.05 * seen[-1][:, None] * np.ones(2), rtol=0.05)
+    np.testing.assert_allclose(
+        correction[:, HIP_ROLLS], 0.05 * seen[-1][:, None] * np.ones(2), rtol=0.05
+    )
 
 
 def test_caution_is_only_where_it_is_asked_for() -> None:
@@ -103,14 +135,18 @@ def test_caution_is_only_where_it_is_asked_for() -> None:
 def test_evidence_is_of_the_episode_and_counted_once_per_decision() -> None:
     """Catches evidence of the episode before or of another world, and decisions at other steps."""
     envs = worlds("payload", num_steps=1)
-    policy, model = decided(envs, cautious=True), envs.unwrapped.assumed_model
+    policy = decided(envs, cautious=True)
+    model = envs.unwrapped.assumed_model
     source = Evidence(model, PERIOD * model.control_period_s)
     begun = np.zeros(2, dtype=np.int64)
-    (observation, _), state, memory = envs.reset(seed=0), None, source.begin(2)
+    observation, _ = envs.reset(seed=0)
+    state = None
+    memory = source.begin(2)
     for step in range(12 * PERIOD):
         starting = np.full(2, step == 0)
         if step == 5 * PERIOD + 7:
-            starting[0], begun[0] = True, step
+            starting[0] = True
+            begun[0] = step
             observation, _ = envs.reset(options={"reset_mask": starting})
         due = (step - begun) % PERIOD == 0
         memory = put_rows(memory, starting, select_rows(source.begin(2), starting))

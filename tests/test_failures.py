@@ -1,4 +1,5 @@
-"""What goes wrong with the system or with a user's policy is one sentence, and an exit code that says which."""
+"""What goes wrong with the system or with a user's policy is one sentence, and an exit code that
+says which."""
 
 import ctypes
 import errno
@@ -63,7 +64,9 @@ CELL = Condition(policy=PolicySpec(name="mine.py:policy"), reference={"kind": "s
 
 def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "from train.commands.entry import main; main()", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, **options
+    )  # type: ignore[call-overload]
 
 
 SEVERAL = """
@@ -82,8 +85,11 @@ for size, arguments in json.loads(sys.argv[1]):
 """
 
 
-def several(*commands: tuple[int | None, list[str]], first: str = "", **options: object) -> list[str]:
-    """What commands say on stderr that all end with the same code, one after the other in one process.
+def several(
+    *commands: tuple[int | None, list[str]], first: str = "", **options: object
+) -> list[str]:
+    """What commands say on stderr that all end with the same code, one after the other in one
+    process.
 
     Args:
         commands: Largest file that each may write [bytes], None for any, and its arguments.
@@ -94,7 +100,9 @@ def several(*commands: tuple[int | None, list[str]], first: str = "", **options:
         Of each command what it said and "ended with CODE".
     """
     program = [sys.executable, "-c", first + SEVERAL, json.dumps(commands)]
-    run = subprocess.run(program, capture_output=True, text=True, timeout=120, check=True, **options)  # type: ignore[call-overload]
+    run = subprocess.run(
+        program, capture_output=True, text=True, timeout=120, check=True, **options
+    )  # type: ignore[call-overload]
     said = [line for line in re.split(r"(?<=ended with \d)\n", run.stderr) if line]
     assert len(said) == len(commands), run.stderr
     return said
@@ -105,7 +113,11 @@ def several(*commands: tuple[int | None, list[str]], first: str = "", **options:
     [
         (ConfigurationError("no"), "no", 2),
         (SystemFailedError("gone"), "gone", 3),
-        (OSError(errno.ENOSPC, "No space left on device", "runs/x"), "runs/x: No space left on device; free some", 3),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "runs/x"),
+            "runs/x: No space left on device; free some",
+            3,
+        ),
         (WorkerKilledError(), "a worker process was killed", 3),
         (MemoryError(), "there is not enough memory", 3),
         (ModuleNotFoundError("", name="torch"), "constraints.txt '.[train]'", 2),
@@ -122,7 +134,8 @@ def test_a_failure_is_a_sentence_and_a_code(error: Exception, said: str, code: i
 
 def test_a_full_disk_is_found_behind_the_error_of_a_library() -> None:
     """Catches a library that hides why it could not write."""
-    error, cause = RuntimeError("writer failed"), OSError(errno.ENOSPC, "No space left on device")
+    error = RuntimeError("writer failed")
+    cause = OSError(errno.ENOSPC, "No space left on device")
     error.__cause__ = cause
     assert explain(error) == explain(cause)
     assert explain(RuntimeError("a defect")) is None
@@ -133,28 +146,44 @@ def test_a_policy_that_fails_is_named_with_scenario_and_step(tmp_path: Path) -> 
     (tmp_path / "mine.py").write_text(POLICIES)
     reference = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
     kinds = ["raises", "nan", "shape"]
-    commands = [(None, ["evaluate", "--policy", f"mine.py:{kind}", "--reference", reference]) for kind in kinds]
+    commands = [
+        (None, ["evaluate", "--policy", f"mine.py:{kind}", "--reference", reference])
+        for kind in kinds
+    ]
     for kind, said in zip(kinds, several(*commands, cwd=tmp_path), strict=True):
         assert said.endswith("ended with 2"), said
-        assert f"the policy 'mine.py:{kind}' failed in scenario 'nominal', sine, at control step 3" in said
+        assert (
+            f"the policy 'mine.py:{kind}' failed in scenario 'nominal', sine, at control step 3"
+            in said
+        )
         assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(
-    "error", [FileNotFoundError(2, "No such file"), SystemExit(7), ConfigurationError("no"), RuntimeError("no")]
+    "error",
+    [
+        FileNotFoundError(2, "No such file"),
+        SystemExit(7),
+        ConfigurationError("no"),
+        RuntimeError("no"),
+    ],
 )
 def test_whatever_a_policy_raises_is_the_policys(error: BaseException) -> None:
-    """Catches a file that the policy misses taken for a disk that failed, and a policy that ends the program."""
+    """Catches a file that the policy misses taken for a disk that failed, and a policy that ends
+    the program."""
     with (
         pytest.raises(
-            PolicyFailedError, match=r"'mine.py:policy' failed in scenario 'nominal', sine, at control step 3"
+            PolicyFailedError,
+            match=r"'mine.py:policy' failed in scenario 'nominal', sine, at control step 3",
         ),
         policy_errors(CELL, 3),
     ):
         raise error
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), MemoryError(), SystemFailedError("gone")])
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space"), MemoryError(), SystemFailedError("gone")]
+)
 def test_what_the_system_does_is_not_the_policys(error: Exception) -> None:
     """Catches a full disk that is put down to the policy that met it."""
     with pytest.raises(type(error)) as caught, policy_errors(CELL, 3):
@@ -164,14 +193,26 @@ def test_what_the_system_does_is_not_the_policys(error: Exception) -> None:
 
 @pytest.mark.parametrize("command", ["play", "speed"])
 def test_a_policy_that_fails_is_named_by_every_command(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Catches a traceback in commands that play a policy without scoring it."""
     (tmp_path / "mine.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
     given = {
         "play": ["--video", "x.gif", "--max-s", "0.1"],
-        "speed": ["--env", "testbed", "--num-envs", "2", "--rounds", "1", "--no-others", "--no-ppo"],
+        "speed": [
+            "--env",
+            "testbed",
+            "--num-envs",
+            "2",
+            "--rounds",
+            "1",
+            "--no-others",
+            "--no-ppo",
+        ],
     }
     with pytest.raises(SystemExit) as caught:
         main([command, "--policy", "mine.py:raises", *given[command]])
@@ -204,16 +245,26 @@ def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path)
 def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
     """Catches BrokenPipeError, also where the interpreter flushes at its end."""
     code = f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help"
-    run = subprocess.run(f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True)
+    run = subprocess.run(
+        f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True
+    )
     assert "Traceback" not in run.stderr
     assert "BrokenPipe" not in run.stderr
 
 
-@pytest.mark.parametrize(("where", "code", "said"), [("> /dev/full", 3, "No space left on device"), (">&-", 0, "")])
+@pytest.mark.parametrize(
+    ("where", "code", "said"), [("> /dev/full", 3, "No space left on device"), (">&-", 0, "")]
+)
 def test_output_that_cannot_be_written_is_one_sentence(where: str, code: int, said: str) -> None:
-    """Catches a traceback and "worse" where a log's disk is full, and a program that needs a standard output."""
-    program = f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help {where}"
-    run = subprocess.run(program, shell=True, capture_output=True, text=True, timeout=120, check=False)
+    """Catches a traceback and "worse" where a log's disk is full, and a program that needs a
+    standard output."""
+    program = (
+        f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help"
+        f" {where}"
+    )
+    run = subprocess.run(
+        program, shell=True, capture_output=True, text=True, timeout=120, check=False
+    )
     assert run.returncode == code, run.stderr
     assert said in run.stderr
     assert len(run.stderr.splitlines()) == bool(said)
@@ -226,7 +277,9 @@ def test_an_interrupt_while_modules_load_is_one_word() -> None:
         "-c",
         "import sys; sys.argv[1:] = ['demo']; from train.commands.entry import main; main()",
     ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as program:
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as program:
         time.sleep(0.6)
         program.send_signal(signal.SIGINT)
         _, said = program.communicate(timeout=60)
@@ -237,7 +290,8 @@ def test_an_interrupt_while_modules_load_is_one_word() -> None:
 
 @pytest.mark.parametrize("asked", [KeyboardInterrupt, EndedError])
 def test_an_interrupt_that_c_code_quotes_is_an_interrupt(asked: type[KeyboardInterrupt]) -> None:
-    """Catches "a defect" where Ctrl-C comes while `ctypes` converts an argument, as while Numba compiles."""
+    """Catches "a defect" where Ctrl-C comes while `ctypes` converts an argument, as while Numba
+    compiles."""
 
     class Interrupted:
         @classmethod
@@ -272,10 +326,15 @@ def test_a_file_that_cannot_grow_is_one_sentence(tmp_path: Path) -> None:
         assert "Traceback" not in said
 
 
-@pytest.mark.parametrize(("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")])
+@pytest.mark.parametrize(
+    ("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")]
+)
 def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_path: Path) -> None:
-    """Catches an encoder that says nothing, and a writer that prints what it raises a second time."""
-    run = elastic("play", "--video", video, "--max-s", "0.2", cwd=tmp_path, preexec_fn=limited(2_000))
+    """Catches an encoder that says nothing, and a writer that prints what it raises a second
+    time."""
+    run = elastic(
+        "play", "--video", video, "--max-s", "0.2", cwd=tmp_path, preexec_fn=limited(2_000)
+    )
     assert run.returncode == 3, run.stderr
     assert said in run.stderr
     assert "Traceback" not in run.stderr
@@ -283,16 +342,26 @@ def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_pat
 
 @pytest.mark.parametrize(
     ("seconds", "said"),
-    [(34.0, "30 s"), (62.0, "60 s"), (89.0, "90 s"), (91.0, "2 min"), (5399.0, "90 min"), (7300.0, "2 h")],
+    [
+        (34.0, "30 s"),
+        (62.0, "60 s"),
+        (89.0, "90 s"),
+        (91.0, "2 min"),
+        (5399.0, "90 min"),
+        (7300.0, "2 h"),
+    ],
 )
 def test_a_time_to_go_is_said_in_words(seconds: float, said: str) -> None:
     assert duration(seconds) == said
 
 
 @pytest.mark.parametrize(("whole_s", "first"), [(100.0, "  about 2 min to go"), (20.0, "  50 %")])
-def test_long_work_is_announced(whole_s: float, first: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_work_is_announced(
+    whole_s: float, first: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a minute of silence, and words about what is over in a moment."""
-    now, out = 0.0, io.StringIO()
+    now = 0.0
+    out = io.StringIO()
     monkeypatch.setattr(time, "monotonic", lambda: now)
     say = plain_progress(Console(file=out), least_s=10.0)
     for percent in range(1, 101):

@@ -1,4 +1,5 @@
-"""No bit of a rollout changes unnoticed: environments, noise, delay, policies, residuals, metrics."""
+"""No bit of a rollout changes unnoticed: environments, noise, delay, policies, residuals,
+metrics."""
 
 import numpy as np
 import pytest
@@ -8,7 +9,11 @@ from tests.fingerprints import Case, cases, fingerprint, numerics, recorded
 
 def _played() -> list[Case]:
     """Each scenario in a vector environment, each policy and each whole episode in a scalar one."""
-    return [case for case in cases() if (case.worlds == 1) == (case.scenario == "nominal" or case.arguments != "{}")]
+    return [
+        case
+        for case in cases()
+        if (case.worlds == 1) == (case.scenario == "nominal" or case.arguments != "{}")
+    ]
 
 
 def test_every_case_is_recorded() -> None:

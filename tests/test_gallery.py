@@ -1,4 +1,5 @@
-"""Known robots with elastic joints: stable, rigid in the limit, and of one gravity torque, whoever computes it."""
+"""Known robots with elastic joints: stable, rigid in the limit, and of one gravity torque,
+whoever computes it."""
 
 import copy
 import csv
@@ -27,7 +28,13 @@ from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.rigid.tree.torque import TreeTorque
 from elastic_env.robots import gallery
-from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, home_pose
+from elastic_env.robots.gallery import (
+    GALLERY,
+    gallery_file,
+    gallery_joints,
+    gallery_robot,
+    home_pose,
+)
 from tests.gallery_files import FOLDER, PACKAGED, excerpt
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")
@@ -56,13 +63,18 @@ def sides(model: mujoco.MjModel, hinges: list[str]) -> tuple[list[int], list[int
 
 @pytest.mark.parametrize("name", GALLERY)
 def test_a_robot_with_elastic_hinges_moves_for_ten_seconds(name: str) -> None:
-    """Catches a hinge that stayed rigid, a spring that explodes or swings up, and a reset that would hide it."""
-    model, hinges = elastic(name), hinges_of(rigid(name))
+    """Catches a hinge that stayed rigid, a spring that explodes or swings up, and a reset that
+    would hide it."""
+    model = elastic(name)
+    hinges = hinges_of(rigid(name))
     assert len(hinges) == rigid(name).nv == model.ntendon
-    data, home = mujoco.MjData(model), home_pose(name, hinges)
+    data = mujoco.MjData(model)
+    home = home_pose(name, hinges)
     rotors, links = sides(model, hinges)
     data.qpos[rotors] = data.qpos[links] = home
-    omega, largest, early = 2.0 * np.pi * np.linspace(0.2, 0.5, len(hinges)), 0.0, 0.0
+    omega = 2.0 * np.pi * np.linspace(0.2, 0.5, len(hinges))
+    largest = 0.0
+    early = 0.0
     for step in range(2500):
         data.ctrl[:] = home + 0.2 * np.sin(omega * data.time)
         mujoco.mj_step(model, data, 4)
@@ -78,39 +90,56 @@ def test_a_robot_with_elastic_hinges_moves_for_ten_seconds(name: str) -> None:
 def test_the_limit_of_rigid_joints_is_the_model_as_it_was(name: str) -> None:
     """Catches weight, damping or limits that a rotor brings along or loses.
 
-    For K → ∞ the deflection vanishes, and what is left is Tᵀ M T q̈ = Tᵀ f. q̈ must be that of MuJoCo for the model as
-    it was, with the rotors' inertia as armature, pushed by the same torques.
+    For K → ∞ the deflection vanishes, and what is left is Tᵀ M T q̈ = Tᵀ f. q̈ must be that of
+    MuJoCo for the model as it was, with the rotors' inertia as armature, pushed by the same
+    torques.
     """
-    model, stiff, hinges = copy.copy(rigid(name)), elastic(name), hinges_of(rigid(name))
-    expected, data = mujoco.MjData(model), mujoco.MjData(stiff)
+    model = copy.copy(rigid(name))
+    stiff = elastic(name)
+    hinges = hinges_of(rigid(name))
+    expected = mujoco.MjData(model)
+    data = mujoco.MjData(stiff)
     rotors, links = sides(stiff, hinges)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
     model.dof_armature[:] = stiff.dof_armature[rotors]
     generator = np.random.default_rng(1)
     for _ in range(5):
-        q, speed, push = home_pose(name, hinges), generator.uniform(-1, 1, model.nv), generator.uniform(-5, 5, model.nv)
-        expected.qpos[:], expected.qvel[:], expected.qfrc_applied[:] = q, speed, push
+        q = home_pose(name, hinges)
+        speed = generator.uniform(-1, 1, model.nv)
+        push = generator.uniform(-5, 5, model.nv)
+        expected.qpos[:] = q
+        expected.qvel[:] = speed
+        expected.qfrc_applied[:] = push
         data.qpos[rotors] = data.qpos[links] = q
         data.qvel[rotors] = data.qvel[links] = speed
         mujoco.mj_forward(model, expected)
         mujoco.mj_forward(stiff, data)
-        M, T = np.zeros((stiff.nv, stiff.nv)), np.zeros((stiff.nv, model.nv))
+        M = np.zeros((stiff.nv, stiff.nv))
+        T = np.zeros((stiff.nv, model.nv))
         mujoco.mj_fullM(stiff, data, M)
         T[rotors, range(model.nv)] = T[links, range(model.nv)] = 1.0
         force = T.T @ (data.qfrc_passive - data.qfrc_bias) + push
-        size = np.abs(expected.qacc).max()  # a rotor has 1e-12 kg·m² of its own, which the lightest gripper feels
-        np.testing.assert_allclose(np.linalg.solve(T.T @ M @ T, force), expected.qacc, rtol=0.0, atol=1e-7 * size)
+        size = np.abs(
+            expected.qacc
+        ).max()  # a rotor has 1e-12 kg·m² of its own, which the lightest gripper feels
+        np.testing.assert_allclose(
+            np.linalg.solve(T.T @ M @ T, force), expected.qacc, rtol=0.0, atol=1e-7 * size
+        )
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "talos_arm", "so101", "pusher"])
 def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
-    """Catches a limit that is right on paper and not in motion: ten times the stiffness is a tenth of the deviation."""
-    hinges, joints = hinges_of(rigid(name)), gallery_joints(name, FOLDER)
+    """Catches a limit that is right on paper and not in motion: ten times the stiffness is a
+    tenth of the deviation."""
+    hinges = hinges_of(rigid(name))
+    joints = gallery_joints(name, FOLDER)
 
     def fallen(form: str, scale: float, timestep_s: float | None = None) -> Array:
         """Link angles after a fall of 50 ms from home."""
         scaled = {
-            hinge: ElasticJoint(stiffness=scale * joint.stiffness, rotor_inertia=joint.rotor_inertia)
+            hinge: ElasticJoint(
+                stiffness=scale * joint.stiffness, rotor_inertia=joint.rotor_inertia
+            )
             for hinge, joint in joints.items()
         }
         spec = transformed(gallery_robot(name, FOLDER), scaled, form)  # type: ignore[arg-type]
@@ -119,7 +148,8 @@ def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
         model = spec.compile()
         steps = int(np.ceil(0.05 / min(timestep_s or 1.0, 0.3 * largest_stable_timestep(model))))
         model.opt.timestep = 0.05 / steps
-        data, home = mujoco.MjData(model), home_pose(name, hinges)
+        data = mujoco.MjData(model)
+        home = home_pose(name, hinges)
         at = [model.joint(hinge).qposadr[0] for hinge in hinges]
         data.qpos[at] = home
         if form == "tendon":
@@ -137,13 +167,12 @@ def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
 
 @pytest.mark.parametrize("name", GALLERY)
 def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
-    """Catches a mass, an axis or a frame that is lost between URDF, MuJoCo, Pinocchio and our tree."""
+    """Catches a mass, an axis or a frame that is lost between URDF, MuJoCo, Pinocchio and our
+    tree."""
     model = rigid(name)
-    hinges, data, poses = (
-        hinges_of(model),
-        mujoco.MjData(model),
-        gallery.random_poses(model, np.random.default_rng(3), 10),
-    )
+    hinges = hinges_of(model)
+    data = mujoco.MjData(model)
+    poses = gallery.random_poses(model, np.random.default_rng(3), 10)
     ours = TreeTorque(model, hinges).gravity_torque(poses)
     size = np.abs(ours).max()
     for pose, torque in zip(poses, ours, strict=True):
@@ -152,7 +181,9 @@ def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
         springs = model.jnt_stiffness * (pose - model.qpos_spring)
         np.testing.assert_allclose(torque, data.qfrc_bias + springs, rtol=0.0, atol=1e-9 * size)
         if name in PACKAGED:
-            np.testing.assert_allclose(torque, from_urdf(name, hinges, pose), rtol=0.0, atol=1e-9 * size)
+            np.testing.assert_allclose(
+                torque, from_urdf(name, hinges, pose), rtol=0.0, atol=1e-9 * size
+            )
 
 
 @cache
@@ -187,17 +218,26 @@ def test_the_figures_of_the_page_are_those_of_robots_at_rest(name: str) -> None:
     assert row.pop("input_rms_m") < 1e-9
     for column, value in row.items():
         found = rows()[name][column]
-        assert found == str(value) if isinstance(value, str) else float(found) == pytest.approx(value, rel=1e-4), column
-    robot, model = AtRest(name, FOLDER), elastic(name)
+        assert (
+            found == str(value)
+            if isinstance(value, str)
+            else float(found) == pytest.approx(value, rel=1e-4)
+        ), column
+    robot = AtRest(name, FOLDER)
+    model = elastic(name)
     rotors, links = sides(model, robot.hinges)
-    data, q_ref = mujoco.MjData(model), gallery.random_poses(robot.model, np.random.default_rng(5), 3)
+    data = mujoco.MjData(model)
+    q_ref = gallery.random_poses(robot.model, np.random.default_rng(5), 3)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
     for theta in (q_ref, robot.commands(q_ref)):
         for motor, link in zip(theta, robot.links(theta), strict=True):
-            data.qpos[rotors], data.qpos[links] = motor, link
+            data.qpos[rotors] = motor
+            data.qpos[links] = link
             mujoco.mj_forward(model, data)
             load = data.qfrc_bias[links]
-            np.testing.assert_allclose(data.qfrc_passive[links], load, rtol=0.0, atol=1e-9 * np.abs(load).max())
+            np.testing.assert_allclose(
+                data.qfrc_passive[links], load, rtol=0.0, atol=1e-9 * np.abs(load).max()
+            )
 
 
 def test_the_page_shows_every_robot() -> None:
@@ -223,16 +263,21 @@ def test_rods_weigh_nothing() -> None:
 
 
 def test_the_excerpts_are_those_of_the_package() -> None:
-    """Catches a robot that has changed in the package; without the package there is nothing to compare."""
+    """Catches a robot that has changed in the package; without the package there is nothing to
+    compare."""
     try:
         found = {name: excerpt(gallery_file(name)) for name in PACKAGED}
     except ConfigurationError as error:
         assert "pip install" in str(error)  # noqa: PT017  what a user is told who has no package
         return
-    assert found == {name: gallery_file(name, FOLDER).read_text(encoding="utf-8") for name in PACKAGED}
+    assert found == {
+        name: gallery_file(name, FOLDER).read_text(encoding="utf-8") for name in PACKAGED
+    }
 
 
-def test_what_is_missing_is_said_with_its_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_is_said_with_its_cure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a traceback of files where the extra is not installed."""
     with pytest.raises(ConfigurationError, match=r"unknown robot 'pandas'.*'panda'"):
         gallery_robot("pandas")
@@ -243,7 +288,9 @@ def test_what_is_missing_is_said_with_its_cure(tmp_path: Path, monkeypatch: pyte
         raise PackageNotFoundError
 
     monkeypatch.setattr(gallery, "distribution", missing)
-    with pytest.raises(ConfigurationError, match=r"package example-robot-data; .*pip install .*'\.\[robots\]'"):
+    with pytest.raises(
+        ConfigurationError, match=r"package example-robot-data; .*pip install .*'\.\[robots\]'"
+    ):
         gallery_robot("panda")
 
 
@@ -255,15 +302,21 @@ LINK = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass va
 
 
 @pytest.mark.parametrize(
-    ("visual", "drawn"), [("wedge.stl", "wedge"), ("wedge.dae", "wedge"), ("lost.stl", "wedge"), (None, None)]
+    ("visual", "drawn"),
+    [("wedge.stl", "wedge"), ("wedge.dae", "wedge"), ("lost.stl", "wedge"), (None, None)],
 )
-def test_meshes_are_drawn_where_mujoco_reads_them(tmp_path: Path, visual: str | None, drawn: str | None) -> None:
-    """Catches shapes that add mass or touch something, and a picture without the link whose visual is of COLLADA."""
+def test_meshes_are_drawn_where_mujoco_reads_them(
+    tmp_path: Path, visual: str | None, drawn: str | None
+) -> None:
+    """Catches shapes that add mass or touch something, and a picture without the link whose
+    visual is of COLLADA."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
     faces = [corners[[0, 2, 1]], corners[[0, 1, 3]], corners[[0, 3, 2]], corners[[1, 2, 3]]]
     (tmp_path / "robots" / "meshes").mkdir(parents=True)
     content = b"".join(struct.pack("<3f", 0, 0, 0) + face.tobytes() + b"\0\0" for face in faces)
-    (tmp_path / "robots" / "meshes" / "wedge.stl").write_bytes(b" " * 80 + struct.pack("<I", len(faces)) + content)
+    (tmp_path / "robots" / "meshes" / "wedge.stl").write_bytes(
+        b" " * 80 + struct.pack("<I", len(faces)) + content
+    )
     (tmp_path / "robots" / "meshes" / "wedge.dae").write_text("<COLLADA/>")
     root = ET.fromstring(LINK.format(visual=visual or "wedge.stl"))
     lost = keep_shapes(root, tmp_path / "robots" / "urdf" if visual else None)

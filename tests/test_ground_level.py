@@ -20,9 +20,14 @@ PERIOD_S = 0.1
 def walker(scenario: str, num_envs: int = 4) -> Any:
     """A walk that is only looked at while it stands."""
     return gymnasium.make_vec(
-        "elastic_env/WalkInPlace-v0", num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=1,
-        scenario=scenario, step_period=1.6, num_steps=1,
-    )  # fmt: skip
+        "elastic_env/WalkInPlace-v0",
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        num_threads=1,
+        scenario=scenario,
+        step_period=1.6,
+        num_steps=1,
+    )
 
 
 def force(wrenches: Array) -> Array:
@@ -46,10 +51,13 @@ def _zmp(wrenches: Array, model: Any) -> Array:
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.02, 0.0), (0.0, -0.02), (0.015, 0.01)])
 def test_tilted_ground_shows_what_level_ground_would(tilt: tuple[float, float]) -> None:
-    """A robot that leans by itself, on ground that does: SciPy turns its weight about the center of mass."""
+    """A robot that leans by itself, on ground that does: SciPy turns its weight about the center
+    of mass."""
     model = walker("ideal").unwrapped.assumed_model
-    ground, generator = GroundLevel(model, PERIOD_S), np.random.default_rng(0)
-    table, own = model.observation_table, np.array([0.01, -0.02])
+    ground = GroundLevel(model, PERIOD_S)
+    generator = np.random.default_rng(0)
+    table = model.observation_table
+    own = np.array([0.01, -0.02])
     level = generator.normal(0.0, 5.0, size=(1, 4, 3))
     level[:, [0, 2]] = [[0.0, 0.0, 300.0], [0.0, 0.0, 230.0]]
     theta = generator.normal(0.0, 0.2, size=(1, 12))
@@ -64,49 +72,68 @@ def test_tilted_ground_shows_what_level_ground_would(tilt: tuple[float, float]) 
     rows[:, table.group("encoder_angle")] = theta
     rows[:, table.group("imu_attitude")] = own
     rows[:, table.group("wrench")] = level.reshape(1, -1)
-    bending, share = BendingObserver(model), np.array([300.0, 230.0]) / 530.0
+    bending = BendingObserver(model)
+    share = np.array([300.0, 230.0]) / 530.0
     upright = share @ bending.expected_tilt(rows)[0]
     rows[:, table.group("imu_attitude")] += tilt
     rows[:, table.group("wrench")] = tilted.reshape(1, -1)
-    rows[:, table.group("imu_attitude")] += share @ bending.expected_tilt(rows)[0] - upright  # it bends further
+    rows[:, table.group("imu_attitude")] += (
+        share @ bending.expected_tilt(rows)[0] - upright
+    )  # it bends further
     values = after_a_minute(ground, rows)[0]
     np.testing.assert_allclose(values[0, :2], own, atol=1e-4)
     np.testing.assert_allclose(values[0, 2:], level.ravel(), atol=0.01)
 
 
 def test_slope_of_the_simulation_is_taken_off() -> None:
-    """Catches a sign, an axis, or left for right: a standing robot on one degree, in directions that are drawn."""
-    seen, zmp = {}, {}
+    """Catches a sign, an axis, or left for right: a standing robot on one degree, in directions
+    that are drawn."""
+    seen = {}
+    zmp = {}
     for scenario in ("ideal", "ideal+slope"):
         env = walker(scenario)
         model = env.unwrapped.assumed_model
-        ground, table = GroundLevel(model, PERIOD_S), model.observation_table
+        ground = GroundLevel(model, PERIOD_S)
+        table = model.observation_table
         rows = env.reset(seed=5)[0]
         values, memory = after_a_minute(ground, rows)
-        seen[scenario] = values, memory.mean, rows[:, table.group("imu_attitude")], rows[:, table.group("wrench")]
+        seen[scenario] = (
+            values,
+            memory.mean,
+            rows[:, table.group("imu_attitude")],
+            rows[:, table.group("wrench")],
+        )
         zmp[scenario] = _zmp(values[:, 2:], model), _zmp(rows[:, table.group("wrench")], model)
-    (level, none, attitude, wrench), (values, lean, tilted, leaning) = seen["ideal"], seen["ideal+slope"]
+    level, none, attitude, wrench = seen["ideal"]
+    values, lean, tilted, leaning = seen["ideal+slope"]
     np.testing.assert_allclose(none, 0.0, atol=1e-3)
     np.testing.assert_allclose(np.hypot(*lean.T), np.radians(1.0), atol=1e-3)
-    # the attitude follows the ground, and the springs bend further towards where it leans: neither is the robot's own
+    # the attitude follows the ground, and the springs bend further towards where it leans: neither
+    # is the robot's own
     further = np.linalg.norm(tilted - attitude - lean, axis=1)
     assert further.min() > 4e-3
     assert (np.linalg.norm(values[:, :2] - level[:, :2], axis=1) < 0.65 * further).all()
-    # about y, where both legs bend alike, what is left is the weight of the center of mass that the bending moves
+    # about y, where both legs bend alike, what is left is the weight of the center of mass that the
+    # bending moves
     ahead = np.abs(tilted - attitude - lean)[:, 1]
     assert (np.abs(values - level)[:, 1] < 0.45 * ahead).all()
     assert np.abs(force(leaning) - force(wrench)).max() > 5.0
     np.testing.assert_allclose(force(values[:, 2:]), force(level[:, 2:]), atol=0.5)
-    # so does the center of mass: by millimetres, of a centimetre that it lies beside the feet without bending
-    ours, measured = (np.linalg.norm(zmp["ideal+slope"][i] - zmp["ideal"][i], axis=1) for i in (0, 1))
+    # so does the center of mass: by millimetres, of a centimetre that it lies beside the feet
+    # without bending
+    ours, measured = (
+        np.linalg.norm(zmp["ideal+slope"][i] - zmp["ideal"][i], axis=1) for i in (0, 1)
+    )
     assert measured.min() > 8e-3
     assert ours.max() < 0.5 * measured.min()
 
 
 def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
-    """The mean of the measurements, then a time constant; nothing while both feet hang, or from the first velocity."""
+    """The mean of the measurements, then a time constant; nothing while both feet hang, or from
+    the first velocity."""
     model = walker("ideal").unwrapped.assumed_model
-    ground, wrench = GroundLevel(model, PERIOD_S, mean_s=1.0), model.observation_table.group("wrench")
+    ground = GroundLevel(model, PERIOD_S, mean_s=1.0)
+    wrench = model.observation_table.group("wrench")
 
     def mean(x: float, z: float, memory: GroundMemory) -> GroundMemory:
         rows = np.zeros((1, len(model.observation_table)))
@@ -120,7 +147,9 @@ def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
     for number, x in enumerate((3.0, 6.0, 0.0), start=1):
         memory = mean(x, 300.0, memory)
         assert memory.number[0] == number
-        np.testing.assert_allclose(memory.mean[0], [0.0, -np.mean([3.0, 6.0, 0.0][:number]) / 300.0], atol=1e-15)
+        np.testing.assert_allclose(
+            memory.mean[0], [0.0, -np.mean([3.0, 6.0, 0.0][:number]) / 300.0], atol=1e-15
+        )
     for _ in range(200):
         memory = mean(0.0, 300.0, memory)
     before = mean(3.0, 300.0, memory).mean[0, 1]
@@ -128,9 +157,12 @@ def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
 
 
 def test_acceleration_and_certainty_have_their_closed_forms() -> None:
-    """Catches a sign, a factor or an axis of the acceleration, and a first estimate that is believed at once."""
+    """Catches a sign, a factor or an axis of the acceleration, and a first estimate that is
+    believed at once."""
     model = walker("ideal").unwrapped.assumed_model
-    ground, table, chains = GroundLevel(model, PERIOD_S), model.observation_table, model.biped.chains_above_feet
+    ground = GroundLevel(model, PERIOD_S)
+    table = model.observation_table
+    chains = model.biped.chains_above_feet
     rates = np.zeros((2, 6))
     rates[:, 1] = 0.3  # both hips roll: the body goes sideways
     rates[:, 2] = 0.2  # and pitch
@@ -140,11 +172,20 @@ def test_acceleration_and_certainty_have_their_closed_forms() -> None:
     rows[1, table.group("encoder_rate")] = rates.ravel()
     direction = velocity / (9.81 * PERIOD_S)
     assert np.abs(direction).min() > 0.01
-    rows[:, table.group("wrench")] = [300.0 * direction[0], 300.0 * direction[1], 300.0, 0.0, 0.0, 0.0] * 2
+    rows[:, table.group("wrench")] = [
+        300.0 * direction[0],
+        300.0 * direction[1],
+        300.0,
+        0.0,
+        0.0,
+        0.0,
+    ] * 2
     _, memory = ground.observe(rows[:1], ground.begin(1))
     np.testing.assert_allclose(ground.observe(rows[1:], memory)[1].mean[0], 0.0, atol=1e-5)
 
-    tilt = np.array([direction[1], -direction[0]])  # the same force on a robot that stands: the ground leans
+    tilt = np.array(
+        [direction[1], -direction[0]]
+    )  # the same force on a robot that stands: the ground leans
     for number in range(1, 20):
         lean, _, memory = ground.upright(rows[:1], memory)
         certainty = 1.0 / (1.0 + (VELOCITY_M_PER_S / (9.81 * number * PERIOD_S * TILT_RAD)) ** 2)
@@ -152,16 +193,23 @@ def test_acceleration_and_certainty_have_their_closed_forms() -> None:
 
 
 def test_what_accelerates_is_no_slope() -> None:
-    """Catches a sway that is taken for a tilt of the ground: in a walk the tilt of level ground stays near zero."""
+    """Catches a sway that is taken for a tilt of the ground: in a walk the tilt of level ground
+    stays near zero."""
     env = walker("ideal")
     model = env.unwrapped.assumed_model
-    base, ground = baselines.make("input_output", env), GroundLevel(model, 25 * model.control_period_s)
+    base = baselines.make("input_output", env)
+    ground = GroundLevel(model, 25 * model.control_period_s)
     observation, _ = env.reset(seed=5)
-    state, memory, tilts, leans = None, ground.begin(4), [], []
+    state = None
+    memory = ground.begin(4)
+    tilts = []
+    leans = []
     for step in range(env.unwrapped.task.num_steps):
         if step % 25 == 0:
             values, memory = ground.observe(observation, memory)
-            tilts.append(observation[:, model.observation_table.group("imu_attitude")] - values[:, :2])
+            tilts.append(
+                observation[:, model.observation_table.group("imu_attitude")] - values[:, :2]
+            )
             total = force(observation[:, model.observation_table.group("wrench")])
             leans.append(total[:, :2] / total[:, 2:])
         action, state = base.predict(observation, state, np.full(4, step == 0))

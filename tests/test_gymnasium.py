@@ -1,4 +1,5 @@
-"""Contracts of Gymnasium and Stable-Baselines3, on every registered simulation; hardware has its own test."""
+"""Contracts of Gymnasium and Stable-Baselines3, on every registered simulation; hardware has its
+own test."""
 
 import warnings
 from typing import Any
@@ -14,8 +15,12 @@ from baselines import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 
 SIMULATIONS = {
-    "elastic_env/Testbed-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},
-    "elastic_env/Robot-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},
+    "elastic_env/Testbed-v0": {
+        "reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}
+    },
+    "elastic_env/Robot-v0": {
+        "reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}
+    },
     "elastic_env/WalkInPlace-v0": {"step_period": [0.3, 0.4, 0.3], "num_steps": 1},
 }
 IDS = sorted(SIMULATIONS)
@@ -27,14 +32,21 @@ def make(name: str, **arguments: Any) -> Any:
 
 def make_vec(name: str, num_envs: int, **arguments: Any) -> Any:
     return gymnasium.make_vec(
-        name, num_envs=num_envs, vectorization_mode="vector_entry_point", **{**SIMULATIONS[name], **arguments}
+        name,
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        **{**SIMULATIONS[name], **arguments},
     )
 
 
 def test_every_id_is_here_or_is_hardware() -> None:
     """Catches an environment that is registered and not checked."""
     # those of the package name their module; a test may have registered a robot of its own
-    ours = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("elastic_env.")]
+    ours = [
+        name
+        for name, spec in gymnasium.registry.items()
+        if str(spec.entry_point).startswith("elastic_env.")
+    ]
     assert sorted([*SIMULATIONS, "elastic_env/HardwareTestbed-v0"]) == sorted(ours)
 
 
@@ -43,9 +55,15 @@ def test_gymnasiums_checker_finds_nothing(name: str) -> None:
     """Catches spaces, dtypes, seeding, rendering and return types that are not Gymnasium's."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*recommended way of making.*|.*A Box observation space.*")
-        warnings.filterwarnings("ignore", message=".*observation space (min|max)imum value is -?infinity.*")
-        warnings.filterwarnings("ignore", message=".*recommended to use a symmetric and normalized.*")
+        warnings.filterwarnings(
+            "ignore", message=".*recommended way of making.*|.*A Box observation space.*"
+        )
+        warnings.filterwarnings(
+            "ignore", message=".*observation space (min|max)imum value is -?infinity.*"
+        )
+        warnings.filterwarnings(
+            "ignore", message=".*recommended to use a symmetric and normalized.*"
+        )
         check_env(make(name).unwrapped, skip_render_check=True)  # which opens windows
         drawn = make(name, render_mode="rgb_array")
         drawn.reset(seed=0)
@@ -60,8 +78,10 @@ def test_stable_baselines3s_checker_finds_nothing(name: str) -> None:
 
 @pytest.mark.parametrize("name", IDS)
 def test_rollouts_of_one_seed_are_equal(name: str) -> None:
-    """Catches an environment that remembers the one before, in values and in types; as Gymnasium tests its own."""
-    one, other = make(name), make(name)
+    """Catches an environment that remembers the one before, in values and in types; as Gymnasium
+    tests its own."""
+    one = make(name)
+    other = make(name)
     for _ in range(2):
         assert data_equivalence(one.reset(seed=4), other.reset(seed=4), exact=True)
         one.action_space.seed(4)
@@ -70,19 +90,29 @@ def test_rollouts_of_one_seed_are_equal(name: str) -> None:
             assert data_equivalence(one.step(action), other.step(action), exact=True)
 
 
-@pytest.mark.parametrize(("name", "start_method"), [(IDS[0], "fork"), (IDS[1], "fork"), (IDS[1], "spawn")])
+@pytest.mark.parametrize(
+    ("name", "start_method"), [(IDS[0], "fork"), (IDS[1], "fork"), (IDS[1], "spawn")]
+)
 def test_processes_of_stable_baselines3_play_as_this_one(name: str, start_method: str) -> None:
-    """Catches an environment that does not survive the way into a process, with threads that a fork leaves behind."""
-    env, made = make(name), make(name)  # one is made before the fork
-    worlds = SubprocVecEnv([lambda: made if start_method == "fork" else make(name)] * 2, start_method=start_method)
+    """Catches an environment that does not survive the way into a process, with threads that a
+    fork leaves behind."""
+    # one is made before the fork
+    env = make(name)
+    made = make(name)
+    worlds = SubprocVecEnv(
+        [lambda: made if start_method == "fork" else make(name)] * 2, start_method=start_method
+    )
     try:
         worlds.seed(5)
         first = worlds.reset()
         for world in range(2):
-            np.testing.assert_array_equal(first[world], env.reset(seed=5 + world)[0].astype(first.dtype))
+            np.testing.assert_array_equal(
+                first[world], env.reset(seed=5 + world)[0].astype(first.dtype)
+            )
         action = np.full(env.action_space.shape, 0.01, dtype=np.float32)
         for _ in range(20):
-            observation, mine = worlds.step(np.stack([action, action]))[0], env.step(action)[0]
+            observation = worlds.step(np.stack([action, action]))[0]
+            mine = env.step(action)[0]
             np.testing.assert_array_equal(observation[1], mine.astype(observation.dtype))
     finally:
         worlds.close()
@@ -90,7 +120,8 @@ def test_processes_of_stable_baselines3_play_as_this_one(name: str, start_method
 
 @pytest.mark.parametrize("name", IDS)
 def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
-    """Catches wrappers and libraries that ask for it and find None; a shorter one that is asked for stays."""
+    """Catches wrappers and libraries that ask for it and find None; a shorter one that is asked
+    for stays."""
     env = make(name)
     assert isinstance(env.unwrapped, ElasticEnv)
     assert env.spec.max_episode_steps == env.unwrapped.task.num_steps
@@ -104,11 +135,14 @@ def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
 
 @pytest.mark.parametrize("name", IDS)
 def test_a_step_before_the_reset_is_refused(name: str) -> None:
-    """Catches a robot that moves before its equilibrium, also as one world of several, and under a residual."""
+    """Catches a robot that moves before its equilibrium, also as one world of several, and under
+    a residual."""
     many = make_vec(name, 3)
     envs = many, make(name).unwrapped, ResidualWrapper(make(name).unwrapped, "input")
     for env in (*envs, ResidualVectorWrapper(make_vec(name, 2), "input")):
-        with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset\(\) comes before the first step"):
+        with pytest.raises(
+            gymnasium.error.ResetNeeded, match=r"reset\(\) comes before the first step"
+        ):
             env.step(np.zeros(env.action_space.shape, dtype=np.float32))
     many.reset(seed=0, options={"reset_mask": np.array([False, True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"of the worlds \[0, 2\] too"):

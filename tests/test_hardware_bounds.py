@@ -68,7 +68,8 @@ def test_goals_that_are_no_angles_are_not_commanded(value: float) -> None:
 
 @pytest.mark.parametrize("value", [*NO_NUMBERS, -0.001])
 def test_a_time_since_the_last_command_that_is_none_is_not_taken(value: float) -> None:
-    """Catches a limit on the goal's speed that is nan wide, by which the goal becomes nan, or infinitely wide."""
+    """Catches a limit on the goal's speed that is nan wide, by which the goal becomes nan, or
+    infinitely wide."""
     with pytest.raises(FaultError, match=r"at least 0 s and finite"):
         Guard(SafetyLimits(), np.zeros(1), ["it"]).command(np.array([0.5]), value)
 
@@ -76,9 +77,12 @@ def test_a_time_since_the_last_command_that_is_none_is_not_taken(value: float) -
 @no_number
 @pytest.mark.parametrize("what", ["goals", "at"])
 def test_a_request_with_what_is_no_number_switches_torque_off(what: str, value: float) -> None:
-    """Catches NaN and Infinity, which JSON as Python has it passes on, in a cycle's goals or moment."""
+    """Catches NaN and Infinity, which JSON as Python has it passes on, in a cycle's goals or
+    moment."""
     line = attached("one", 1)
-    asked: dict[str, Any] = {"goals": [0.0], "at": 0.0} | {what: [value] if what == "goals" else value}
+    asked: dict[str, Any] = {"goals": [0.0], "at": 0.0} | {
+        what: [value] if what == "goals" else value
+    }
     _, answer = served([line], ENABLE, ("exchange", asked))
     if what == "at" and value == -math.inf:
         assert "asked for -inf s" in answer["message"]
@@ -98,11 +102,13 @@ def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
 @no_number
 @pytest.mark.parametrize("what", ["q", "theta", "rate", "age"])
 def test_a_link_that_is_nowhere_stops_the_motion(still: StillBus, what: str, value: float) -> None:  # noqa: F811
-    """Catches the deflection stop that an IMU's nan switches off, and the tolerance that an endless age widens."""
+    """Catches the deflection stop that an IMU's nan switches off, and the tolerance that an
+    endless age widens."""
     env = make_still()
     testbed = env.unwrapped.task.plant
     at = testbed._at
-    testbed.qpos[0, at.theta[0]], testbed.qvel[0, at.theta_dot[0]] = 0.0, 0.1
+    testbed.qpos[0, at.theta[0]] = 0.0
+    testbed.qvel[0, at.theta_dot[0]] = 0.1
     given = {"q": 0.0, "age": 0.01}
     testbed._require_together(given["q"], given["age"])
     if what == "theta":
@@ -141,7 +147,8 @@ def test_angles_that_no_imu_can_measure_are_named(axis: str, value: float) -> No
 
 
 def test_the_ends_of_the_range_are_angles() -> None:
-    """Catches a false alarm at ±π, which 32 bits round to more than π, and a range that is too wide for the pitch."""
+    """Catches a false alarm at ±π, which 32 bits round to more than π, and a range that is too
+    wide for the pitch."""
     for sign in (1, -1):
         end = sign * float(np.float32(np.pi))
         half = sign * float(np.float32(np.pi / 2))
@@ -150,7 +157,8 @@ def test_the_ends_of_the_range_are_angles() -> None:
 
 
 def test_an_imu_that_repeats_itself_is_frozen_when_an_attitude_may_be_no_older() -> None:
-    """Catches a filter that stands still while its packets go on, and a false alarm at two equal samples."""
+    """Catches a filter that stands still while its packets go on, and a false alarm at two equal
+    samples."""
     plausible = PlausibleAttitudes(oldest_s=0.055)
     found = [plausible.check(after(10.0 + 0.01 * k)) for k in range(7)]
     assert found[:6] == [""] * 6
@@ -160,22 +168,28 @@ def test_an_imu_that_repeats_itself_is_frozen_when_an_attitude_may_be_no_older()
 @pytest.mark.parametrize("axis", ["roll", "pitch", "yaw"])
 def test_one_angle_that_changes_by_a_bit_is_life(axis: str) -> None:
     """Catches a stop while the link hangs still, and one of an axis that is not looked at."""
-    plausible, angle = PlausibleAttitudes(oldest_s=0.05), np.float32(0.1)
+    plausible = PlausibleAttitudes(oldest_s=0.05)
+    angle = np.float32(0.1)
     for k in range(100):
         angle = np.nextafter(angle, np.float32(1.0))
         assert plausible.check(after(10.0 + 0.01 * k, **{axis: float(angle)})) == ""
 
 
 @pytest.mark.parametrize("time_s", [*NO_NUMBERS, 99.9, 100.1])
-def test_an_attitude_whose_age_is_not_known_is_missing(time_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an age of nan, which is not above what is allowed, and one of the future, which never becomes old."""
+def test_an_attitude_whose_age_is_not_known_is_missing(
+    time_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an age of nan, which is not above what is allowed, and one of the future, which
+    never becomes old."""
     stream = _stream(lambda: after(time_s), monkeypatch)
     with pytest.raises(AttitudeError, match="has sent no attitude"):
         stream.latest()
 
 
 @no_number
-def test_the_stream_gives_nobody_what_is_no_angle(value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stream_gives_nobody_what_is_no_angle(
+    value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a check that nobody calls: the very first sample is refused."""
     with pytest.raises(AttitudeError, match="the IMU at here sends roll"):
         _stream(lambda: after(100.0, roll=value), monkeypatch).latest()
@@ -185,8 +199,12 @@ def _stream(sample: Callable[[], Attitude], monkeypatch: pytest.MonkeyPatch) -> 
     """A stream without a process, at 100 s of its clock."""
     monkeypatch.setattr(imu, "time", SimpleNamespace(monotonic=lambda: 100.0))
     stream = AttitudeStream.__new__(AttitudeStream)
-    stream.port, stream._oldest_s, stream._plausible = "here", 0.05, PlausibleAttitudes(0.05)
-    stream._shared, stream._lock = SimpleNamespace(get=sample), None  # type: ignore[assignment]
+    stream.port = "here"
+    stream._oldest_s = 0.05
+    stream._plausible = PlausibleAttitudes(0.05)
+    # type: ignore[assignment]
+    stream._shared = SimpleNamespace(get=sample)
+    stream._lock = None
     stream._process = SimpleNamespace(poll=lambda: None, stderr=None)  # type: ignore[assignment]
     monkeypatch.setattr(stream, "close", lambda: None)
     return stream
@@ -208,7 +226,8 @@ def test_the_first_cycle_that_sees_it_stops_the_motion(
     angles: Callable[[float], dict[str, float]],
     words: str,
 ) -> None:
-    """Catches one more command after an attitude that nothing can have measured, or that is as old as may be."""
+    """Catches one more command after an attitude that nothing can have measured, or that is as
+    old as may be."""
     still.closed_s = math.nan  # type: ignore[attr-defined]
     now = still.monotonic
     plausible = PlausibleAttitudes(0.05)
@@ -221,7 +240,10 @@ def test_the_first_cycle_that_sees_it_stops_the_motion(
         is_wrong = now() > begin_s + 0.02
         sample = Attitude(
             now(),
-            **({"roll": 0.0, "pitch": 0.0, "yaw": 0.0 if is_wrong else now()} | (angles(now()) if is_wrong else {})),
+            **(
+                {"roll": 0.0, "pitch": 0.0, "yaw": 0.0 if is_wrong else now()}
+                | (angles(now()) if is_wrong else {})
+            ),
         )
         if problem := plausible.check(sample):
             raise AttitudeError(problem)
@@ -240,13 +262,21 @@ def _step(env: Any, times: int) -> None:
         env.step(np.zeros(1, dtype=np.float32))
 
 
-TINY, HUGE = 5e-324, 1e39
+TINY = 5e-324
+HUGE = 1e39
 ALLOWED_NEAR_ZERO = ("lowest_rad", "highest_rad", "margin_rad", "patience_cycles")
-LIMITS = [(name, info) for name, info in SafetyLimits.model_fields.items() if name not in ALLOWED_NEAR_ZERO]
+LIMITS = [
+    (name, info)
+    for name, info in SafetyLimits.model_fields.items()
+    if name not in ALLOWED_NEAR_ZERO
+]
 SETTINGS = {
-    "baudrate": "[bit/s]", "imu_baudrate": "[bit/s]", "imu_oldest_s": "[s]", "largest_deflection_rad": "[rad]",
+    "baudrate": "[bit/s]",
+    "imu_baudrate": "[bit/s]",
+    "imu_oldest_s": "[s]",
+    "largest_deflection_rad": "[rad]",
     "approach_rad_s": "[rad/s]",
-}  # fmt: skip
+}
 LOADS = {"gravity_torque": "[N·m]", "mass": "[kg]", "gyration_radius": "[m]"}
 
 
@@ -261,8 +291,11 @@ LOADS = {"gravity_torque": "[N·m]", "mass": "[kg]", "gyration_radius": "[m]"}
         (EmulatorConfig, "baudrate", "[bit/s]"),
     ],
 )
-def test_no_setting_takes_what_no_hardware_has(model: type[Model], name: str, unit: str, value: float) -> None:
-    """Catches a rate of 1e39 bit/s that ends in the SDK, and limits that stop every motion, or none."""
+def test_no_setting_takes_what_no_hardware_has(
+    model: type[Model], name: str, unit: str, value: float
+) -> None:
+    """Catches a rate of 1e39 bit/s that ends in the SDK, and limits that stop every motion, or
+    none."""
     others = {"port": "/dev/ttyNOTHING"} if model is HardwareSettings else {}
     with pytest.raises(ConfigurationError, match=name) as refused:
         model(**{name: value, **others})
@@ -288,7 +321,9 @@ BOUNDS = ("ge", "gt", "le", "lt")
 
 def documented() -> dict[str, tuple[str, float, float, float]]:
     """Unit, default and bounds of each number, as docs/hardware.md has them."""
-    rows = [line.strip("| ").split(" | ") for line in Path("docs/hardware.md").read_text().splitlines()]
+    rows = [
+        line.strip("| ").split(" | ") for line in Path("docs/hardware.md").read_text().splitlines()
+    ]
     numbers = [row for row in rows if len(row) == 6 and row[0].startswith("`")]
     return {row[0].strip("`"): (row[1], *map(_number, row[2:5])) for row in numbers}
 
@@ -303,13 +338,19 @@ def in_code(model: type[Model], prefix: str = "") -> dict[str, tuple[str, float,
     found = {}
     for name, info in model.model_fields.items():
         if isinstance(info.json_schema_extra, dict):
-            low, high = (getattr(bound, kind) for bound in info.metadata for kind in BOUNDS if hasattr(bound, kind))
+            low, high = (
+                getattr(bound, kind)
+                for bound in info.metadata
+                for kind in BOUNDS
+                if hasattr(bound, kind)
+            )
             found[prefix + name] = (str(info.json_schema_extra["unit"]), info.default, low, high)
     return found
 
 
 def test_the_table_of_the_docs_has_the_bounds_of_the_code() -> None:
-    """Catches a bound, a unit or a default that is changed in one of the two places, and a setting without any."""
+    """Catches a bound, a unit or a default that is changed in one of the two places, and a
+    setting without any."""
     expected = in_code(HardwareSettings) | in_code(SafetyLimits, "limits.")
     assert documented().keys() == expected.keys()
     for name, (unit, *numbers) in documented().items():

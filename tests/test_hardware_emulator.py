@@ -1,4 +1,5 @@
-"""The emulated servo: registers, rights, errors, watchdog, and the order of replies, without any terminal."""
+"""The emulated servo: registers, rights, errors, watchdog, and the order of replies, without any
+terminal."""
 
 import numpy as np
 import pytest
@@ -54,7 +55,8 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
 
 
 def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
-    """Catches an emulator that forgives a program which switches torque on before it has set the goal."""
+    """Catches an emulator that forgives a program which switches torque on before it has set the
+    goal."""
     servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=Motor(position=0.25))
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
@@ -62,7 +64,8 @@ def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
 
 
 def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
-    """Catches an alert that comes as an error: it arrives with success, which a driver must not overlook."""
+    """Catches an alert that comes as an error: it arrives with success, which a driver must not
+    overlook."""
     servo = make_servo()
     write(servo, "torque_enable", 1)
     servo.overload(True)
@@ -74,7 +77,8 @@ def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
 
 
 def test_watchdog_stops_models_that_have_one() -> None:
-    """Catches a watchdog that fires while the bus speaks, or never, or on the firmware that has none.
+    """Catches a watchdog that fires while the bus speaks, or never, or on the firmware that has
+    none.
 
     A fired one holds the servo where it is, under torque, and refuses goals until it is cleared.
     """
@@ -104,17 +108,26 @@ def answers(bus: EmulatedBus, wire: bytes) -> list[Packet]:
 
 
 def test_sync_and_bulk_instructions_reach_their_servos_in_order() -> None:
-    """Catches a group that is cut at the wrong byte, and replies in the order of ids instead of the request's."""
+    """Catches a group that is cut at the wrong byte, and replies in the order of ids instead of
+    the request's."""
     bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2, 3)])
     values = {1: -131_073, 3: 77}
     data = b"".join(bytes([i]) + v.to_bytes(4, "little", signed=True) for i, v in values.items())
-    assert answers(bus, packets.packet(0xFE, packets.SYNC_WRITE, bytes([0x54, 2, 4, 0]) + data)) == []
+    assert (
+        answers(bus, packets.packet(0xFE, packets.SYNC_WRITE, bytes([0x54, 2, 4, 0]) + data)) == []
+    )
     replies = answers(bus, packets.packet(0xFE, packets.SYNC_READ, bytes([0x54, 2, 4, 0, 3, 1, 2])))
     assert [r.servo_id for r in replies] == [3, 1, 2]
-    assert [int.from_bytes(r.parameters[1:], "little", signed=True) for r in replies] == [77, -131_073, 0]
+    assert [int.from_bytes(r.parameters[1:], "little", signed=True) for r in replies] == [
+        77,
+        -131_073,
+        0,
+    ]
     bulk = bytes([2, 0x54, 2, 4, 0, 9, 0, 0, 0, 1, 0x32, 2, 1, 0, 1])
     answers(bus, packets.packet(0xFE, packets.BULK_WRITE, bulk))
-    replies = answers(bus, packets.packet(0xFE, packets.BULK_READ, bytes([2, 0x54, 2, 4, 0, 1, 0x32, 2, 1, 0])))
+    replies = answers(
+        bus, packets.packet(0xFE, packets.BULK_READ, bytes([2, 0x54, 2, 4, 0, 1, 0x32, 2, 1, 0]))
+    )
     assert [r.parameters[1:] for r in replies] == [b"\x09\x00\x00\x00", b"\x01"]
 
 
@@ -122,7 +135,10 @@ def test_fast_reply_is_one_packet_with_a_part_of_every_servo() -> None:
     """Catches parts without their checksums: each ends with one of everything before it."""
     bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2)])
     (wire,) = bus.answer(
-        Parser().feed(packets.packet(0xFE, packets.FAST_SYNC_READ, bytes([0x71, 2, 1, 0, 1, 2])))[0], 0.0
+        Parser().feed(packets.packet(0xFE, packets.FAST_SYNC_READ, bytes([0x71, 2, 1, 0, 1, 2])))[
+            0
+        ],
+        0.0,
     )
     assert wire[:8] == bytes.fromhex("FFFFFD00FE0B0055")
     assert wire[8:11] == bytes([0, 1, 35])
@@ -143,14 +159,21 @@ def test_damaged_instruction_is_answered_with_an_error_and_not_obeyed() -> None:
 
 def test_faults_come_as_often_as_they_are_asked_for() -> None:
     """Catches a switch that does nothing, or that damages what it should leave alone."""
-    generator, reply = np.random.default_rng(0), packets.status(1, 0, b"\x01\x02\x03\x04")
+    generator = np.random.default_rng(0)
+    reply = packets.status(1, 0, b"\x01\x02\x03\x04")
     half = [damage(Faults(lost=0.5), reply, generator)[0] for _ in range(400)]
     assert 150 < half.count(b"") < 250
     assert all(damage(Faults(), reply, generator) == (reply, 0.0) for _ in range(20))
     changed = [damage(Faults(corrupted=1.0), reply, generator)[0] for _ in range(20)]
-    assert all(sum(bin(a ^ b).count("1") for a, b in zip(c, reply, strict=True)) == 1 for c in changed)
-    assert all(len(damage(Faults(truncated=1.0), reply, generator)[0]) < len(reply) for _ in range(20))
-    assert damage(Faults(late=1.0, late_s=0.01, latency_s=0.016), reply, generator)[1] == pytest.approx(0.026)
+    assert all(
+        sum(bin(a ^ b).count("1") for a, b in zip(c, reply, strict=True)) == 1 for c in changed
+    )
+    assert all(
+        len(damage(Faults(truncated=1.0), reply, generator)[0]) < len(reply) for _ in range(20)
+    )
+    assert damage(Faults(late=1.0, late_s=0.01, latency_s=0.016), reply, generator)[
+        1
+    ] == pytest.approx(0.026)
 
 
 def test_emulated_joint_is_the_testbeds_own() -> None:

@@ -1,4 +1,5 @@
-"""Every fault that the emulator has, in the midst of a motion: it stops and is named, or goes on for a reason."""
+"""Every fault that the emulator has, in the midst of a motion: it stops and is named, or goes on
+for a reason."""
 
 import math
 import os
@@ -31,7 +32,8 @@ from train.commands.cli import main
 
 PERIOD_S = 0.004
 STOP_CYCLES = 60
-"""Within which every fault that stops is to be found, the slowest in 35: temperatures are read in every 25th cycle."""
+"""Within which every fault that stops is to be found, the slowest in 35: temperatures are read
+in every 25th cycle."""
 
 pytestmark = once_more
 
@@ -46,11 +48,17 @@ class Case:
 
 
 SERVO = [
-    Case({"unheard": 0.1}, goes_on="lost instructions within patience_cycles: the last command is repeated"),
+    Case(
+        {"unheard": 0.1},
+        goes_on="lost instructions within patience_cycles: the last command is repeated",
+    ),
     Case({"unheard": 1.0}, stops="no usable reply|not answer"),
     Case({"lost": 0.1}, goes_on="lost replies within patience_cycles"),
     Case({"lost": 1.0}, stops="no usable reply"),
-    Case({"late": 0.1, "late_s": 0.006}, goes_on="late replies are known as old and count as lost ones"),
+    Case(
+        {"late": 0.1, "late_s": 0.006},
+        goes_on="late replies are known as old and count as lost ones",
+    ),
     Case({"late": 1.0, "late_s": 0.02}, stops="no usable reply"),
     Case({"corrupted": 0.1}, goes_on="damaged replies fail their checksum and count as lost ones"),
     Case({"corrupted": 1.0}, stops="no usable reply"),
@@ -71,7 +79,10 @@ IMU = [
     Case({"imu_inf": True}, stops="sends roll = inf rad"),
     Case({"imu_out_of_range": True}, stops="sends roll = 8 rad.*-3.1416 and 3.1416"),
     Case({"imu_frozen": True}, stops=r"same attitude in all bits for \d+ ms"),
-    Case({"imu_corrupted": 0.2}, goes_on="damaged packets fail their checksum, the others are young enough"),
+    Case(
+        {"imu_corrupted": 0.2},
+        goes_on="damaged packets fail their checksum, the others are young enough",
+    ),
     Case({"imu_corrupted": 1.0}, stops=r"has sent no attitude for \d+ ms"),
 ]
 
@@ -109,7 +120,8 @@ def cycles(bus: SupervisedBus, number: int) -> None:
 
 @pytest.mark.parametrize("case", SERVO, ids=named)
 def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) -> None:
-    """Catches a fault after which the motion goes on for no reason, or stops without torque off or its cause."""
+    """Catches a fault after which the motion goes on for no reason, or stops without torque off
+    or its cause."""
     with SupervisedBus({emulator.port: [1]}) as bus:
         bus.enable(PATIENT)
         cycles(bus, 5)
@@ -124,7 +136,9 @@ def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) ->
         off = [(name, value) for _, _, name, value in emulator.events()]
         emulator.faults(**Faults().model_dump())
         if isinstance(caught.value, BusGoneError):
-            assert "Switch their power off" in str(caught.value)  # nobody can switch it off over the bus
+            assert "Switch their power off" in str(
+                caught.value
+            )  # nobody can switch it off over the bus
             bus._is_enabled = False
         elif "unheard" in case.faults:
             assert "not confirmed by servo 1" in str(caught.value)
@@ -132,16 +146,21 @@ def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) ->
         else:
             assert ("torque_enable", 0) in off
             after = [name for name, _ in off[off.index(("torque_enable", 0)) :]]
-            # a servo that is overloaded lets go by itself, and is told so once more before its reply says it
+            # a servo that is overloaded lets go by itself, and is told so once more before its
+            # reply says it
             assert after.count("goal_position") <= ("overload" in case.faults)
 
 
 @pytest.mark.parametrize("case", IMU, ids=named)
-def test_no_fault_of_the_imu_is_silent(emulator: RunningEmulator, case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_fault_of_the_imu_is_silent(
+    emulator: RunningEmulator, case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches an IMU's fault, with its valid flag, that the motion goes on with."""
     for name in ("_SHORTEST_MOVE_S", "_SETTLE_S"):
         monkeypatch.setattr(plant, name, 0.05)
-    env = make_hardware(emulator, imu_port=emulator.imu_port, reference={"kind": "hold", "lower": 0.0})
+    env = make_hardware(
+        emulator, imu_port=emulator.imu_port, reference={"kind": "hold", "lower": 0.0}
+    )
     testbed = env.unwrapped.task.plant
     testbed.begin(0.0)
     emulator.faults(**case.faults)
@@ -181,7 +200,8 @@ def test_temperatures_are_read_in_the_first_cycle_and_every_25th_after(number: i
 
 
 def test_a_temperature_that_was_not_told_is_asked_for_again() -> None:
-    """Catches a lost reply that costs 25 cycles, and old replies taken for new because of the temperature."""
+    """Catches a lost reply that costs 25 cycles, and old replies taken for new because of the
+    temperature."""
     line = attached("one", 1)
     line.lost = {0, 1}
     told = [line.read_states(0.01).temperature[0] for _ in range(4)]
@@ -192,7 +212,8 @@ def test_a_temperature_that_was_not_told_is_asked_for_again() -> None:
 
 @pytest.mark.parametrize("limit", ["servo", "ours"])
 def test_the_lower_limit_on_the_temperature_holds_in_motion_and_before(limit: str) -> None:
-    """Catches torque that goes on while a servo is too hot, and a limit of its own that nobody has read."""
+    """Catches torque that goes on while a servo is too hot, and a limit of its own that nobody
+    has read."""
     limits = SafetyLimits(temperature_c=60.0 if limit == "ours" else 80.0)
     enable = ("enable", {"limits": limits.model_dump()})
     for degrees, words in ((60, ""), (61, "too hot: servo 2 at one: 61.*at most 60 °C")):
@@ -209,7 +230,9 @@ def test_the_lower_limit_on_the_temperature_holds_in_motion_and_before(limit: st
 @pytest.mark.parametrize("value", [80.1, math.inf, -math.inf])
 def test_a_temperature_beyond_its_limit_stops_the_motion(value: float) -> None:
     """Catches a limit that is never looked at."""
-    said = Guard(SafetyLimits(), np.zeros(1), ["it"]).check(replace(states([0.0]), temperature=np.array([value])))
+    said = Guard(SafetyLimits(), np.zeros(1), ["it"]).check(
+        replace(states([0.0]), temperature=np.array([value]))
+    )
     assert f"too hot: it: {value:.3f} °C, at most 80 °C" in said
 
 
@@ -217,7 +240,11 @@ def test_a_servo_that_never_tells_its_temperature_stops_the_motion() -> None:
     """Catches nan that counts as cool for ever; one that tells it now and then is fine."""
     guard = Guard(SafetyLimits(), np.zeros(1), ["it"])
     cool = replace(states([0.0]), temperature=np.array([80.0]))
-    said = [guard.check(one) for _ in range(4) for one in (*[states([0.0])] * 2 * TEMPERATURE_CYCLES, cool)]
+    said = [
+        guard.check(one)
+        for _ in range(4)
+        for one in (*[states([0.0])] * 2 * TEMPERATURE_CYCLES, cool)
+    ]
     assert set(said) == {""}
     said = [guard.check(states([0.0])) for _ in range(61)]
     assert set(said[:60]) == {""}
@@ -228,13 +255,16 @@ def test_a_servo_that_never_tells_its_temperature_stops_the_motion() -> None:
 def test_a_supervisor_in_motion_may_be_silent_for_as_long_as_the_program(
     emulator: RunningEmulator, hang_s: float, said_ms: int
 ) -> None:
-    """Catches a servo that is held for 100 ms by a supervisor that hangs, where its program may hang for 50 ms."""
+    """Catches a servo that is held for 100 ms by a supervisor that hangs, where its program may
+    hang for 50 ms."""
     with SupervisedBus({emulator.port: [1]}) as bus:
         bus.enable(PATIENT.replace(hang_s=0.09))
         cycles(bus, 2)
         bus._answer_s = max(hang_s, supervised_bus._LEAST_ANSWER_S)
         os.kill(bus.process_id, signal.SIGSTOP)
-        awake = threading.Timer(10.0, os.kill, (bus.process_id, signal.SIGCONT))  # a test must not wait for ever
+        awake = threading.Timer(
+            10.0, os.kill, (bus.process_id, signal.SIGCONT)
+        )  # a test must not wait for ever
         awake.start()
         try:
             with pytest.raises(
@@ -250,7 +280,9 @@ def test_a_supervisor_in_motion_may_be_silent_for_as_long_as_the_program(
 
 
 @pytest.mark.parametrize("hang_s", [0.05, 0.09, 0.005])
-def test_the_limit_on_silence_is_the_one_that_was_given(emulator: RunningEmulator, hang_s: float) -> None:
+def test_the_limit_on_silence_is_the_one_that_was_given(
+    emulator: RunningEmulator, hang_s: float
+) -> None:
     """Catches a limit that `enable` does not pass on."""
     with SupervisedBus({emulator.port: [1]}) as bus:
         assert bus._answer_s == supervised_bus._ANSWER_S
@@ -266,7 +298,9 @@ def test_the_watchdog_is_set_where_there_is_one() -> None:
         assert [value for _, name, value in line.events if name == "bus_watchdog"] == expected
 
 
-def test_an_emulated_fault_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_emulated_fault_that_does_not_exist_is_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Catches a share or a wrong word that is taken for a switch."""
     for name in ("lost", "imu_nam"):
         with pytest.raises(SystemExit):

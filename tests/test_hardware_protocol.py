@@ -1,4 +1,5 @@
-"""Packets, control tables, late replies: against the maker's examples, the SDK's own functions, and random bytes."""
+"""Packets, control tables, late replies: against the maker's examples, the SDK's own functions,
+and random bytes."""
 
 import itertools
 import math
@@ -29,18 +30,28 @@ EXAMPLES = [
     ((1, packets.PING, b""), "FF FF FD 00 01 03 00 01 19 4E"),
     ((1, packets.STATUS, bytes([0, 6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
     ((1, packets.READ, bytes([0x84, 0, 4, 0])), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
-    ((1, packets.WRITE, bytes([0x74, 0, 0, 2, 0, 0])), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
-    ((254, packets.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
+    (
+        (1, packets.WRITE, bytes([0x74, 0, 0, 2, 0, 0])),
+        "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89",
+    ),
+    (
+        (254, packets.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])),
+        "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA",
+    ),
     ((1, packets.REBOOT, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
 ]
 
 
 @pytest.mark.parametrize(("content", "wire"), EXAMPLES)
-def test_packets_are_those_of_the_makers_examples(content: tuple[int, int, bytes], wire: str) -> None:
+def test_packets_are_those_of_the_makers_examples(
+    content: tuple[int, int, bytes], wire: str
+) -> None:
     """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
     assert packets.packet(*content) == bytes.fromhex(wire)
     found = packets.Parser().feed(bytes.fromhex(wire))
-    assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [(*content, True)]
+    assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [
+        (*content, True)
+    ]
 
 
 @given(st.binary(max_size=60))
@@ -57,13 +68,22 @@ def test_stuffed_bytes_hold_no_header_and_come_back(data: bytes) -> None:
 
 
 @given(
-    st.lists(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x07]), max_size=12).map(bytes), min_size=1, max_size=4),
+    st.lists(
+        st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x07]), max_size=12).map(bytes),
+        min_size=1,
+        max_size=4,
+    ),
     st.lists(st.integers(1, 9), min_size=1, max_size=8),
 )
-def test_parser_finds_packets_in_pieces_behind_noise(bodies: list[bytes], pieces: list[int]) -> None:
-    """Catches a parser that needs whole packets at a time, or that loses step by what lies before the first."""
+def test_parser_finds_packets_in_pieces_behind_noise(
+    bodies: list[bytes], pieces: list[int]
+) -> None:
+    """Catches a parser that needs whole packets at a time, or that loses step by what lies
+    before the first."""
     stream = b"\xff\xff\x00\xfd" + b"".join(packets.status(7, 0, body) for body in bodies)
-    parser, found, at = packets.Parser(), [], 0
+    parser = packets.Parser()
+    found = []
+    at = 0
     for number in range(len(stream)):
         step = pieces[number % len(pieces)]
         found += parser.feed(stream[at : at + step])
@@ -72,7 +92,8 @@ def test_parser_finds_packets_in_pieces_behind_noise(bodies: list[bytes], pieces
 
 
 def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
-    """Catches a flipped bit that is taken for data, and a lost tail that swallows the next packet."""
+    """Catches a flipped bit that is taken for data, and a lost tail that swallows the next
+    packet."""
     good = packets.status(1, 0, b"\x01\x02\x03\x04")
     flipped = bytearray(good)
     flipped[10] ^= 1
@@ -83,7 +104,8 @@ def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
 
 
 def test_a_checksum_that_completes_a_header_is_no_header() -> None:
-    """Catches a packet that is dropped for the header in its end: goal −26843 to id 1 ends FF FF, its CRC FD 00."""
+    """Catches a packet that is dropped for the header in its end: goal −26843 to id 1 ends FF
+    FF, its CRC FD 00."""
     goal = bytes([0x54, 2, 4, 0, 1]) + (-26_843).to_bytes(4, "little", signed=True)
     wire = packets.packet(packets.BROADCAST, packets.SYNC_WRITE, goal)
     assert wire.endswith(packets.HEADER)
@@ -94,13 +116,22 @@ def test_a_checksum_that_completes_a_header_is_no_header() -> None:
 
 def test_tables_have_the_registers_of_the_maker() -> None:
     """Catches a shifted row of the data: addresses that the issue's robots rely on."""
-    pro, advanced = servo_model(54024), servo_model(2020)
-    assert [pro.table[name].address for name in ("torque_enable", "goal_position", "present_position")] == [
+    pro = servo_model(54024)
+    advanced = servo_model(2020)
+    assert [
+        pro.table[name].address for name in ("torque_enable", "goal_position", "present_position")
+    ] == [
         562,
         596,
         611,
     ]
-    names = ("torque_enable", "goal_position", "present_current", "present_velocity", "present_position")
+    names = (
+        "torque_enable",
+        "goal_position",
+        "present_current",
+        "present_velocity",
+        "present_position",
+    )
     assert [advanced.table[name].address for name in names] == [512, 564, 574, 576, 580]
     assert not pro.has_watchdog
     assert advanced.has_watchdog
@@ -115,7 +146,9 @@ def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int)
     assert all(a.end <= b.address for a, b in itertools.pairwise(registers))
     lengths = {len(block) for block in model.blocks}
     assert len(lengths) == len(model.blocks) == NUM_BLOCKS
-    with pytest.raises(ConfigurationError, match="patience_cycles"):  # a motion ends before a length comes again
+    with pytest.raises(
+        ConfigurationError, match="patience_cycles"
+    ):  # a motion ends before a length comes again
         SafetyLimits(patience_cycles=len(lengths))
     for block in model.blocks:
         assert block.start in {register.address for register in registers}
@@ -126,7 +159,8 @@ def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int)
 
 @given(st.lists(st.sampled_from([0, 0, 1, 2, 4, 10, NUM_BLOCKS - 1, math.inf]), max_size=60))
 def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float]) -> None:
-    """Catches a reply of some cycles ago that passes as new; each says in its position which request it answers."""
+    """Catches a reply of some cycles ago that passes as new; each says in its position which
+    request it answers."""
     model = servo_model(54024)
     position = model.table["present_position"]
     on_the_way: dict[float, list[bytes]] = {}
@@ -158,12 +192,15 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
 
 
 def test_units_are_the_makers() -> None:
-    """Catches counts of one model used for another: half a turn, 33.1 rpm without load, 9.99 A of current limit."""
+    """Catches counts of one model used for another: half a turn, 33.1 rpm without load, 9.99 A
+    of current limit."""
     assert 250_961.5 * servo_model(54024).position_unit == pytest.approx(np.pi)
     assert 501_923 * servo_model(2020).position_unit == pytest.approx(np.pi)
     assert 620 * servo_model(54024).current_unit == pytest.approx(9.99, abs=0.005)
     assert 2900 * servo_model(2020).velocity_unit == pytest.approx(29.0 * 2 * np.pi / 60)
-    assert 17000 * servo_model(54024).velocity_unit == pytest.approx(33.87 * 2 * np.pi / 60, rel=1e-4)
+    assert 17000 * servo_model(54024).velocity_unit == pytest.approx(
+        33.87 * 2 * np.pi / 60, rel=1e-4
+    )
 
 
 def test_unknown_names_are_answered_with_those_that_exist() -> None:
@@ -185,7 +222,8 @@ def test_torque_line_runs_both_ways() -> None:
 
 
 def test_ping_of_the_imus_protocol_has_the_makers_checksum() -> None:
-    """Catches a checksum that only our own reader would accept: 75 65 01 02 02 01 E0 C6 is the maker's ping."""
+    """Catches a checksum that only our own reader would accept: 75 65 01 02 02 01 E0 C6 is the
+    maker's ping."""
     assert checksum(bytes.fromhex("756501020201")) == bytes.fromhex("E0C6")
     packet = attitude_packet(0.1, -0.2, 0.3, 1.0)
     assert packet[:4] == bytes([0x75, 0x65, 0x82, len(packet) - 6])

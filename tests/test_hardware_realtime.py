@@ -1,4 +1,5 @@
-"""Who gets the processor first, on an emulated bus; true also where the system grants nobody real-time scheduling."""
+"""Who gets the processor first, on an emulated bus; true also where the system grants nobody
+real-time scheduling."""
 
 import os
 import subprocess
@@ -54,7 +55,10 @@ def in_realtime() -> Iterator[None]:
 def test_a_program_that_keeps_the_processor_busy_does_not_keep_torque_on() -> None:
     """Catches a supervisor that waits in a line with the program whose hang it is to end."""
     busy = subprocess.Popen(
-        [sys.executable, "-c", BUSY_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", BUSY_PROGRAM],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert busy.stdin is not None
     assert busy.stdout is not None
@@ -74,7 +78,8 @@ def test_a_program_that_keeps_the_processor_busy_does_not_keep_torque_on() -> No
     finally:
         busy.kill()
         busy.communicate()
-    # not when the servo loses its torque: the kernel carries bytes between pseudo-terminals in its turn with all other
+    # not when the servo loses its torque: the kernel carries bytes between pseudo-terminals in its
+    # turn with all other
     # programs, so that the 100 ms asked for are held to by `python -m tests.hardware_trials`
     assert in_line < BUSY_S / 2
 
@@ -86,9 +91,13 @@ def _in_line_s(process_id: int) -> float:
 
 @pytest.mark.usefixtures("in_realtime")
 def test_what_a_control_loop_starts_runs_as_all_others_do() -> None:
-    """Catches a plot, a video or an IMU's library that is loaded in the place of a control cycle."""
+    """Catches a plot, a video or an IMU's library that is loaded in the place of a control
+    cycle."""
     child = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert int(child.stdout) == os.SCHED_OTHER
 
@@ -102,7 +111,10 @@ def test_goals_are_kept_as_urgently_as_the_loop_commands_them() -> None:
         (keeper,) = (thread for thread in threading.enumerate() if "_keep" in thread.name)
         time.sleep(0.05)
         assert keeper.native_id is not None
-        found = os.sched_getscheduler(keeper.native_id), os.sched_getparam(keeper.native_id).sched_priority
+        found = (
+            os.sched_getscheduler(keeper.native_id),
+            os.sched_getparam(keeper.native_id).sched_priority,
+        )
         bus.exchange(np.array(start), time.monotonic())
     assert found == (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority)
 
@@ -124,7 +136,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def paced(clock: Clock, pace: Pace, before_s: float, reading_s: float) -> tuple[float, float]:
-    """A cycle of a loop that needs a while for its command and whose reading waits: when it read, how late that was."""
+    """A cycle of a loop that needs a while for its command and whose reading waits: when it
+    read, how late that was."""
     clock.now_s += before_s
     clock.now_s = max(clock.now_s, pace.next()) + reading_s
     return clock.now_s, pace.late(clock.now_s)
@@ -133,7 +146,9 @@ def paced(clock: Clock, pace: Pace, before_s: float, reading_s: float) -> tuple[
 def test_a_loop_that_keeps_up_reads_on_the_grid(clock: Clock) -> None:
     """Catches readings whose small delays add up: the loop would run below its rate."""
     pace = Pace(0.004)
-    moments, lateness = np.transpose([paced(clock, pace, 0.002, 1e-4 * (number % 3)) for number in range(30)])
+    moments, lateness = np.transpose(
+        [paced(clock, pace, 0.002, 1e-4 * (number % 3)) for number in range(30)]
+    )
     delays = 1e-4 * (np.arange(30) % 3)
     assert moments == pytest.approx(0.004 * np.arange(1, 31) + delays, abs=1e-12)
     assert lateness == pytest.approx(delays, abs=1e-12)
@@ -143,27 +158,37 @@ def test_a_loop_that_keeps_up_reads_on_the_grid(clock: Clock) -> None:
 def test_a_short_delay_is_caught_up_with_and_no_overrun(clock: Clock, is_command: bool) -> None:
     pace = Pace(0.004)
     delay = (0.0055, 0.0) if is_command else (0.002, 0.0015)
-    (_, first), (moment, second) = paced(clock, pace, *delay), paced(clock, pace, 0.002, 0.0)
+    _, first = paced(clock, pace, *delay)
+    moment, second = paced(clock, pace, 0.002, 0.0)
     assert (first, second) == pytest.approx((0.0015, 0.0), abs=1e-12)
     assert not pace.is_overrun(first)
     assert moment == pytest.approx(0.008)
 
 
 @pytest.mark.parametrize("is_command", [True, False])
-def test_one_hold_up_is_one_overrun_and_a_whole_period_follows(clock: Clock, is_command: bool) -> None:
-    """Catches a hold-up that counts twice, and a command that has no time to act before the reading after it."""
+def test_one_hold_up_is_one_overrun_and_a_whole_period_follows(
+    clock: Clock, is_command: bool
+) -> None:
+    """Catches a hold-up that counts twice, and a command that has no time to act before the
+    reading after it."""
     pace = Pace(0.004)
     delay = (0.0075, 0.0) if is_command else (0.002, 0.0035)
-    (moment, late_s), *after = [paced(clock, pace, *delay), *(paced(clock, pace, 0.0035, 0.0) for _ in range(3))]
+    (moment, late_s), *after = [
+        paced(clock, pace, *delay),
+        *(paced(clock, pace, 0.0035, 0.0) for _ in range(3)),
+    ]
     assert late_s == pytest.approx(0.0035)
     assert pace.is_overrun(late_s)
     assert moment == pytest.approx(0.0115 if is_command else 0.0075)
-    assert [at for at, _ in after] == pytest.approx([moment + 0.004 * number for number in (1, 2, 3)])
+    assert [at for at, _ in after] == pytest.approx(
+        [moment + 0.004 * number for number in (1, 2, 3)]
+    )
     assert [late for _, late in after] == pytest.approx([0.0] * 3, abs=1e-12)
 
 
 def test_a_loop_that_is_always_too_slow_cannot_hide_it(clock: Clock) -> None:
-    """Catches a grid that moves along with every small delay: 4.9 ms for each 4 ms, and never an overrun."""
+    """Catches a grid that moves along with every small delay: 4.9 ms for each 4 ms, and never an
+    overrun."""
     pace = Pace(0.004)
     overruns = sum(pace.is_overrun(paced(clock, pace, 0.0049, 0.0)[1]) for _ in range(300))
     assert overruns == pytest.approx(100, abs=1)

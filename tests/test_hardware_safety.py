@@ -1,4 +1,5 @@
-"""Limits by themselves; bus and supervisor through the real SDK on an emulated bus, in good times and bad."""
+"""Limits by themselves; bus and supervisor through the real SDK on an emulated bus, in good
+times and bad."""
 
 import os
 import pty
@@ -18,7 +19,13 @@ from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.port import Port
 from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
-from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
+from elastic_env.hardware.errors import (
+    BusGoneError,
+    FaultError,
+    HardwareError,
+    PortError,
+    ReplyError,
+)
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.guard import Guard
@@ -33,16 +40,24 @@ PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
 pytestmark = once_more
 
 
-def states(position: list[float], velocity: float = 0.0, current: float = 0.0, fresh: bool = True) -> States:
+def states(
+    position: list[float], velocity: float = 0.0, current: float = 0.0, fresh: bool = True
+) -> States:
     n = len(position)
     values = np.array(position) if fresh else np.full(n, np.nan)
     return States(
-        values, np.full(n, velocity), np.full(n, current), np.full(n, fresh), np.zeros(n, dtype=np.bool_), 0.0
-    )  # fmt: skip
+        values,
+        np.full(n, velocity),
+        np.full(n, current),
+        np.full(n, fresh),
+        np.zeros(n, dtype=np.bool_),
+        0.0,
+    )
 
 
 def test_first_commands_lead_away_from_where_the_servo_stands_no_faster_than_allowed() -> None:
-    """Catches the jump to the first goal, and a limit that holds for one step but not for the next."""
+    """Catches the jump to the first goal, and a limit that holds for one step but not for the
+    next."""
     guard = Guard(SafetyLimits(slew_rad_s=1.0), np.array([0.2]), ["it"])
     at = [float(guard.command(np.array([1.0]), 0.004)[0][0]) for _ in range(3)]
     np.testing.assert_allclose(at, [0.204, 0.208, 0.212])
@@ -50,7 +65,9 @@ def test_first_commands_lead_away_from_where_the_servo_stands_no_faster_than_all
 
 def test_goals_stay_within_the_position_limits() -> None:
     """Catches limits that only one side has, or that the slew limit undoes."""
-    guard = Guard(SafetyLimits(lowest_rad=-0.1, highest_rad=0.3, slew_rad_s=10.0), np.zeros(2), ["one", "two"])
+    guard = Guard(
+        SafetyLimits(lowest_rad=-0.1, highest_rad=0.3, slew_rad_s=10.0), np.zeros(2), ["one", "two"]
+    )
     goals, is_limited = guard.command(np.array([-5.0, 5.0]), 0.5)
     assert goals.tolist() == [-0.1, 0.3]
     assert is_limited.all()
@@ -65,13 +82,15 @@ def test_goals_that_are_no_angles_stop_the_motion(goals: list[float]) -> None:
 
 @pytest.mark.parametrize("begin", [-0.6, -0.51, np.nan])
 def test_motion_does_not_begin_outside_the_limits(begin: float) -> None:
-    """Catches a first command beyond the limit, also within the margin that is for what is measured on the way."""
+    """Catches a first command beyond the limit, also within the margin that is for what is
+    measured on the way."""
     with pytest.raises(FaultError, match="by hand"):
         Guard(SafetyLimits(lowest_rad=-0.5), np.array([begin]), ["it"])
 
 
 def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> None:
-    """Catches commands that go on blindly, a fault at the first hiccup, and a count that a good reply does not end."""
+    """Catches commands that go on blindly, a fault at the first hiccup, and a count that a good
+    reply does not end."""
     guard = Guard(SafetyLimits(slew_rad_s=1.0), np.zeros(1), ["it"])
     guard.command(np.array([1.0]), 0.004)
     assert guard.check(states([0.0], fresh=False)) == ""
@@ -103,15 +122,24 @@ def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
     """Catches a stop at one spike of the current, and none under a load that stays."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
     strained = states([0.0], current=-12.0)
-    assert [guard.check(s) != "" for s in (strained, strained, states([0.0]), strained, strained, strained)] == [
-        False, False, False, False, False, True,
-    ]  # fmt: skip
+    assert [
+        guard.check(s) != ""
+        for s in (strained, strained, states([0.0]), strained, strained, strained)
+    ] == [
+        False,
+        False,
+        False,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_missing_replies_do_not_hide_too_much_torque() -> None:
     """Catches a load that lasts for ever because every second reply is lost."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
-    strained, missing = states([0.0], current=-12.0), states([np.nan], current=np.nan, fresh=False)
+    strained = states([0.0], current=-12.0)
+    missing = states([np.nan], current=np.nan, fresh=False)
     reasons = [guard.check(s) for s in (strained, missing, strained, missing, strained)]
     assert reasons[:4] == [""] * 4
     assert "torque exceeds 40 N·m: it: " in reasons[4]
@@ -152,10 +180,15 @@ def torque_events(emulator: RunningEmulator, value: int) -> list[float]:
     return [t for t, _, name, v in emulator.events() if name == "torque_enable" and v == value]
 
 
-def test_registers_and_positions_that_look_like_a_header_pass_both_ways(emulator: RunningEmulator) -> None:
+def test_registers_and_positions_that_look_like_a_header_pass_both_ways(
+    emulator: RunningEmulator,
+) -> None:
     """Catches the SDK's missing stuffing: −131073 is FF FF FD FF on the wire."""
     with DynamixelBus(emulator.port) as bus:
-        assert [(f.servo_id, f.model_number) for f in (bus.ping(1), bus.ping(2))] == [(1, 54024), (2, 54024)]
+        assert [(f.servo_id, f.model_number) for f in (bus.ping(1), bus.ping(2))] == [
+            (1, 54024),
+            (2, 54024),
+        ]
         bus.attach([1, 2])
         for value in (-131_073, -131_072, -3, 250_961):
             bus.write(1, "goal_position", value)
@@ -168,17 +201,25 @@ def test_registers_and_positions_that_look_like_a_header_pass_both_ways(emulator
 
 
 def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -> None:
-    """Catches a check that reads the wrong register: the emulated servos are set as they should be."""
+    """Catches a check that reads the wrong register: the emulated servos are set as they should
+    be."""
     with DynamixelBus(emulator.port) as bus:
         checks = check_bus(bus, [1, 2])
-    of_the_computer = ("round trip of a ping", "lost replies")  # pseudo-terminals are slow where it is busy
+    of_the_computer = (
+        "round trip of a ping",
+        "lost replies",
+    )  # pseudo-terminals are slow where it is busy
     assert [one.what for one in checks if not one.is_good and one.what not in of_the_computer] == []
     assert any("54024 H54-200-S500-R" in one.value for one in checks)
 
 
 def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
-    """Catches emulated servos that are delivered with settings that nothing but the maker's program can change."""
-    with RunningEmulator(EmulatorConfig(model_number=2020)) as newer, DynamixelBus(newer.port) as bus:
+    """Catches emulated servos that are delivered with settings that nothing but the maker's
+    program can change."""
+    with (
+        RunningEmulator(EmulatorConfig(model_number=2020)) as newer,
+        DynamixelBus(newer.port) as bus,
+    ):
         found = {one.what: one.cure for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
     assert set(found.values()) == {""}
 
@@ -195,7 +236,8 @@ def test_a_bad_line_is_seen_by_its_lost_and_damaged_replies(fault: str) -> None:
 
 
 def test_slow_adapter_is_refused_with_its_cure(emulator: RunningEmulator) -> None:
-    """Catches a loop that would begin on an adapter as it is delivered: 16 ms, four control periods."""
+    """Catches a loop that would begin on an adapter as it is delivered: 16 ms, four control
+    periods."""
     emulator.faults(latency_s=0.016)
     with pytest.raises(HardwareError, match=r"round trip .* is 1[67].*latency timer to 1 ms"):
         SupervisedBus({emulator.port: [1]})
@@ -203,14 +245,16 @@ def test_slow_adapter_is_refused_with_its_cure(emulator: RunningEmulator) -> Non
 
 def read_until(port: Port, number: int, at_once: int) -> list[bytes]:
     """Pieces of together so many bytes, within a second."""
-    parts, end = [], time.monotonic() + 1.0
+    parts = []
+    end = time.monotonic() + 1.0
     while sum(map(len, parts)) < number and time.monotonic() < end:
         parts.append(port.readPort(at_once))
     return parts
 
 
 def test_a_read_takes_no_more_than_it_asked_for_and_loses_nothing() -> None:
-    """Catches bytes read ahead that are lost, given twice, or still there after the port was cleared."""
+    """Catches bytes read ahead that are lost, given twice, or still there after the port was
+    cleared."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     port = Port(os.ttyname(slave))
@@ -239,7 +283,9 @@ def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator)
         bus.attach([1])
         emulator.faults(late=1.0, late_s=0.006)
         missing = 0
-        for _ in range(20):  # fewer than there are lengths: whatever the delay, an old reply has another one
+        for _ in range(
+            20
+        ):  # fewer than there are lengths: whatever the delay, an old reply has another one
             begin = time.monotonic()
             replied = bus.read_states(0.004)
             missing += not replied.is_fresh.all()
@@ -250,9 +296,14 @@ def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator)
         assert bus.read_states(0.1).is_fresh.all()
 
 
-def test_second_program_is_told_which_port_is_taken(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
+def test_second_program_is_told_which_port_is_taken(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
     """Catches two programs on one bus, one directly and one through a supervisor."""
-    for intrude in (lambda: DynamixelBus(emulator.port).open(), lambda: SupervisedBus({emulator.port: [1]})):
+    for intrude in (
+        lambda: DynamixelBus(emulator.port).open(),
+        lambda: SupervisedBus({emulator.port: [1]}),
+    ):
         with pytest.raises(PortError, match=emulator.port):
             intrude()
     assert supervised.read().is_fresh.all()
@@ -261,7 +312,8 @@ def test_second_program_is_told_which_port_is_taken(emulator: RunningEmulator, s
 def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
     emulator: RunningEmulator, supervised: SupervisedBus
 ) -> None:
-    """Catches a port that is opened, and its input thrown away, before anybody has asked whether it is free."""
+    """Catches a port that is opened, and its input thrown away, before anybody has asked whether
+    it is free."""
     start = supervised.enable(PATIENT)
     cycle(supervised, start.tolist(), 5)
     for _ in range(5):
@@ -271,7 +323,8 @@ def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
 
 
 def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator) -> None:
-    """Catches goals that do not arrive in the servos' units, and a program that ends with torque on."""
+    """Catches goals that do not arrive in the servos' units, and a program that ends with torque
+    on."""
     with SupervisedBus({emulator.port: [1, 2]}) as bus:
         start = bus.enable(PATIENT)
         begin = time.monotonic()
@@ -282,8 +335,11 @@ def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator)
     assert emulator.state()["torque_on"] == [False, False]
 
 
-def test_torque_is_off_when_the_program_waits_too_long(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
-    """Catches a supervisor that waits for ever, and a program that is not told why nothing moves."""
+def test_torque_is_off_when_the_program_waits_too_long(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a supervisor that waits for ever, and a program that is not told why nothing
+    moves."""
     supervised.enable(PATIENT.replace(hang_s=0.05))
     emulator.events()
     cycle(supervised, [0.0, 0.0], 3)
@@ -295,7 +351,9 @@ def test_torque_is_off_when_the_program_waits_too_long(emulator: RunningEmulator
         cycle(supervised, [0.0, 0.0])
 
 
-def test_overload_stops_all_and_is_named(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
+def test_overload_stops_all_and_is_named(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
     """Catches an alert bit that is overlooked because it comes with success."""
     supervised.enable(PATIENT)
     emulator.faults(overload=True)
@@ -314,10 +372,14 @@ def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
     supervised.enable(PATIENT)
     emulator.events()
     os.kill(supervised.process_id, signal.SIGSTOP)
-    awake = threading.Timer(10.0, os.kill, (supervised.process_id, signal.SIGCONT))  # a test must not wait for ever
+    awake = threading.Timer(
+        10.0, os.kill, (supervised.process_id, signal.SIGCONT)
+    )  # a test must not wait for ever
     awake.start()
     try:
-        with pytest.raises(FaultError, match=r"did not answer within .* ms and was ended; torque is off"):
+        with pytest.raises(
+            FaultError, match=r"did not answer within .* ms and was ended; torque is off"
+        ):
             cycle(supervised, [0.0, 0.0])
     finally:
         awake.cancel()
@@ -333,7 +395,9 @@ def test_a_supervisor_that_waits_for_silent_servos_is_not_taken_for_dead(
     supervised.enable()
     emulator.events()
     emulator.faults(silent=True)
-    with pytest.raises(FaultError, match=r"sent, but not confirmed by servo 1 at .*, servo 2 at .*: switch"):
+    with pytest.raises(
+        FaultError, match=r"sent, but not confirmed by servo 1 at .*, servo 2 at .*: switch"
+    ):
         cycle(supervised, [0.0, 0.0], 12)
     emulator.faults(silent=False)
     assert torque_events(emulator, 0)
@@ -360,7 +424,8 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
 
 @pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
-    """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of the supervisor."""
+    """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of
+    the supervisor."""
     command = [sys.executable, "-m", "tests.hardware_trials.wave", emulator.port, "1"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
@@ -371,7 +436,9 @@ def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, ho
         if how == "kill-supervisor":
             os.kill(supervisor, signal.SIGKILL)
         else:
-            program.send_signal({"kill": signal.SIGKILL, "stop": signal.SIGSTOP, "interrupt": signal.SIGINT}[how])
+            program.send_signal(
+                {"kill": signal.SIGKILL, "stop": signal.SIGSTOP, "interrupt": signal.SIGINT}[how]
+            )
         off: list[float] = []
         while not off and time.monotonic() - begin < 1.0:
             time.sleep(0.05)
@@ -395,7 +462,8 @@ def _wait_until_free(port: str) -> None:
 
 
 def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
-    """Catches arrays that mix up the servos of two buses, and one bus whose loss keeps torque on at the other."""
+    """Catches arrays that mix up the servos of two buses, and one bus whose loss keeps torque on
+    at the other."""
     with RunningEmulator(EmulatorConfig(ids=(7,), model_number=2020)) as other:
         ports = {other.port: [7], emulator.port: [1, 2]}
         with SupervisedBus(ports) as bus:

@@ -1,4 +1,5 @@
-"""The supervisor in this process, on emulated servos without terminals: faults at the very moment that matters."""
+"""The supervisor in this process, on emulated servos without terminals: faults at the very
+moment that matters."""
 
 import itertools
 import os
@@ -42,18 +43,22 @@ class Line(DynamixelBus):
     Attributes:
         sent: Instructions that were sent, (id, instruction).
         events: What changed at the servos, (id, register, value).
-        goals_at_torque_on: Where a servo was told to go when it got torque, less where it stood [rad].
+        goals_at_torque_on: Where a servo was told to go when it got torque, less where it stood
+            [rad].
         lost: Numbers of the instructions, as they are sent, that reach no servo.
         damaged: Likewise those that arrive damaged.
         silent: Ids of servos that hear but do not answer.
         gone_at: Instruction from which on the port is gone.
     """
 
-    def __init__(self, name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024) -> None:
+    def __init__(
+        self, name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024
+    ) -> None:
         super().__init__(name)
         self.motors = {servo_id: Motor() for servo_id in ids}
         self.servos = {
-            i: EmulatedServo(i, servo_model(number), self._note, None, motor) for i, motor in self.motors.items()
+            i: EmulatedServo(i, servo_model(number), self._note, None, motor)
+            for i, motor in self.motors.items()
         }
         self.sent: list[tuple[int, int]] = []
         self.log = [] if log is None else log
@@ -64,7 +69,8 @@ class Line(DynamixelBus):
         self.silent: set[int] = set()
         self.gone_at = -1
         self._line = EmulatedBus(list(self.servos.values()))
-        self._is_gone, self._refusals = False, 0
+        self._is_gone = False
+        self._refusals = 0
         self._coming: deque[Packet] = deque()
 
     def open(self) -> None:
@@ -73,13 +79,17 @@ class Line(DynamixelBus):
     def _note(self, servo_id: int, name: str, value: int) -> None:
         self.events.append((servo_id, name, value))
         if (name, value) == ("torque_enable", 1):
-            self.goals_at_torque_on.append(self.servos[servo_id].goal - self.motors[servo_id].position)
+            self.goals_at_torque_on.append(
+                self.servos[servo_id].goal - self.motors[servo_id].position
+            )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
         self._is_gone |= instruction == self.gone_at
         if self._is_gone:
             self._refusals += 1  # a lost port tells of its loss in other words the second time
-            raise BusGoneError(f"the bus at {self.name} is gone (error {self._refusals}): switch their power off")
+            raise BusGoneError(
+                f"the bus at {self.name} is gone (error {self._refusals}): switch their power off"
+            )
         number = len(self.sent)
         self.sent.append((servo_id, instruction))
         self.log.append((self.name, instruction))
@@ -87,7 +97,9 @@ class Line(DynamixelBus):
         if number not in self.lost:
             packet = Packet(servo_id, instruction, parameters, number not in self.damaged)
             wire = b"".join(self._line.answer(packet, 0.0))
-            self._coming += [reply for reply in Parser().feed(wire) if reply.servo_id not in self.silent]
+            self._coming += [
+                reply for reply in Parser().feed(wire) if reply.servo_id not in self.silent
+            ]
 
     def _receive(self) -> tuple[int, int, bytes] | None:
         if not self._coming:
@@ -99,7 +111,9 @@ class Line(DynamixelBus):
         pass
 
 
-def attached(name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024) -> Line:
+def attached(
+    name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024
+) -> Line:
     line = Line(name, *ids, log=log, number=number)
     line.attach(ids)
     line.sent.clear()
@@ -108,7 +122,8 @@ def attached(name: str, *ids: int, log: list[tuple[str, int]] | None = None, num
 
 
 def served(lines: list[Line], *requests: tuple[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """What a supervisor answers to requests which all have come before it begins, and then the program is gone."""
+    """What a supervisor answers to requests which all have come before it begins, and then the
+    program is gone."""
     own, other = Channel.pair()
     program = Channel(own)
     for number, (action, arguments) in enumerate(requests, 1):
@@ -137,7 +152,8 @@ def handlers() -> Iterator[None]:
 @pytest.mark.parametrize("number", [1, 2, 3])
 @pytest.mark.usefixtures("handlers")
 def test_signals_in_the_last_moment_do_not_keep_torque_on(number: int) -> None:
-    """Catches torque off that a signal interrupts before it is sent, or a second one that comes with the first."""
+    """Catches torque off that a signal interrupts before it is sent, or a second one that comes
+    with the first."""
     pending = [signal.SIGTERM, signal.SIGHUP, signal.SIGINT][:number]
 
     class Interrupted(Line):
@@ -154,7 +170,8 @@ def test_signals_in_the_last_moment_do_not_keep_torque_on(number: int) -> None:
 
 
 def test_a_bus_that_is_lost_before_the_first_step_is_remembered() -> None:
-    """Catches "torque is off" as the answer where nobody knows: the first to hear of the loss was the keeper."""
+    """Catches "torque is off" as the answer where nobody knows: the first to hear of the loss
+    was the keeper."""
     line = attached("one", 1)
     line.gone_at = packets.SYNC_READ
     answers = served([line], ENABLE, exchange(0.0), exchange(0.0), ENABLE, ("disable", {}))
@@ -163,8 +180,10 @@ def test_a_bus_that_is_lost_before_the_first_step_is_remembered() -> None:
 
 
 def test_a_lost_bus_leaves_the_others_off_and_confirmed() -> None:
-    """Catches a loss that ends the attempt at the others, and a message that tells of one bus only."""
-    lost, left = attached("one", 1), attached("two", 1, 2)
+    """Catches a loss that ends the attempt at the others, and a message that tells of one bus
+    only."""
+    lost = attached("one", 1)
+    left = attached("two", 1, 2)
     lost.gone_at = packets.SYNC_READ
     _, answer = served([lost, left], ENABLE, exchange(0.0, 0.0, 0.0))
     assert answer["error"] == "BusGoneError"
@@ -177,7 +196,8 @@ def test_a_lost_bus_leaves_the_others_off_and_confirmed() -> None:
 
 
 def test_no_lost_instruction_lets_a_servo_jump() -> None:
-    """Catches torque that is switched on although the goal before it never arrived: the servo keeps an old one."""
+    """Catches torque that is switched on although the goal before it never arrived: the servo
+    keeps an old one."""
     for lost in itertools.count():
         line = attached("one", 1, 2)
         for motor in line.motors.values():
@@ -215,7 +235,8 @@ def test_torque_goes_on_at_rest_only() -> None:
 
 
 def test_reading_does_not_count_as_commanding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a program that only reads and so keeps torque on for ever, as one that hangs in its control law may."""
+    """Catches a program that only reads and so keeps torque on for ever, as one that hangs in
+    its control law may."""
     clock = [0.0]
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: clock[0]))
 
@@ -226,14 +247,19 @@ def test_reading_does_not_count_as_commanding(monkeypatch: pytest.MonkeyPatch) -
 
     line = Slow("one", 1)
     line.attach([1])
-    *answers, last = served([line], ENABLE, READ, READ, exchange(0.0), READ, READ, READ, READ, exchange(0.0))
+    *answers, last = served(
+        [line], ENABLE, READ, READ, exchange(0.0), READ, READ, READ, READ, exchange(0.0)
+    )
     assert not any("error" in answer for answer in answers)
     assert last["error"] == "FaultError"
     assert "no command for 50 ms" in last["message"]
 
 
-def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a stop that asks all servos before it switches any off, or one port after the other."""
+def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a stop that asks all servos before it switches any off, or one port after the
+    other."""
     log: list[tuple[str, int]] = []
     lines = {"one": attached("one", 1, 2, log=log), "two": attached("two", 3, log=log)}
     monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda port, _: lines[port])
@@ -250,7 +276,9 @@ def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(monkeypat
     assert sorted(name for name, _ in log[:4]) == ["one", "one", "two", "two"]
 
 
-def test_emergency_stop_without_models_takes_those_that_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_emergency_stop_without_models_takes_those_that_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Catches one servo without power that keeps all others under torque."""
     line = attached("one", 1, 2)
     monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda *_: line)
@@ -270,7 +298,9 @@ def test_an_instruction_that_arrives_damaged_is_sent_again() -> None:
     assert line.servos[1].goal == pytest.approx(0.1, abs=MODEL.position_unit)
     assert line.num_retries == 2
     line.damaged = {3, 4, 5}
-    with pytest.raises(ReplyError, match=r"servo 1 at one says that the instruction arrived damaged in 3 tries"):
+    with pytest.raises(
+        ReplyError, match=r"servo 1 at one says that the instruction arrived damaged in 3 tries"
+    ):
         line.write_goal(1, 0.2)
 
 
@@ -295,7 +325,9 @@ def test_a_program_that_was_killed_and_still_has_its_channel_loses_torque_at_onc
     with subprocess.Popen(["true"]) as program:  # it has ended, and nobody has asked how
         while not is_ending(program.pid):
             time.sleep(0.001)
-        Supervisor(Channel(other), [line], program.pid).run()  # which waits for ever, as `own` is open
+        Supervisor(
+            Channel(other), [line], program.pid
+        ).run()  # which waits for ever, as `own` is open
     own.close()
     other.close()
     assert line.events[-1] == (1, "torque_enable", 0)
@@ -316,7 +348,9 @@ STAT = "7 (a) b c) {} 1 7 7 0 -1 {} 0 0\n"
         ("0" * 16, "Z", 0x400000, True),
     ],
 )
-def test_linux_tells_that_a_program_ends(pending: str, state: str, flags: int, expected: bool, tmp_path: Path) -> None:
+def test_linux_tells_that_a_program_ends(
+    pending: str, state: str, flags: int, expected: bool, tmp_path: Path
+) -> None:
     """Catches a signal, a state or a flag that is read from the wrong place."""
     (tmp_path / "7").mkdir()
     (tmp_path / "7" / "status").write_text(STATUS.format(pending))

@@ -60,14 +60,25 @@ def emulator(running: RunningEmulator) -> RunningEmulator:
 
 
 def make_hardware(emulator: RunningEmulator, **arguments: Any) -> Any:
-    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0, "limits": PATIENT, "imu_oldest_s": 0.3}
+    given = {
+        "reference": QUICK,
+        "confirm": False,
+        "approach_rad_s": 2.0,
+        "limits": PATIENT,
+        "imu_oldest_s": 0.3,
+    }
     given |= arguments
-    return gymnasium.make("elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port, **given)
+    return gymnasium.make(
+        "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port, **given
+    )
 
 
 def play(env: Any, policy: Any) -> tuple[list[Any], dict[str, Any], float]:
     observation, info = env.reset(seed=0)
-    seen, state, start, reward = [observation], None, np.array(True), 0.0
+    seen = [observation]
+    state = None
+    start = np.array(True)
+    reward = 0.0
     while True:
         action, state = policy.predict(observation, state=state, episode_start=start)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -77,9 +88,14 @@ def play(env: Any, policy: Any) -> tuple[list[Any], dict[str, Any], float]:
             return seen, info, reward
 
 
-def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(emulator: RunningEmulator) -> None:
-    """Catches a policy that would see something else on the real joint: every column agrees with the simulation's."""
-    simulated: Any = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True, reference=QUICK)
+def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(
+    emulator: RunningEmulator,
+) -> None:
+    """Catches a policy that would see something else on the real joint: every column agrees with
+    the simulation's."""
+    simulated: Any = gymnasium.make(
+        "elastic_env/Testbed-v0", disable_env_checker=True, reference=QUICK
+    )
     real = make_hardware(emulator, imu_port=emulator.imu_port)
     assert real.observation_space == simulated.observation_space
     assert real.action_space == simulated.action_space
@@ -98,7 +114,8 @@ def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(emula
 
 
 def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
-    """Catches an encoder that is passed off as the link's angle, and a torque that is passed off as measured."""
+    """Catches an encoder that is passed off as the link's angle, and a torque that is passed off
+    as measured."""
     env = make_hardware(emulator)
     env.reset()
     _, reward, _, _, info = env.step(np.zeros(1, dtype=np.float32))
@@ -118,14 +135,19 @@ def test_a_step_outside_an_episode_says_so_and_touches_nothing(emulator: Running
     env.reset()
     env.close()
     emulator.events()
-    with pytest.raises(HardwareError, match=rf"no episode is under way at {emulator.port}.* reset\(\)"):
+    with pytest.raises(
+        HardwareError, match=rf"no episode is under way at {emulator.port}.* reset\(\)"
+    ):
         env.step(np.zeros(1, dtype=np.float32))
     assert emulator.events() == []
 
 
 def test_a_link_that_turns_against_its_motor_stops_the_motion(emulator: RunningEmulator) -> None:
-    """Catches an IMU whose sign is wrong, by which a policy would be scored and identification would fit K."""
-    env = make_hardware(emulator, imu_port=emulator.imu_port, imu_sign=-1, reference={"kind": "hold", "lower": -0.5})
+    """Catches an IMU whose sign is wrong, by which a policy would be scored and identification
+    would fit K."""
+    env = make_hardware(
+        emulator, imu_port=emulator.imu_port, imu_sign=-1, reference={"kind": "hold", "lower": -0.5}
+    )
     with pytest.raises(HardwareError, match="imu_sign") as caught:
         env.reset()
     assert caught.value.__notes__ == [f"torque at {emulator.port} is off"]
@@ -133,7 +155,8 @@ def test_a_link_that_turns_against_its_motor_stops_the_motion(emulator: RunningE
 
 
 def test_a_testbed_that_is_forgotten_lets_go(emulator: RunningEmulator) -> None:
-    """Catches a cell of a notebook that cannot be run a second time: its own kernel has the ports."""
+    """Catches a cell of a notebook that cannot be run a second time: its own kernel has the
+    ports."""
 
     def forget() -> None:
         make_hardware(emulator, imu_port=emulator.imu_port).reset()
@@ -156,12 +179,20 @@ def test_nothing_moves_unless_somebody_agrees(emulator: RunningEmulator) -> None
     assert emulator.events() == []
 
 
-def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(emulator: RunningEmulator) -> None:
+def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(
+    emulator: RunningEmulator,
+) -> None:
     """Catches an episode that would be cut off by the limits half-way."""
     with pytest.raises(HardwareError, match="limits allow"):
         make_hardware(emulator, limits={"lowest_rad": -0.05})
-    for wrong, words in (({"prot": 1}, "port"), ({"scenario": "soft"}, "simulation"), ({"form": "rigid"}, "form")):
-        with pytest.raises(ConfigurationError if "prot" in wrong or "form" in wrong else HardwareError, match=words):
+    for wrong, words in (
+        ({"prot": 1}, "port"),
+        ({"scenario": "soft"}, "simulation"),
+        ({"form": "rigid"}, "form"),
+    ):
+        with pytest.raises(
+            ConfigurationError if "prot" in wrong or "form" in wrong else HardwareError, match=words
+        ):
             make_hardware(emulator, **wrong)
 
 
@@ -190,7 +221,9 @@ def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: Runni
         for _ in range(40):
             time.sleep(0.01)
             rolls.append(stream.latest().roll)
-    assert np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01  # offset and noise of the scenario
+    assert (
+        np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01
+    )  # offset and noise of the scenario
     with pytest.raises(PortError, match="/dev/ttyNOTHING: there is no such device"):
         AttitudeStream("/dev/ttyNOTHING")
 
@@ -198,7 +231,8 @@ def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: Runni
 def test_a_sample_whose_writer_died_within_is_none() -> None:
     """Catches a control loop that waits for ever, under torque, for the second half of a sample."""
     file = SharedSample.file()
-    writer, reader = SharedSample(file), SharedSample(file)
+    writer = SharedSample(file)
+    reader = SharedSample(file)
     os.close(file)
     seen: list[Attitude | None] = []
     sample = Attitude(1.0, 0.1, 0.2, 0.3)
@@ -248,9 +282,13 @@ class StillBus:
 
     def exchange(self, goals: Any, at: float) -> Cycle:
         late_s = max(self.now_s - at, 0.0)
-        self.now_s, self.goal = max(at, self.now_s), float(goals[0])
-        yes, no = np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
-        states = States(np.array(goals), np.zeros(1), np.full(1, 1.0 + self.goal), yes, no, self.now_s)
+        self.now_s = max(at, self.now_s)
+        self.goal = float(goals[0])
+        yes = np.ones(1, dtype=np.bool_)
+        no = np.zeros(1, dtype=np.bool_)
+        states = States(
+            np.array(goals), np.zeros(1), np.full(1, 1.0 + self.goal), yes, no, self.now_s
+        )
         return Cycle(states, np.array(goals), no, is_held=False, late_s=late_s)
 
 
@@ -266,11 +304,14 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
 
 def make_still() -> Any:
     given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0}
-    return gymnasium.make("elastic_env/HardwareTestbed-v0", disable_env_checker=True, port="still", **given)
+    return gymnasium.make(
+        "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port="still", **given
+    )
 
 
 def test_the_first_step_may_come_any_time_after_the_reset(still: StillBus) -> None:
-    """Catches a period that is counted from the reset: every episode would begin with an overrun that is none."""
+    """Catches a period that is counted from the reset: every episode would begin with an overrun
+    that is none."""
     env = make_still()
     env.reset()
     still.now_s += 2.0
@@ -281,10 +322,12 @@ def test_the_first_step_may_come_any_time_after_the_reset(still: StillBus) -> No
 
 
 def test_the_last_step_tells_of_itself_and_not_of_the_way_back(still: StillBus) -> None:
-    """Catches torque and timing that are measured when the pendulum has been brought back to rest."""
+    """Catches torque and timing that are measured when the pendulum has been brought back to
+    rest."""
     env = make_still()
     env.reset()
-    torques, is_over = [], False
+    torques = []
+    is_over = False
     while not is_over:
         *_, is_over, info = env.step(np.full(1, 0.2, dtype=np.float32))
         torques.append(info["joint_torque"])
@@ -294,7 +337,9 @@ def test_the_last_step_tells_of_itself_and_not_of_the_way_back(still: StillBus) 
     assert torques[-1] == pytest.approx(torque_of_current(1.0 + info["reference_angle"] + 0.2))
 
 
-def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Catches a traceback that ends all other measurements with it."""
     monkeypatch.setattr(hardware_trials, "_end_once", lambda *_: None)
     trial = hardware_trials.killed(0.02)
@@ -310,19 +355,25 @@ def test_a_measurement_that_does_not_exist_is_refused() -> None:
 
 def test_mounting_turns_angles_into_the_joints() -> None:
     """Catches a sign that is applied to the angle but not to the limits."""
-    mounting = HardwareSettings(port="p", direction=-1, zero_rad=0.5, limits={"lowest_rad": -1.0, "highest_rad": 0.3})  # type: ignore[arg-type]
+    mounting = HardwareSettings(
+        port="p", direction=-1, zero_rad=0.5, limits={"lowest_rad": -1.0, "highest_rad": 0.3}
+    )  # type: ignore[arg-type]
     assert mounting.joint_angle(mounting.servo_angle(0.7)) == pytest.approx(0.7)
     assert mounting.servo_angle(0.2) == pytest.approx(0.3)
     limits = mounting.servo_limits
     assert (limits.lowest_rad, limits.highest_rad) == pytest.approx((0.2, 1.5))
     assert Attitude(0.0, 0.1, -0.2, 0.0).link_angle("pitch", -1, -0.2) == 0.0
     assert Attitude(0.0, 0.1, -0.2, 0.0).link_angle("pitch", -1, 0.05) == pytest.approx(0.25)
-    assert Attitude(0.0, 3.0, 0.0, 0.0).link_angle("roll", 1, -0.5) == pytest.approx(3.5 - 2 * np.pi)
+    assert Attitude(0.0, 3.0, 0.0, 0.0).link_angle("roll", 1, -0.5) == pytest.approx(
+        3.5 - 2 * np.pi
+    )
 
 
 def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> None:
     """Catches K that is found with the torque of another pendulum."""
-    (tmp_path / "m.yaml").write_text("port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n")
+    (tmp_path / "m.yaml").write_text(
+        "port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n"
+    )
     on = OnHardware(mounting=tmp_path / "m.yaml")
     envs = identified_environments(Identify(on=on, second_mass=0.5))
     pendulums = [env.unwrapped.task.config.pendulum for env in envs]
@@ -338,24 +389,44 @@ def command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_commands_run_on_hardware(
-    emulator: RunningEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    emulator: RunningEmulator,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Catches --port that is not passed on: evaluate and run play on the emulated joint with its mounting."""
+    """Catches --port that is not passed on: evaluate and run play on the emulated joint with its
+    mounting."""
     residual = Path("baselines/trained/testbed/seed_0").absolute()
     monkeypatch.chdir(tmp_path)
     Path("mounting.yaml").write_text(
-        f"port: {emulator.port}\napproach_rad_s: 2.0\nimu_oldest_s: 0.3\n"
-        "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\npendulum: {gravity_torque: 60.0, mass: 11.0}\n"
+        f"port: {emulator.port}\napproach_rad_s: 2.0\nimu_oldest_s: 0.3\nlimits: {{patience_cycles:"
+        " 10, hang_s: 0.09, slew_rad_s: 2.5}\npendulum: {gravity_torque: 60.0, mass: 11.0}\n"
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
-    assert OnHardware(mounting=Path("mounting.yaml"), yes=True).arguments["limits"]["slew_rad_s"] == 2.5
+    assert (
+        OnHardware(mounting=Path("mounting.yaml"), yes=True).arguments["limits"]["slew_rad_s"]
+        == 2.5
+    )
     patient = OnHardware(mounting=Path("mounting.yaml"), yes=True, patient=True).arguments
     assert [patient["limits"][name] for name in ("patience_cycles", "slew_rad_s")] == [10, 2.5]
     assert patient["imu_oldest_s"] == 0.3  # as the file says, which is more patient still
     assert OnHardware(port="p", yes=True, patient=True).arguments["imu_oldest_s"] == 0.2
-    assert "pendulum" not in OnHardware(port=emulator.port, yes=True).arguments  # a configuration may say it
+    assert (
+        "pendulum" not in OnHardware(port=emulator.port, yes=True).arguments
+    )  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
-    command(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"], capsys)
+    command(
+        [
+            "evaluate",
+            "--policy",
+            f"residual:{residual}",
+            *reference,
+            *options,
+            "--output",
+            "evaluated",
+        ],
+        capsys,
+    )
     (episode,) = csv.DictReader(Path("evaluated/episodes.csv").read_text().splitlines())
     assert episode["scenario"] == "hardware"
     assert 0.0 < float(episode["link_error_imu_rms_rad"]) < 0.05
@@ -363,18 +434,25 @@ def test_commands_run_on_hardware(
     rows = list(csv.DictReader(Path("run/log.csv").read_text().splitlines()))
     assert len(rows) == 425
     assert all(float(row["period"]) > 0.0 for row in rows)
-    assert json.loads(Path("run/metrics.json").read_text())["limited"] == max(int(row["limited"]) for row in rows)
+    assert json.loads(Path("run/metrics.json").read_text())["limited"] == max(
+        int(row["limited"]) for row in rows
+    )
     capsys.readouterr()
     main(["hardware", "scan", emulator.port])
     assert capsys.readouterr().out.count("H54-200-S500-R") == 1  # at its own rate only
 
 
 def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
-    """Catches --port that is looked at after the file was refused for having none, and errors without a cure."""
+    """Catches --port that is looked at after the file was refused for having none, and errors
+    without a cure."""
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("direction: -1\n")
     given = OnHardware(port="/dev/ttyUSB7", imu_port="/dev/ttyACM7", mounting=mounting).arguments
-    assert (given["port"], given["imu_port"], given["direction"]) == ("/dev/ttyUSB7", "/dev/ttyACM7", -1)
+    assert (given["port"], given["imu_port"], given["direction"]) == (
+        "/dev/ttyUSB7",
+        "/dev/ttyACM7",
+        -1,
+    )
     for text, port, words in (
         ("direction: -1", None, "'port': .* --port"),
         ("limits: 5", "p", "limits must be a mapping"),
@@ -390,11 +468,14 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
         _ = OnHardware(port="p", mounting=tmp_path).arguments
 
 
-@pytest.mark.parametrize(("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")])
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")]
+)
 def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
     emulator: RunningEmulator, tmp_path: Path, number: signal.Signals, words: str
 ) -> None:
-    """Catches a log that is written at the end only, and an end after which nobody knows what the servo does.
+    """Catches a log that is written at the end only, and an end after which nobody knows what the
+    servo does.
 
     And a motion that waits for the compiler, of which nothing is kept, where steps are scored.
     """
@@ -410,15 +491,28 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
             "--port",
             emulator.port,
         ),
-        *("--mounting", str(mounting), "--yes", "--reference", "sine", "--output", str(tmp_path / "run")),
+        *(
+            "--mounting",
+            str(mounting),
+            "--yes",
+            "--reference",
+            "sine",
+            "--output",
+            str(tmp_path / "run"),
+        ),
     ]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "compiled")},
-    ) as program:  # fmt: skip
+    ) as program:
         log = tmp_path / "run" / "log.csv"
         deadline = time.monotonic() + 120.0
-        while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") > 500):
+        while time.monotonic() < deadline and not (
+            log.exists() and log.read_text().count("\n") > 500
+        ):
             assert program.poll() is None
             time.sleep(0.05)  # what is kept is seen on the disk while the run goes on
         program.send_signal(number)
@@ -434,10 +528,14 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
 
 
 def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an identification without the link's angle, and options of hardware that are silently ignored."""
+    """Catches an identification without the link's angle, and options of hardware that are
+    silently ignored."""
     for arguments, words in (
         (["evaluate", "--port", "/dev/null", "--scenario", "soft"], "--scenario"),
-        (["identify", "--port", "/dev/null", "--imu-port", "p", "--scenario", "soft"], "--scenario"),
+        (
+            ["identify", "--port", "/dev/null", "--imu-port", "p", "--scenario", "soft"],
+            "--scenario",
+        ),
         (["hardware", "check", "/dev/null", "--imu-port", "/dev/null"], "port of their own"),
         (["hardware", "check", "/dev/null", "--ids"], "ids must be different"),
         (["hardware", "check", "/dev/null", "--ids", "300"], "from 0 to 252"),
@@ -455,13 +553,17 @@ def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_the_links_deflection_is_that_of_the_emulated_spring() -> None:
-    """Catches counts, signs or angles that are off anywhere between the emulated joint and what a policy is told.
+    """Catches counts, signs or angles that are off anywhere between the emulated joint and what a
+    policy is told.
 
-    The joint is softer than the paper's, so that an assumed K would not pass, and damped, so that it settles quickly.
+    The joint is softer than the paper's, so that an assumed K would not pass, and damped, so that
+    it settles quickly.
     """
     soft = configure_testbed(scenario="ideal", stiffness=300.0, joint={"damping": 60.0})
     with RunningEmulator(EmulatorConfig(testbed=soft)) as emulator:
-        env = make_hardware(emulator, imu_port=emulator.imu_port, reference={"kind": "hold", "lower": -0.5})
+        env = make_hardware(
+            emulator, imu_port=emulator.imu_port, reference={"kind": "hold", "lower": -0.5}
+        )
         _, info = env.reset()
         env.close()
     torque = soft.true_pendulum.torque(np.array(info["link_angle"]))
@@ -473,6 +575,8 @@ def test_the_links_deflection_is_that_of_the_emulated_spring() -> None:
 def test_hardware_is_not_copied(still: StillBus, copied: Any) -> None:
     """Catches two environments at one port, or an error from the depths of a socket."""
     env = make_still()
-    with pytest.raises(HardwareError, match="cannot be copied or pickled: there is one joint at its port"):
+    with pytest.raises(
+        HardwareError, match="cannot be copied or pickled: there is one joint at its port"
+    ):
         copied(env)
     env.close()

@@ -1,4 +1,5 @@
-"""Identification: exact on points of the closed form, honest about noise, and right on the simulated testbed."""
+"""Identification: exact on points of the closed form, honest about noise, and right on the
+simulated testbed."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,38 +35,61 @@ def gravity(*masses: float) -> list[GravityModel]:
 
 
 def synthetic(
-    K: float = 1001.0, F: float = 0.0, b: float = 0.0, c: float = 0.0, s: float = 0.0,
-    masses: Sequence[float] = (1.0,), positions: int = 20, shares: tuple[float, float] = SHARES,
+    K: float = 1001.0,
+    F: float = 0.0,
+    b: float = 0.0,
+    c: float = 0.0,
+    s: float = 0.0,
+    masses: Sequence[float] = (1.0,),
+    positions: int = 20,
+    shares: tuple[float, float] = SHARES,
     noise: Array | float = 0.0,
-) -> StaticPoints:  # fmt: skip
-    """Static points of the closed form: a link at rest under gravity and friction, seen by an IMU with errors.
+) -> StaticPoints:
+    """Static points of the closed form: a link at rest under gravity and friction, seen by an IMU
+    with errors.
 
     The transmission carries τ + F d; the IMU reads q − c + s sin q.
     """
     shares_twice = np.linspace(*shares, positions)[np.r_[:positions, positions - 1 : -1 : -1]]
-    q, direction = np.arcsin(shares_twice), np.repeat([1, -1], positions)
+    q = np.arcsin(shares_twice)
+    direction = np.repeat([1, -1], positions)
     position = np.r_[:positions, positions - 1 : -1 : -1]
     parts = []
     for mass in masses:
         load = mass * G * np.sin(q) + F * direction
         theta = q + load / K + 0.5 * b * np.sign(load)
         imu = q - c + s * np.sin(q) + noise
-        parts.append(StaticPoints(theta, imu, direction, position, np.zeros(2 * positions, dtype=np.int64)))
+        parts.append(
+            StaticPoints(theta, imu, direction, position, np.zeros(2 * positions, dtype=np.int64))
+        )
     return StaticPoints.joined(parts)
 
 
 def parameters(result: Identification) -> list[float]:
     """K, F, b, c."""
-    return [result.stiffness_nm_per_rad, result.friction_nm, result.dead_band_rad, result.offset_rad]
+    return [
+        result.stiffness_nm_per_rad,
+        result.friction_nm,
+        result.dead_band_rad,
+        result.offset_rad,
+    ]
 
 
 @pytest.mark.parametrize("K", [300.0, 1001.0, 3000.0])
 @pytest.mark.parametrize(("F", "b"), [(0.0, 0.0), (5.4, 0.0), (5.4, 1.75e-3), (0.0, 1.75e-3)])
 def test_parameters_of_exact_points_are_recovered_to_rounding(K: float, F: float, b: float) -> None:
-    """Catches τ taken at the encoder (+4 % of K), the sign of τ instead of the load's, and half a dead band."""
+    """Catches τ taken at the encoder (+4 % of K), the sign of τ instead of the load's, and half
+    a dead band."""
     result = identify_points(synthetic(K, F, b), gravity())
-    assert parameters(result) == [REST(K, rel=1e-10), REST(F, abs=1e-9), REST(b, abs=1e-12), REST(0.0, abs=1e-12)]
-    assert (result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad) == (REST(K, rel=1e-8),) * 2
+    assert parameters(result) == [
+        REST(K, rel=1e-10),
+        REST(F, abs=1e-9),
+        REST(b, abs=1e-12),
+        REST(0.0, abs=1e-12),
+    ]
+    assert (result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad) == (
+        REST(K, rel=1e-8),
+    ) * 2
     assert result.residual_rad < 1e-12
     assert result.imu_sine_error_rad is None
     assert (result.points, result.positions) == (40, 20)
@@ -76,43 +100,57 @@ def test_offset_of_the_imu_is_recovered_to_rounding(c: float) -> None:
     """Catches τ taken at the IMU's angle, which the offset has shifted, or corrected only once."""
     result = identify_points(synthetic(F=5.4, b=1.75e-3, c=c), gravity())
     assert parameters(result) == [
-        REST(1001.0, rel=1e-9), REST(5.4, rel=1e-8), REST(1.75e-3, rel=1e-8), REST(c, rel=1e-8)
-    ]  # fmt: skip
+        REST(1001.0, rel=1e-9),
+        REST(5.4, rel=1e-8),
+        REST(1.75e-3, rel=1e-8),
+        REST(c, rel=1e-8),
+    ]
 
 
-@pytest.mark.parametrize(("K", "c", "s"), [(1001.0, 0.0, 2e-3), (1001.0, 1.7e-3, -2e-3), (300.0, 1.7e-3, 5e-3)])
+@pytest.mark.parametrize(
+    ("K", "c", "s"), [(1001.0, 0.0, 2e-3), (1001.0, 1.7e-3, -2e-3), (300.0, 1.7e-3, 5e-3)]
+)
 def test_two_masses_separate_the_sine_error_of_the_imu(K: float, c: float, s: float) -> None:
-    """Catches a sine error taken for compliance, its sign, and τ taken at an angle with that error in it."""
+    """Catches a sine error taken for compliance, its sign, and τ taken at an angle with that
+    error in it."""
     result = identify_points(synthetic(K, 5.4, 1.75e-3, c, s, masses=(1.0, 0.5)), gravity(1.0, 0.5))
     assert parameters(result) == [
-        REST(K, rel=1e-8), REST(5.4, rel=1e-7), REST(1.75e-3, rel=1e-7), REST(c, rel=1e-7, abs=1e-10)
-    ]  # fmt: skip
+        REST(K, rel=1e-8),
+        REST(5.4, rel=1e-7),
+        REST(1.75e-3, rel=1e-7),
+        REST(c, rel=1e-7, abs=1e-10),
+    ]
     assert result.imu_sine_error_rad == REST(s, rel=1e-7)
     assert (result.points, result.positions) == (80, 40)
 
 
 def test_one_mass_takes_the_sine_error_for_compliance() -> None:
-    """Catches a test of two masses that one mass would pass as well: 1/K shifts by −s/G, that is K by 3.5 %."""
+    """Catches a test of two masses that one mass would pass as well: 1/K shifts by −s/G, that is
+    K by 3.5 %."""
     result = identify_points(synthetic(s=2e-3), gravity())
     assert 1.0 / result.stiffness_nm_per_rad == REST(1.0 / 1001.0 - 2e-3 / G, rel=3e-3)
 
 
 def test_two_equal_masses_are_refused() -> None:
-    """Catches a singular regression whose answer, K = −2 N·m/rad within a narrow interval, is reported in earnest."""
+    """Catches a singular regression whose answer, K = −2 N·m/rad within a narrow interval, is
+    reported in earnest."""
     with pytest.raises(ElasticError, match=r"mass"):
         identify_points(synthetic(F=5.4, s=2e-3, masses=(1.0, 1.0)), gravity(1.0, 1.0))
 
 
 def test_torques_of_one_sign_are_refused() -> None:
-    """Catches an offset of 1.7 mrad that is reported as half of it and a dead band of 1.7 mrad: nothing tells them."""
+    """Catches an offset of 1.7 mrad that is reported as half of it and a dead band of 1.7 mrad:
+    nothing tells them."""
     with pytest.raises(ElasticError, match=r"dead band|offset|sign|determine"):
         identify_points(synthetic(F=5.4, c=1.7e-3, shares=(0.3, 0.8)), gravity())
 
 
 def test_plain_line_is_biased_by_the_dead_band_by_the_derived_amount() -> None:
-    """Catches a line through other points or another torque: its slope is 1/K + b/2 · cov(sign, τ)/var τ."""
+    """Catches a line through other points or another torque: its slope is 1/K + b/2 · cov(sign,
+    τ)/var τ."""
     points = synthetic(F=5.4, b=1.75e-3)
-    tau, load = G * np.sin(points.q), G * np.sin(points.q) + 5.4 * points.direction
+    tau = G * np.sin(points.q)
+    load = G * np.sin(points.q) + 5.4 * points.direction
     slope = 1.0 / 1001.0 + 0.5 * 1.75e-3 * np.cov(np.sign(load), tau, bias=True)[0, 1] / np.var(tau)
     result = identify_points(points, gravity())
     assert 1.0 / result.line_stiffness_nm_per_rad == REST(slope, rel=1e-10)
@@ -121,12 +159,18 @@ def test_plain_line_is_biased_by_the_dead_band_by_the_derived_amount() -> None:
 
 
 def test_interval_covers_the_truth_as_often_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an interval that resamples visits, whose noise is shared within a position, or that is half as wide."""
+    """Catches an interval that resamples visits, whose noise is shared within a position, or
+    that is half as wide."""
     monkeypatch.setattr(identification, "_RESAMPLES", 99)
-    generator, hits, widths, estimates = np.random.default_rng(1), 0, [], []
+    generator = np.random.default_rng(1)
+    hits = 0
+    widths = []
+    estimates = []
     for seed in range(100):
         up = generator.normal(0.0, 1e-4, 40)
-        result = identify_points(synthetic(F=5.4, positions=40, noise=np.r_[up, up[::-1]]), gravity(), seed)
+        result = identify_points(
+            synthetic(F=5.4, positions=40, noise=np.r_[up, up[::-1]]), gravity(), seed
+        )
         hits += result.stiffness_low_nm_per_rad <= 1001.0 <= result.stiffness_high_nm_per_rad
         widths.append(result.half_width * result.stiffness_nm_per_rad)
         estimates.append(result.stiffness_nm_per_rad)
@@ -136,11 +180,14 @@ def test_interval_covers_the_truth_as_often_as_it_says(monkeypatch: pytest.Monke
 
 
 def test_residual_spread_is_that_of_the_noise() -> None:
-    """Catches a spread divided by the number of points instead of the degrees of freedom that are left."""
+    """Catches a spread divided by the number of points instead of the degrees of freedom that
+    are left."""
     generator = np.random.default_rng(2)
     spreads = [
         identification.fit_points(points, points.q, G * np.sin(points.q), with_sine_error=False)
-        for points in (synthetic(positions=6, noise=generator.normal(0.0, 1e-4, 12)) for _ in range(300))
+        for points in (
+            synthetic(positions=6, noise=generator.normal(0.0, 1e-4, 12)) for _ in range(300)
+        )
     ]
     variance = np.mean([np.sum(fit.residuals**2) / (12 - 4) for fit in spreads])
     assert np.sqrt(variance) == REST(1e-4, rel=0.06)
@@ -152,13 +199,15 @@ def test_residual_spread_is_that_of_the_noise() -> None:
 
 @pytest.mark.parametrize(("F", "differ"), [(0.0, False), (5.4, True), (-5.4, True), (0.02, False)])
 def test_hysteresis_is_reported_where_the_directions_differ(F: float, differ: bool) -> None:
-    """Catches hysteresis seen in noise or in differences below 0.1 mrad, and one that is missed for its sign."""
+    """Catches hysteresis seen in noise or in differences below 0.1 mrad, and one that is missed
+    for its sign."""
     noise = np.random.default_rng(3).normal(0.0, 2e-5, 40)
     assert identify_points(synthetic(F=F, noise=noise), gravity()).hysteresis is differ
 
 
 def test_resampling_repeats_with_its_seed() -> None:
-    """Catches global random numbers: the same points and seed give the same interval, another seed another."""
+    """Catches global random numbers: the same points and seed give the same interval, another
+    seed another."""
     points = synthetic(noise=np.random.default_rng(4).normal(0.0, 1e-4, 40))
     first, again, other = (identify_points(points, gravity(), seed) for seed in (7, 7, 8))
     assert first == again
@@ -167,28 +216,38 @@ def test_resampling_repeats_with_its_seed() -> None:
 
 @pytest.mark.parametrize("positions", [5, 6, 8, 20])
 def test_interval_of_few_positions_is_that_of_their_noise(positions: int) -> None:
-    """Catches resamples that determine nothing, of one position over and over, whose K of zero widens the interval."""
+    """Catches resamples that determine nothing, of one position over and over, whose K of zero
+    widens the interval."""
     noise = np.random.default_rng(6).normal(0.0, 1e-5, 2 * positions)
     result = identify_points(synthetic(positions=positions, noise=noise), gravity())
     torque = np.linspace(*SHARES, positions) * G
-    deviation = 1001.0 * 1e-5 / np.sqrt(2.0 * np.sum((torque - torque.mean()) ** 2))  # of K, relative, by a plain line
+    deviation = (
+        1001.0 * 1e-5 / np.sqrt(2.0 * np.sum((torque - torque.mean()) ** 2))
+    )  # of K, relative, by a plain line
     assert 0.2 * deviation < result.half_width < 20.0 * deviation
 
 
 def test_too_few_positions_are_refused() -> None:
     """Catches a fit of four unknowns to four positions, whose interval would be made up."""
-    with pytest.raises(ElasticError, match="at least 5 positions approached from both sides, got 4"):
+    with pytest.raises(
+        ElasticError, match="at least 5 positions approached from both sides, got 4"
+    ):
         identify_points(synthetic(positions=4), gravity())
 
 
 def test_one_direction_of_approach_is_refused() -> None:
     """Catches friction that a single direction cannot tell from an offset."""
-    with pytest.raises(ElasticError, match=r"both sides, got 20 positions and the directions \[1\]"):
+    with pytest.raises(
+        ElasticError, match=r"both sides, got 20 positions and the directions \[1\]"
+    ):
         identify_points(synthetic().rows(np.arange(20)), gravity())
 
 
-def test_identification_survives_its_file_and_is_a_stiffness_for_the_environment(tmp_path: Path) -> None:
-    """Catches numbers rounded on the way, and a file that `stiffness=` of the environment does not take."""
+def test_identification_survives_its_file_and_is_a_stiffness_for_the_environment(
+    tmp_path: Path,
+) -> None:
+    """Catches numbers rounded on the way, and a file that `stiffness=` of the environment does
+    not take."""
     path = tmp_path / "identification.json"
     result = identify_points(synthetic(K=777.7, F=5.4, b=1e-3, c=1e-3), gravity())
     result.save(path)
@@ -198,7 +257,8 @@ def test_identification_survives_its_file_and_is_a_stiffness_for_the_environment
 
 
 def test_recorder_averages_encoder_and_imu_over_each_window() -> None:
-    """Catches windows mixed up, samples outside of them, and positions that do not belong together on the way back."""
+    """Catches windows mixed up, samples outside of them, and positions that do not belong
+    together on the way back."""
     directions = Hold(positions=2).visits[1]
     recorder = HoldRecorder(directions, num_worlds=2)
     assert not recorder.is_complete
@@ -222,22 +282,32 @@ def test_a_run_that_ended_early_is_an_error() -> None:
 
 def test_identification_needs_the_reference_hold() -> None:
     """Catches an identification of a sine, which is nowhere at rest."""
-    with pytest.raises(ConfigurationError, match="needs the reference 'hold', the environment has 'sine'"):
+    with pytest.raises(
+        ConfigurationError, match="needs the reference 'hold', the environment has 'sine'"
+    ):
         record_points(gymnasium.make(ID, reference="sine"))
 
 
 def test_three_masses_are_refused() -> None:
     """Catches environments beyond the second that are ignored."""
-    with pytest.raises(ConfigurationError, match="one environment or two with different masses, got 3"):
+    with pytest.raises(
+        ConfigurationError, match="one environment or two with different masses, got 3"
+    ):
         identify([gymnasium.make(ID)] * 3)
 
 
 # From here on the simulated testbed: one rollout each, shared by the tests.
 
 NARROW = {
-    "kind": "hold", "positions": 5, "lower": -0.6, "upper": 0.5, "rate": 0.4, "shortest_move_s": 1.2, "settle_s": 0.8,
+    "kind": "hold",
+    "positions": 5,
+    "lower": -0.6,
+    "upper": 0.5,
+    "rate": 0.4,
+    "shortest_move_s": 1.2,
+    "settle_s": 0.8,
     "measure_s": 0.1,
-}  # fmt: skip
+}
 CALM = H54_200_S500_R.replace(damping=60.0)
 """Comes to rest sooner."""
 WIDE = {"kind": "hold", "positions": 7, "rate": 0.1, "settle_s": 1.0, "measure_s": 0.4}
@@ -247,9 +317,17 @@ RUNS: dict[str, dict[str, Any]] = {
     "nominal": {"reference": WIDE, "scenario": "nominal"},
     "backlash": {"reference": WIDE, "scenario": "backlash"},
     "nominal input": {"reference": ENDS, "scenario": "nominal", "policy": "input"},
-    "ideal 300": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 300.0, "joint": CALM}},
+    "ideal 300": {
+        "reference": NARROW,
+        "scenario": "ideal",
+        "env_options": {"stiffness": 300.0, "joint": CALM},
+    },
     "ideal 1001": {"reference": NARROW, "scenario": "ideal", "env_options": {"joint": CALM}},
-    "ideal 3000": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 3000.0, "joint": CALM}},
+    "ideal 3000": {
+        "reference": NARROW,
+        "scenario": "ideal",
+        "env_options": {"stiffness": 3000.0, "joint": CALM},
+    },
     "ideal input": {
         "reference": {**NARROW, "positions": 2},
         "scenario": "ideal",
@@ -263,9 +341,13 @@ RUNS: dict[str, dict[str, Any]] = {
 def runs() -> dict[str, Evaluation]:
     """Evaluations by the names of `RUNS`."""
     conditions = [
-        Condition(**{**run, "policy": PolicySpec(name=run.get("policy", "uncompensated"))}) for run in RUNS.values()
+        Condition(**{**run, "policy": PolicySpec(name=run.get("policy", "uncompensated"))})
+        for run in RUNS.values()
     ]
-    return {name: evaluate(condition, num_threads=1) for name, condition in zip(RUNS, conditions, strict=True)}
+    return {
+        name: evaluate(condition, num_threads=1)
+        for name, condition in zip(RUNS, conditions, strict=True)
+    }
 
 
 def identified(run: Evaluation) -> Identification:
@@ -283,7 +365,8 @@ def range_at_rest(run: Evaluation) -> tuple[float, float]:
 
 @pytest.mark.parametrize("K", [300.0, 1001.0, 3000.0])
 def test_ideal_testbed_gives_its_stiffness(K: float, runs: dict[str, Evaluation]) -> None:
-    """Catches a plant whose spring is not the one it is told, and friction or play that an ideal one does not have."""
+    """Catches a plant whose spring is not the one it is told, and friction or play that an ideal
+    one does not have."""
     result = identified(runs[f"ideal {K:.0f}"])
     assert result.stiffness_nm_per_rad == REST(K, rel=2e-4)
     assert abs(result.friction_nm) < 0.02
@@ -292,13 +375,15 @@ def test_ideal_testbed_gives_its_stiffness(K: float, runs: dict[str, Evaluation]
 
 
 def test_ideal_link_is_where_it_should_be_at_rest(runs: dict[str, Evaluation]) -> None:
-    """Catches input compensation with a residue: Fig. 6 in `ideal` stays below 0.2 mrad in every sample at rest."""
+    """Catches input compensation with a residue: Fig. 6 in `ideal` stays below 0.2 mrad in every
+    sample at rest."""
     assert runs["ideal input"].values("link_error_peak_rad")[0] < 2e-4
     assert runs["ideal 1001"].values("link_error_peak_rad")[0] > 0.03
 
 
 def test_nominal_testbed_gives_stiffness_and_friction(runs: dict[str, Evaluation]) -> None:
-    """Catches friction that creeps away at rest or acts across the spring, and an IMU offset with the wrong sign."""
+    """Catches friction that creeps away at rest or acts across the spring, and an IMU offset
+    with the wrong sign."""
     result = identified(runs["nominal"])
     assert result.stiffness_nm_per_rad == REST(1001.0, rel=0.01)
     assert result.friction_nm == REST(5.4, rel=0.1)
@@ -309,12 +394,14 @@ def test_nominal_testbed_gives_stiffness_and_friction(runs: dict[str, Evaluation
 
 
 def test_nominal_testbed_scatters_like_the_papers_figure_5(runs: dict[str, Evaluation]) -> None:
-    """Catches too little or too much friction: r of the plain line is the paper's 0.9775 within its neighbourhood."""
+    """Catches too little or too much friction: r of the plain line is the paper's 0.9775 within
+    its neighbourhood."""
     assert 0.970 < identified(runs["nominal"]).pearson_r < 0.985
 
 
 def test_nominal_testbed_errs_like_the_papers_figure_6(runs: dict[str, Evaluation]) -> None:
-    """Catches a range, an offset or a compensation that is not the paper's, each end within 1.5 mrad."""
+    """Catches a range, an offset or a compensation that is not the paper's, each end within 1.5
+    mrad."""
     assert range_at_rest(runs["nominal"]) == (REST(-56.2, abs=1.5), REST(41.7, abs=1.5))
     assert range_at_rest(runs["nominal input"]) == (REST(-3.7, abs=1.5), REST(7.1, abs=1.5))
 
@@ -328,15 +415,20 @@ def test_backlash_biases_the_line_and_not_our_fit(runs: dict[str, Evaluation]) -
 
 
 def test_two_masses_find_the_sine_error_of_a_simulated_imu() -> None:
-    """Catches loads that are mixed up between recording and regression; a single mass is 3.5 % off here."""
+    """Catches loads that are mixed up between recording and regression; a single mass is 3.5 %
+    off here."""
     ideal = make_scenario("ideal")
     scenario = ideal.replace(imu=ideal.imu.replace(sine_error_rad=2e-3))
     envs = [
         gymnasium.make(
-            ID, reference=NARROW, scenario=scenario, pendulum=Pendulum().with_mass_scaled(mass), joint=CALM
+            ID,
+            reference=NARROW,
+            scenario=scenario,
+            pendulum=Pendulum().with_mass_scaled(mass),
+            joint=CALM,
         )
         for mass in (1.0, 0.5)
-    ]  # fmt: skip
+    ]
     results, points = identify(envs, seed=0)
     assert len(results) == 1
     assert results[0].stiffness_nm_per_rad == REST(1001.0, rel=5e-3)

@@ -1,4 +1,5 @@
-"""The IMU that computes its attitude: filter against closed forms, accelerometer against MuJoCo, errors of a walk."""
+"""The IMU that computes its attitude: filter against closed forms, accelerometer against MuJoCo,
+errors of a walk."""
 
 import math
 from typing import Any
@@ -20,16 +21,21 @@ from tests.three_joints import ARM
 
 G = 9.81
 EXACT = InertialSensor(
-    gyro_noise_density=0.0, gyro_bias_rad_s=0.0, accelerometer_noise_density=0.0, accelerometer_bias_m_s2=0.0,
+    gyro_noise_density=0.0,
+    gyro_bias_rad_s=0.0,
+    accelerometer_noise_density=0.0,
+    accelerometer_bias_m_s2=0.0,
     static_error_rad=0.0,
-)  # fmt: skip
+)
 STILL = np.zeros((1, 12), np.float32)
 SHORT = {"step_period": 1.1, "num_steps": 1}
 
 
 def filtered(up: Array, rate: Array, force: Array, duration_s: float, tau_s: float) -> Array:
-    """The vertical after some time of a constant rate and a constant force in the frame of the sensor."""
-    up, period_s = up.copy(), 0.004
+    """The vertical after some time of a constant rate and a constant force in the frame of the
+    sensor."""
+    up = up.copy()
+    period_s = 0.004
     for _ in range(round(duration_s / period_s)):
         kernels.complementary_filter(up, rate * period_s, force, 1.0 - math.exp(-period_s / tau_s))
     return up
@@ -37,11 +43,13 @@ def filtered(up: Array, rate: Array, force: Array, duration_s: float, tau_s: flo
 
 @pytest.mark.parametrize("time_s", [2.0, 10.0, 40.0])
 def test_an_acceleration_tilts_the_attitude_as_a_first_order_lag(time_s: float) -> None:
-    """Catches a wrong gain, a force that is not normalised, and a correction away from the accelerometer.
+    """Catches a wrong gain, a force that is not normalised, and a correction away from the
+    accelerometer.
 
     The angle to go, from the present vertical to that of the accelerometer, θ, obeys θ̇ = −sin θ/τ.
     """
-    a, tau = 0.5, 10.0
+    a = 0.5
+    tau = 10.0
     up = filtered(np.array([0.0, 0.0, 1.0]), np.zeros(3), np.array([0.0, a, G]), time_s, tau)
     roll, pitch, _ = kernels.attitude_by(*up)
     end = math.atan2(a, G)
@@ -52,9 +60,13 @@ def test_an_acceleration_tilts_the_attitude_as_a_first_order_lag(time_s: float) 
 
 
 @pytest.mark.parametrize(("axis", "angle"), [(0, 0), (1, 1)])
-def test_a_bias_of_the_gyroscope_tilts_it_by_bias_times_time_constant(axis: int, angle: int) -> None:
-    """Catches a rotation in the wrong direction: a positive rate about x is a growing roll, about y a growing pitch."""
-    tau, bias = 10.0, np.zeros(3)
+def test_a_bias_of_the_gyroscope_tilts_it_by_bias_times_time_constant(
+    axis: int, angle: int
+) -> None:
+    """Catches a rotation in the wrong direction: a positive rate about x is a growing roll,
+    about y a growing pitch."""
+    tau = 10.0
+    bias = np.zeros(3)
     bias[axis] = 1e-3
     force = np.array([0.0, 0.0, G])
     for time_s in (1.0, 10.0, 60.0):
@@ -70,7 +82,8 @@ def test_a_bias_of_the_gyroscope_tilts_it_by_bias_times_time_constant(axis: int,
 def test_the_gyroscope_alone_follows_any_rotation() -> None:
     """Catches a first-order integration, and a vertical that turns with the sensor."""
     rng = np.random.default_rng(0)
-    up, R = np.array([0.0, 0.0, 1.0]), Rotation.identity()
+    up = np.array([0.0, 0.0, 1.0])
+    R = Rotation.identity()
     for turned in rng.normal(scale=0.3, size=(50, 3)):
         R = R * Rotation.from_rotvec(turned)
         kernels.complementary_filter(up, turned, np.zeros(3), 0.0)
@@ -93,13 +106,16 @@ def test_the_mean_rate_is_that_of_the_rotation_between_two_attitudes() -> None:
 def truth(R: Rotation, velocity: Array) -> Any:
     """A row of the truth with an attitude and a velocity."""
     row = np.zeros(1, TRUTH)
-    row["quaternion"], row["pelvis_velocity"] = np.roll(R.as_quat(), 1), velocity
+    row["quaternion"] = np.roll(R.as_quat(), 1)
+    row["pelvis_velocity"] = velocity
     return row.view(np.recarray)[0]
 
 
 def test_a_tilted_sensor_at_rest_feels_gravity() -> None:
-    """Catches a specific force of the wrong sign, and one that is left in the frame of the world."""
-    R, force = Rotation.from_euler("ZYX", [0.7, -0.2, 0.3]), np.empty(3)
+    """Catches a specific force of the wrong sign, and one that is left in the frame of the
+    world."""
+    R = Rotation.from_euler("ZYX", [0.7, -0.2, 0.3])
+    force = np.empty(3)
     row = truth(R, np.zeros(3))
     kernels.specific_force(row, row, 0.004, G, force)
     np.testing.assert_allclose(force, R.inv().apply([0.0, 0.0, G]), atol=1e-12)
@@ -108,21 +124,25 @@ def test_a_tilted_sensor_at_rest_feels_gravity() -> None:
 
 
 def test_the_specific_force_is_that_of_mujocos_accelerometer() -> None:
-    """Catches a frame, a sign or a period: a thrown body that turns, with a force on it, against its own sensor."""
+    """Catches a frame, a sign or a period: a thrown body that turns, with a force on it, against
+    its own sensor."""
     xml = (
-        "<mujoco><option timestep='1e-4'/><worldbody><body pos='0 0 9'><freejoint/><site name='imu'/>"
-        "<geom size='.1 .2 .3' type='ellipsoid'/></body></worldbody>"
-        "<sensor><accelerometer site='imu'/></sensor></mujoco>"
+        "<mujoco><option timestep='1e-4'/><worldbody><body pos='0 0 9'><freejoint/><site"
+        " name='imu'/><geom size='.1 .2 .3'"
+        " type='ellipsoid'/></body></worldbody><sensor><accelerometer"
+        " site='imu'/></sensor></mujoco>"
     )
     model = mujoco.MjModel.from_xml_string(xml)
-    data, force = mujoco.MjData(model), np.empty(3)
+    data = mujoco.MjData(model)
+    force = np.empty(3)
     data.qvel[:] = [0.3, -0.2, 1.0, 0.5, -1.0, 0.8]
     data.xfrc_applied[1, :3] = [40.0, -25.0, 300.0]
 
     def now() -> Any:
         return truth(Rotation.from_quat(np.roll(data.qpos[3:7], -1)), data.qvel[:3].copy())
 
-    before, felt = now(), []
+    before = now()
+    felt = []
     for _ in range(40):
         mujoco.mj_step(model, data)
         felt.append(data.sensordata.copy())
@@ -135,12 +155,16 @@ def test_the_specific_force_is_that_of_mujocos_accelerometer() -> None:
 # In the walker.
 
 
-def shown_and_true(num_envs: int, steps: int, seed: int = 0, **arguments: Any) -> tuple[Array, Array, Any]:
-    """Roll and pitch by the IMU and of the pelvis, (steps + 1, num_envs, 2), and the environment, without offsets."""
+def shown_and_true(
+    num_envs: int, steps: int, seed: int = 0, **arguments: Any
+) -> tuple[Array, Array, Any]:
+    """Roll and pitch by the IMU and of the pelvis, (steps + 1, num_envs, 2), and the
+    environment, without offsets."""
     env = make_vector(num_envs=num_envs, **arguments)
     observation, info = env.reset(seed=seed)
     columns = env.unwrapped.task.observation_table.group("imu_attitude")
-    shown, true = [], []
+    shown = []
+    true = []
     for step in range(steps + 1):
         shown.append(observation[:, columns])
         true.append(np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1))
@@ -157,16 +181,20 @@ def test_the_imu_sits_at_the_origin_of_the_pelvis() -> None:
 
 
 def test_the_error_at_rest_is_that_of_the_data_sheet() -> None:
-    """Catches biases that are drawn twice or not at all: ±0.25° in roll and in pitch, independent, without a mean."""
+    """Catches biases that are drawn twice or not at all: ±0.25° in roll and in pitch,
+    independent, without a mean."""
     shown, true, _ = shown_and_true(256, 0, scenario="imu")
     error = (shown - true)[0]
-    assert np.sqrt(np.square(error).mean(axis=0)) == pytest.approx(math.radians(0.25), rel=5 / math.sqrt(2 * 256))
+    assert np.sqrt(np.square(error).mean(axis=0)) == pytest.approx(
+        math.radians(0.25), rel=5 / math.sqrt(2 * 256)
+    )
     assert np.abs(error.mean(axis=0)).max() < 5 * math.radians(0.25) / math.sqrt(256)
     assert abs(np.corrcoef(error.T)[0, 1]) < 5 / math.sqrt(256)
 
 
 def test_the_error_in_a_walk_is_within_that_of_the_data_sheet() -> None:
-    """±0.25° at rest, ±0.5° in motion: catches a filter that the walk throws off, and one that is not disturbed."""
+    """±0.25° at rest, ±0.5° in motion: catches a filter that the walk throws off, and one that
+    is not disturbed."""
     shown, true, env = shown_and_true(16, 500, scenario="imu", **SHORT)
     walking = env.unwrapped.task.plan.timing.walking[:501]
     # as old as the measurements are, against the truth of then
@@ -180,14 +208,21 @@ def test_the_error_in_a_walk_is_within_that_of_the_data_sheet() -> None:
 
 
 def test_what_moves_the_pelvis_disturbs_the_attitude() -> None:
-    """Catches a disturbance of the wrong sign or size: finite differences of the velocity, over g, over τ, summed."""
-    tau, period_s, steps = 200.0, 0.004, 400
+    """Catches a disturbance of the wrong sign or size: finite differences of the velocity, over
+    g, over τ, summed."""
+    tau = 200.0
+    period_s = 0.004
+    steps = 400
     env = make_vector(
-        num_envs=1, scenario=make_scenario("ideal").replace(inertial=EXACT.replace(time_constant_s=tau)), **SHORT
+        num_envs=1,
+        scenario=make_scenario("ideal").replace(inertial=EXACT.replace(time_constant_s=tau)),
+        **SHORT,
     )
     env.reset(seed=0)
     task = env.unwrapped.task
-    columns, error, velocity = task.observation_table.group("imu_attitude"), [], [np.zeros(3)]
+    columns = task.observation_table.group("imu_attitude")
+    error = []
+    velocity = [np.zeros(3)]
     for _ in range(steps):
         observation, *_, info = env.step(STILL)
         error.append(observation[0, columns] - [info["pelvis_roll"][0], info["pelvis_pitch"][0]])
@@ -201,17 +236,23 @@ def test_what_moves_the_pelvis_disturbs_the_attitude() -> None:
 
 
 def test_without_errors_a_robot_at_rest_shows_its_attitude() -> None:
-    """Catches an offset that is not drawn, a filter that starts elsewhere, and gravity of another size."""
-    shown, true, _ = shown_and_true(1, 10, scenario=make_scenario("ideal").replace(inertial=EXACT), step_period=3.0)
+    """Catches an offset that is not drawn, a filter that starts elsewhere, and gravity of
+    another size."""
+    shown, true, _ = shown_and_true(
+        1, 10, scenario=make_scenario("ideal").replace(inertial=EXACT), step_period=3.0
+    )
     np.testing.assert_allclose(shown, true, atol=1e-6)
     assert abs(true[0, 0, 1]) > 0.02  # pitched by its own weight
 
 
 def test_a_slower_imu_holds_what_a_faster_one_shows() -> None:
-    """Catches a filter that pauses with the output: the device filters on, and shows every fifth step."""
+    """Catches a filter that pauses with the output: the device filters on, and shows every fifth
+    step."""
     fast = make_scenario("nominal").replace(inertial=InertialSensor())
     slow = fast.replace(pelvis_imu=AttitudeSensor(rate_hz=50.0))
-    (all_shown, *_), (held, *_) = (shown_and_true(2, 52, scenario=scenario) for scenario in (fast, slow))
+    (all_shown, *_), (held, *_) = (
+        shown_and_true(2, 52, scenario=scenario) for scenario in (fast, slow)
+    )
     due = np.arange(53) // 5 * 5
     np.testing.assert_array_equal(held, all_shown[due])
 
@@ -220,10 +261,12 @@ def test_its_rate_has_bias_and_noise_of_the_gyroscope() -> None:
     """Catches the noise of `nominal` in its place, and a rate that is not shown."""
     sensor = InertialSensor(gyro_bias_rad_s=0.02, time_constant_s=1e-3)
     scenario = make_scenario("ideal").replace(inertial=sensor)
-    steps, worlds = 12, 128
+    steps = 12
+    worlds = 128
     env = make_vector(num_envs=worlds, scenario=scenario)
     env.reset(seed=0)
-    columns, seen = env.unwrapped.task.observation_table.group("imu_rate"), []
+    columns = env.unwrapped.task.observation_table.group("imu_rate")
+    seen = []
     for _ in range(steps):  # the robot stands
         observation, *_ = env.step(np.zeros((worlds, 12), np.float32))
         seen.append(observation[:, columns])
@@ -241,18 +284,28 @@ def test_its_attitude_has_bias_and_noise_of_the_accelerometer() -> None:
     With a time constant far below a control period the filter shows the accelerometer alone.
     """
     sensor = InertialSensor(
-        gyro_bias_rad_s=0.0, static_error_rad=0.05, accelerometer_bias_m_s2=0.1, time_constant_s=1e-6
+        gyro_bias_rad_s=0.0,
+        static_error_rad=0.05,
+        accelerometer_bias_m_s2=0.1,
+        time_constant_s=1e-6,
     )
-    steps, worlds = 12, 128
-    shown, true, env = shown_and_true(worlds, steps, scenario=make_scenario("ideal").replace(inertial=sensor))
+    steps = 12
+    worlds = 128
+    shown, true, env = shown_and_true(
+        worlds, steps, scenario=make_scenario("ideal").replace(inertial=sensor)
+    )
     bias = env.unwrapped.task._bias
     force = bias["specific_force"]
     # to the left is a positive roll, forward a negative pitch
     expected = bias["imu_attitude"] + np.stack([force[:, 1], -force[:, 0]], axis=1) / G
     error = (shown - true)[1:]
     noise = 100e-6 * math.sqrt(125.0)
-    assert (error - error.mean(axis=0)).std(axis=(0, 1)) == pytest.approx(noise * math.sqrt(11 / 12), rel=0.1)
-    np.testing.assert_allclose(error.mean(axis=0), expected, atol=0.03 * 0.1 / G + 5 * noise / math.sqrt(steps))
+    assert (error - error.mean(axis=0)).std(axis=(0, 1)) == pytest.approx(
+        noise * math.sqrt(11 / 12), rel=0.1
+    )
+    np.testing.assert_allclose(
+        error.mean(axis=0), expected, atol=0.03 * 0.1 / G + 5 * noise / math.sqrt(steps)
+    )
     assert force.std() == pytest.approx(0.1, rel=0.2)
 
 
@@ -269,7 +322,8 @@ def test_one_world_and_many_agree() -> None:
 
 
 def test_the_scenario_has_the_age_of_sensor() -> None:
-    """Catches measurements that are new where the issue asks for old ones, and robots taken for one and the same."""
+    """Catches measurements that are new where the issue asks for old ones, and robots taken for
+    one and the same."""
     scenario = make_scenario("imu")
     assert scenario.delay_steps == make_scenario("sensor").delay_steps == 1
     assert scenario.draws_robots
@@ -278,9 +332,11 @@ def test_the_scenario_has_the_age_of_sensor() -> None:
 
 
 def test_the_default_has_the_data_sheets_error_at_rest() -> None:
-    """Catches an offset that forgets the biases: together they are 0.25°, of which the biases alone are 0.12°."""
+    """Catches an offset that forgets the biases: together they are 0.25°, of which the biases
+    alone are 0.12°."""
     sensor = InertialSensor()
-    by_force, by_rate = sensor.accelerometer_bias_m_s2 / 9.80665, sensor.gyro_bias_rad_s * sensor.time_constant_s
+    by_force = sensor.accelerometer_bias_m_s2 / 9.80665
+    by_rate = sensor.gyro_bias_rad_s * sensor.time_constant_s
     assert math.hypot(by_force, by_rate, sensor.offset_rad) == pytest.approx(math.radians(0.25))
     assert math.degrees(math.hypot(by_force, by_rate)) == pytest.approx(0.118, abs=1e-3)
     with pytest.raises(ConfigurationError, match="static_error_rad must be at least"):
@@ -288,7 +344,8 @@ def test_the_default_has_the_data_sheets_error_at_rest() -> None:
 
 
 def pendulum(scenario: Any, **arguments: Any) -> Any:
-    """A testbed whose link has an IMU that computes its attitude, observed beside the accelerometer."""
+    """A testbed whose link has an IMU that computes its attitude, observed beside the
+    accelerometer."""
     sensors = ["link_imu", "accelerometer"]
     return gymnasium.make("elastic_env/Testbed-v0", scenario=scenario, sensors=sensors, **arguments)
 
@@ -296,7 +353,8 @@ def pendulum(scenario: Any, **arguments: Any) -> Any:
 def played(env: Any, steps: int) -> tuple[Array, list[dict[str, Any]]]:
     """Observations and infos of an episode without compensation."""
     observation, info = env.reset(seed=3)
-    observations, infos = [observation], [info]
+    observations = [observation]
+    infos = [info]
     for _ in range(steps):
         observation, _, _, _, info = env.step(np.zeros(1, np.float32))
         observations.append(observation)
@@ -310,13 +368,17 @@ SWING = {"kind": "sine", "amplitude": 0.3, "frequency_hz": 0.8}
 def test_the_links_accelerometer_is_that_of_mujoco() -> None:
     """Catches a wrong arm, a wrong sign, and a rate in the place of an acceleration.
 
-    With a very short time constant the filter shows the direction of the specific force. MuJoCo's accelerometer at the
-    same site knows that force at a physics step; ours is the mean over a control period, half of one older.
+    With a very short time constant the filter shows the direction of the specific force. MuJoCo's
+    accelerometer at the same site knows that force at a physics step; ours is the mean over a
+    control period, half of one older.
     """
-    fast = make_scenario("ideal").replace(inertial=EXACT.replace(time_constant_s=1e-3, bandwidth_hz=1.0))
+    fast = make_scenario("ideal").replace(
+        inertial=EXACT.replace(time_constant_s=1e-3, bandwidth_hz=1.0)
+    )
     fast = fast.replace(imu=AttitudeSensor(rate_hz=250.0))
     seen, infos = played(pendulum(fast, reference=SWING), 900)
-    x, z = seen[:, 7], seen[:, 9]
+    x = seen[:, 7]
+    z = seen[:, 9]
     by_mujoco = np.arctan2(x, z)
     q = np.array([info["link_angle"] for info in infos])
     half = (by_mujoco[1:] + by_mujoco[:-1]) / 2.0
@@ -326,7 +388,8 @@ def test_the_links_accelerometer_is_that_of_mujoco() -> None:
 
 
 def test_the_links_filter_without_errors_shows_the_link() -> None:
-    """Catches a gyroscope of the wrong sign or scale: with a long time constant the rate alone counts."""
+    """Catches a gyroscope of the wrong sign or scale: with a long time constant the rate alone
+    counts."""
     slow = make_scenario("ideal").replace(
         inertial=EXACT.replace(time_constant_s=1e6), imu=AttitudeSensor(rate_hz=250.0)
     )
@@ -337,16 +400,24 @@ def test_the_links_filter_without_errors_shows_the_link() -> None:
 
 
 def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
-    """Catches biases drawn twice or not at all, and a filter that has not settled when the episode begins."""
+    """Catches biases drawn twice or not at all, and a filter that has not settled when the
+    episode begins."""
     quiet = InertialSensor(gyro_noise_density=0.0, accelerometer_noise_density=0.0)
     scenario = make_scenario("ideal").replace(inertial=quiet)
     env = gymnasium.make_vec(
-        "elastic_env/Testbed-v0", num_envs=256, vectorization_mode="vector_entry_point", num_threads=1,
-        scenario=scenario, observe_link=True, reference="hold",
-    )  # fmt: skip
+        "elastic_env/Testbed-v0",
+        num_envs=256,
+        vectorization_mode="vector_entry_point",
+        num_threads=1,
+        scenario=scenario,
+        observe_link=True,
+        reference="hold",
+    )
     observation, info = env.reset(seed=0)
     error = observation[:, 6] - info["link_angle"]
-    assert np.sqrt(np.square(error).mean()) == pytest.approx(math.radians(0.25), rel=5 / math.sqrt(2 * 256))
+    assert np.sqrt(np.square(error).mean()) == pytest.approx(
+        math.radians(0.25), rel=5 / math.sqrt(2 * 256)
+    )
     for _ in range(100):
         observation, _, _, _, info = env.step(np.zeros((256, 1), np.float32))
     np.testing.assert_allclose(observation[:, 6] - info["link_angle"], error, rtol=0.0, atol=1e-6)
@@ -355,5 +426,7 @@ def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
 def test_robots_without_an_imu_on_the_link_refuse_its_scenario() -> None:
     """Catches a scenario that does nothing on the robot that it is asked of."""
     ARM.register()
-    with pytest.raises(ConfigurationError, match="about the IMU on a link, which arm does not have"):
+    with pytest.raises(
+        ConfigurationError, match="about the IMU on a link, which arm does not have"
+    ):
         gymnasium.make(ARM.id, scenario="imu")

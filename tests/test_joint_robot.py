@@ -1,4 +1,5 @@
-"""A robot of three joints that the package does not know: environments, scenarios, policies, commands, report."""
+"""A robot of three joints that the package does not know: environments, scenarios, policies,
+commands, report."""
 
 import copy
 import csv
@@ -41,7 +42,9 @@ def link_error(policy: str, **arguments: Any) -> float:
     return float(metrics_of(scalar(**arguments), policy)["link_error_rms_rad"])
 
 
-@pytest.mark.parametrize("scenario", [name for name in scenario_names(walks=False) if name != "imu"])
+@pytest.mark.parametrize(
+    "scenario", [name for name in scenario_names(walks=False) if name != "imu"]
+)
 def test_the_checkers_find_nothing_in_any_scenario(scenario: str) -> None:
     """Catches spaces, seeding and types that several joints break."""
     check_env(scalar(scenario=scenario).unwrapped, skip_render_check=True)
@@ -49,12 +52,14 @@ def test_the_checkers_find_nothing_in_any_scenario(scenario: str) -> None:
 
 
 def test_at_rest_the_links_hang_where_gravity_and_springs_have_them() -> None:
-    """Catches joints that are mixed up: K δ is the torque of MuJoCo's own gravity at the link angles."""
+    """Catches joints that are mixed up: K δ is the torque of MuJoCo's own gravity at the link
+    angles."""
     env = scalar(scenario="ideal", reference=STILL)
     observation, _ = env.reset(seed=0)
     for _ in range(400):
         observation, *_ = env.step(np.zeros(3, dtype=np.float32))
-    truth, model = env.unwrapped.truth(), rigid_arm().compile()
+    truth = env.unwrapped.truth()
+    model = rigid_arm().compile()
     data = mujoco.MjData(model)
     data.qpos[:] = truth.q[0]
     mujoco.mj_forward(model, data)
@@ -65,10 +70,12 @@ def test_at_rest_the_links_hang_where_gravity_and_springs_have_them() -> None:
 
 
 def test_a_spread_gives_every_joint_of_every_robot_a_stiffness_of_its_own() -> None:
-    """Catches springs that stay as they were, or as another world has them: MuJoCo's gravity at rest is the judge."""
+    """Catches springs that stay as they were, or as another world has them: MuJoCo's gravity at
+    rest is the judge."""
     worlds = vector(4, scenario="ideal+spread", reference=STILL, autoreset_mode="SameStep")
     model = rigid_arm().compile()
-    data, seen = mujoco.MjData(model), []
+    data = mujoco.MjData(model)
+    seen = []
     worlds.reset(seed=0)
     for _ in range(2):  # the second episodes have robots of their own
         for _ in range(400):
@@ -91,8 +98,11 @@ def test_a_spread_gives_every_joint_of_every_robot_a_stiffness_of_its_own() -> N
 
 
 def test_what_a_model_knows_a_compensator_takes_away() -> None:
-    """Catches a compensator that is of one joint: by the true model little is left, by a wrong one what it misses."""
-    without, statics, dynamics = (link_error(name, scenario="ideal") for name in ("uncompensated", "input", "dynamic"))
+    """Catches a compensator that is of one joint: by the true model little is left, by a wrong
+    one what it misses."""
+    without, statics, dynamics = (
+        link_error(name, scenario="ideal") for name in ("uncompensated", "input", "dynamic")
+    )
     assert statics < 0.25 * without
     assert dynamics < 0.05 * statics
     soft = link_error("uncompensated", scenario="ideal+soft")
@@ -104,8 +114,12 @@ def test_what_a_model_knows_a_compensator_takes_away() -> None:
 
 
 def test_worlds_of_a_vector_are_the_scalar_ones() -> None:
-    """Catches a world that depends on its neighbours; random references and homing errors are each world's own."""
-    arguments = {"scenario": "sensor", "reference": {"kind": "multisine", "duration_s": 0.2, "onset_s": 0.2}}
+    """Catches a world that depends on its neighbours; random references and homing errors are
+    each world's own."""
+    arguments = {
+        "scenario": "sensor",
+        "reference": {"kind": "multisine", "duration_s": 0.2, "onset_s": 0.2},
+    }
     many = vector(3, **arguments)
     seen = [many.reset(seed=5)[0]]
     action = np.full((3, 3), 0.01, dtype=np.float32)
@@ -157,11 +171,24 @@ def test_it_is_drawn() -> None:
 
 
 def test_the_commands_play_and_compare_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a command that knows two robots by name: the robot's file is all it needs, in workers too."""
+    """Catches a command that knows two robots by name: the robot's file is all it needs, in
+    workers too."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "arm.py").write_text(ROBOT.read_text())
     reference = "{kind: sine, amplitude: 0.3, duration_s: 1.0, onset_s: 0.5}"
-    main(["evaluate", "--env", "arm.py:ARM", "--policy", "dynamic", "--scenario", "soft", "--reference", reference])
+    main(
+        [
+            "evaluate",
+            "--env",
+            "arm.py:ARM",
+            "--policy",
+            "dynamic",
+            "--scenario",
+            "soft",
+            "--reference",
+            reference,
+        ]
+    )
     assert (tmp_path / "runs" / "evaluate" / "episodes.csv").is_file()
     (tmp_path / "arm.yaml").write_text(
         f"name: arm\nenv: arm.py:ARM\nreferences: [{reference}]\nscenarios: [nominal, soft]\n"

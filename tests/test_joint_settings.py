@@ -1,4 +1,5 @@
-"""Files of joints: one meaning for the environment and for the compensator, and what a model's drive says."""
+"""Files of joints: one meaning for the environment and for the compensator, and what a model's
+drive says."""
 
 import math
 import warnings
@@ -46,13 +47,18 @@ def compensator(joints: Any, **options: Any) -> PositionCompensator:
 
 def lead(joints: Any, **options: Any) -> float:
     """Of the shoulder over its torque, at a pose [rad/(N·m)]."""
-    made, q = compensator(joints, **options), np.array([0.5, 0.5])
+    made = compensator(joints, **options)
+    q = np.array([0.5, 0.5])
     return float((made.command(q) - q)[0] / made.torque(q)[0])
 
 
-def sag(joints: Any, policy: str = "uncompensated", scenario: str = "ideal", model: str = ARM) -> float:
+def sag(
+    joints: Any, policy: str = "uncompensated", scenario: str = "ideal", model: str = ARM
+) -> float:
     """Of the end effector at static poses, rms [m]."""
-    env = gymnasium.make("elastic_env/Robot-v0", model=model, joints=joints, scenario=scenario, reference=POSES)
+    env = gymnasium.make(
+        "elastic_env/Robot-v0", model=model, joints=joints, scenario=scenario, reference=POSES
+    )
     return float(metrics_of(env, policy)["end_effector_error_rms_m"])
 
 
@@ -68,7 +74,9 @@ def sag(joints: Any, policy: str = "uncompensated", scenario: str = "ideal", mod
         ("{}", 1.0 / 400.0),
     ],
 )
-def test_a_servo_means_the_same_to_compensator_and_environment(servo: str, expected: float, tmp_path: Path) -> None:
+def test_a_servo_means_the_same_to_compensator_and_environment(
+    servo: str, expected: float, tmp_path: Path
+) -> None:
     """Catches a servo that one of them does not read, and an integrator that nobody gave it."""
     file = written(tmp_path, f'"*": {{stiffness: 400, servo: {servo}}}\n"g*": held\n')
     assert lead(file) == pytest.approx(expected, rel=1e-12)
@@ -78,7 +86,8 @@ def test_a_servo_means_the_same_to_compensator_and_environment(servo: str, expec
 
 
 def test_a_position_gain_alone_sags_in_simulation_and_is_taken_back() -> None:
-    """Catches an integrator that holds what a P servo lets go. The judge is the balance of springs in series."""
+    """Catches an integrator that holds what a P servo lets go. The judge is the balance of
+    springs in series."""
     soft = {"*": {"stiffness": 400, "servo": {"position_gain": 800}}, "g*": "held"}
     config = configure_robot(ARM, soft, scenario="ideal", reference=POSES)
     plant = config.robot.plant(config)
@@ -94,7 +103,8 @@ def test_a_position_gain_alone_sags_in_simulation_and_is_taken_back() -> None:
 
 
 def test_held_joints_are_left_out_of_the_commands(tmp_path: Path) -> None:
-    """Catches a file that the environment takes and the compensator does not; torque in closed form."""
+    """Catches a file that the environment takes and the compensator does not; torque in closed
+    form."""
     made = compensator(written(tmp_path, '"*": 400\n"g*": held\n'))
     assert made.joints == ("j1", "j2")
     grip = 0.05 * np.array([np.sin(1.0) * 0.33 + np.cos(1.0) * x for x in (0.03, -0.03)])
@@ -102,7 +112,9 @@ def test_held_joints_are_left_out_of_the_commands(tmp_path: Path) -> None:
     shoulder = elbow - G * (0.15 + 0.3 + 0.03) * np.sin(0.5)
     np.testing.assert_allclose(made.torque([0.5, 0.5]), [shoulder, elbow], rtol=1e-9)
     assert list(configure_robot(ARM, tmp_path / "joints.yaml").joints) == TWO
-    with pytest.raises(ConfigurationError, match="'gl' is named by `joints`, and stiffness says that it is held"):
+    with pytest.raises(
+        ConfigurationError, match="'gl' is named by `joints`, and stiffness says that it is held"
+    ):
         PositionCompensator.from_model(
             mujoco.MjModel.from_xml_string(ARM), {"g*": "held", "j*": 4}, joints=["j1", "gl"]
         )
@@ -111,14 +123,22 @@ def test_held_joints_are_left_out_of_the_commands(tmp_path: Path) -> None:
 
 
 def test_what_a_file_leaves_out_is_rigid_and_said(tmp_path: Path) -> None:
-    """Catches a file of an identification of some joints, as `--joints` writes it, that the compensator refuses."""
+    """Catches a file of an identification of some joints, as `--joints` writes it, that the
+    compensator refuses."""
     file = written(tmp_path, "j2: {stiffness: 400}\n")
-    with pytest.warns(UserWarning, match="leaves out j1, gl, taken for rigid; say j1: rigid, j1: held or its stiff"):
+    with pytest.warns(
+        UserWarning,
+        match="leaves out j1, gl, taken for rigid; say j1: rigid, j1: held or its stiff",
+    ):
         made = compensator(file)
     q = np.array([0.5, 0.5, 0.0])
-    np.testing.assert_allclose((made.command(q) - q) / made.torque(q), [0.0, 1.0 / 400.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        (made.command(q) - q) / made.torque(q), [0.0, 1.0 / 400.0, 0.0], atol=1e-15
+    )
     assert list(configure_robot(ARM, file).joints) == ["j2"]
-    with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing; give 'j1' or a pattern"):
+    with pytest.raises(
+        ConfigurationError, match="stiffness of joint 'j1' is missing; give 'j1' or a pattern"
+    ):
         compensator({"j2": 400.0})
     with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing"):
         compensator(written(tmp_path, "gr: held\n"))
@@ -140,19 +160,28 @@ def test_rigid_joints_are_said_by_word_or_number(rigid: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ({"*": 400, "gr": 300}, "unknown joint or pattern of joints 'gr'; choose one of: j1, j2, gl"),
+        (
+            {"*": 400, "gr": 300},
+            "unknown joint or pattern of joints 'gr'; choose one of: j1, j2, gl",
+        ),
         ({"*": 400, "gx": "held"}, "unknown joint or pattern of joints 'gx'"),
         ({"*": {"stiffness": 400, "colour": 3}}, "joint 'j1':.*colour"),
         ({"*": {"stiffness": 400, "servo": {"kp": 3}}}, "joint 'j1':.*kp"),
-        ({"*": {"stiffness": 400, "servo": {"integral_gain": 0}}}, "servo of joint 'j1' gives way.*say its position"),
+        (
+            {"*": {"stiffness": 400, "servo": {"integral_gain": 0}}},
+            "servo of joint 'j1' gives way.*say its position",
+        ),
         ({"*": {"stiffness": "soft"}}, "joint 'j1':.*stiffness"),
-        ({"*": {"damping": 3}}, "stiffness of joint 'j1' is missing beside.*'damping'.*elastic identify --robot"),
+        (
+            {"*": {"damping": 3}},
+            "stiffness of joint 'j1' is missing beside.*'damping'.*elastic identify --robot",
+        ),
         ({"*": 1e-320}, "joint 'j1':.*stiffness must be at least"),
         ({"*": math.nan}, "joint 'j1':.*stiffness"),
         ({"*": "stiff"}, "joint 'j1':.*stiffness"),
         ({0: 400}, "unknown joint or pattern of joints 0"),
     ],
-)  # fmt: skip
+)
 def test_both_refuse_the_same_with_the_same_words(joints: Any, message: str) -> None:
     """Catches two readers that judge differently."""
     with pytest.raises(ConfigurationError, match=message):
@@ -163,16 +192,27 @@ def test_both_refuse_the_same_with_the_same_words(joints: Any, message: str) -> 
 
 def test_what_the_compensator_cannot_use_it_refuses_by_name() -> None:
     """Catches a dead band that stays without a word, and gains that are said twice."""
-    with pytest.raises(ConfigurationError, match=r"backlash of joint 'j1' is 0.002 rad.*0.001 rad remain"):
+    with pytest.raises(
+        ConfigurationError, match=r"backlash of joint 'j1' is 0.002 rad.*0.001 rad remain"
+    ):
         compensator({"*": {"stiffness": 400, "backlash": 2e-3}})
     with pytest.raises(ConfigurationError, match="servo of joint 'j1' is said twice"):
         compensator({"*": {"stiffness": 400, "servo": {"position_gain": 800}}}, position_gain=600.0)
-    full = {"stiffness": 400, "damping": 3, "rotor_inertia": 0.1, "coulomb_friction": 1.0, "viscous_friction": 2.0,
-            "encoder_counts_per_turn": 4096, "servo": {"velocity_gain": 3.0, "torque_limit": 9.0}}  # fmt: skip
+    full = {
+        "stiffness": 400,
+        "damping": 3,
+        "rotor_inertia": 0.1,
+        "coulomb_friction": 1.0,
+        "viscous_friction": 2.0,
+        "encoder_counts_per_turn": 4096,
+        "servo": {"velocity_gain": 3.0, "torque_limit": 9.0},
+    }
     assert lead({"j*": full, "gl": "held"}) == pytest.approx(1.0 / 400.0)
     rigid = {"*": {"stiffness": math.inf, "servo": {"position_gain": 800}}}
     assert lead(rigid | {"gl": "held"}) == pytest.approx(1.0 / 800.0)
-    with pytest.raises(ConfigurationError, match="'j1' is rigid and its servo gives way, which is not simulated"):
+    with pytest.raises(
+        ConfigurationError, match="'j1' is rigid and its servo gives way, which is not simulated"
+    ):
         configure_robot(ARM, rigid)
 
 
@@ -181,7 +221,9 @@ def test_names_that_look_like_something_else_are_names(tmp_path: Path) -> None:
     names = ["0", "no", "null", "1e3", 'a"b', "j[1]", "x*"]
     text = '"0": 1\n"no": 2\n"null": 3\n"1e3": 4\n\'a"b\': 5\n"j[1]": 6\n"x*": 7\n'
     found = read_joints(written(tmp_path, text), names)
-    assert {name: own.stiffness for name, own in found.items() if own} == {n: k for k, n in enumerate(names, 1)}
+    assert {name: own.stiffness for name, own in found.items() if own} == {
+        n: k for k, n in enumerate(names, 1)
+    }
 
 
 def test_a_name_goes_before_patterns_and_a_later_pattern_before_an_earlier_one() -> None:
@@ -199,12 +241,14 @@ DRIVEN = ARM.replace('<joint name="j1"', '<joint name="j1" armature="0.1" dampin
     '<joint name="j2"', '<joint name="j2" armature="0.1" damping="5"'
 )
 KV0 = DRIVEN.replace(
-    "</mujoco>", '<actuator><position joint="j1" kp="100"/><position joint="j2" kp="100"/></actuator></mujoco>'
+    "</mujoco>",
+    '<actuator><position joint="j1" kp="100"/><position joint="j2" kp="100"/></actuator></mujoco>',
 )
 
 
 def test_what_damps_a_servo_is_no_friction() -> None:
-    """Catches a rotor that swings for minutes in `ideal`, as its only damping is left out with the friction."""
+    """Catches a rotor that swings for minutes in `ideal`, as its only damping is left out with
+    the friction."""
     joints = {"j*": 400}
     config = configure_robot(KV0, joints)
     assert [one.servo.velocity_gain for one in config.joints.values() if one.servo] == [5.0, 5.0]
@@ -225,19 +269,24 @@ def test_what_damps_a_servo_is_no_friction() -> None:
         ('<position joint="j1" kp="100"/><motor joint="j1" damping="9"/>', 9.0, 5.0),
     ],
 )
-def test_the_velocity_gain_is_what_damps_the_servo(actuators: str, gain: float, friction: float) -> None:
+def test_the_velocity_gain_is_what_damps_the_servo(
+    actuators: str, gain: float, friction: float
+) -> None:
     """Catches damping that counts twice, or not at all: gains at the joint, in closed form."""
     model = DRIVEN.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
     joint = configure_robot(model, {"j*": 400}).joints["j1"]
     assert joint.servo is not None
     assert (joint.servo.velocity_gain, joint.viscous_friction) == (gain, friction)
-    given = configure_robot(model, {"j*": {"stiffness": 400, "servo": {"velocity_gain": 3}}}).joints["j1"]
+    given = configure_robot(
+        model, {"j*": {"stiffness": 400, "servo": {"velocity_gain": 3}}}
+    ).joints["j1"]
     assert given.servo is not None
     assert (given.servo.velocity_gain, given.viscous_friction) == (3.0, 5.0)
 
 
 def test_a_servo_that_nothing_damps_is_damped_and_said() -> None:
-    """Catches a swing that never ends, and an assumption without its value. Critical damping in closed form."""
+    """Catches a swing that never ends, and an assumption without its value. Critical damping in
+    closed form."""
     model = KV0.replace(' damping="5"', "")
     with pytest.warns(UserWarning, match="velocity_gain of j1 .* N·m·s/rad, critical damping"):
         joint = configure_robot(model, {"j*": 400}).joints["j1"]
@@ -257,7 +306,9 @@ def test_armature_of_an_actuator_is_rotor_inertia() -> None:
     compiled = mujoco.MjModel.from_xml_string(model)
     assert rotor_inertia(compiled, "j1") == pytest.approx(0.1 + 9.0 * 0.02)
     assert position_servo(compiled, "j1") is None
-    with_motor, without = (configure_robot(text, {"j*": 400}).joints["j1"] for text in (model, DRIVEN))
+    with_motor, without = (
+        configure_robot(text, {"j*": 400}).joints["j1"] for text in (model, DRIVEN)
+    )
     assert with_motor.rotor_inertia == pytest.approx(0.28)
     assert with_motor.servo is not None
     assert without.servo is not None
@@ -267,8 +318,12 @@ def test_armature_of_an_actuator_is_rotor_inertia() -> None:
 
 def test_a_force_range_that_pushes_one_way_is_refused_by_name() -> None:
     """Catches a limit that is ignored as if there were none."""
-    model = ARM.replace("</mujoco>", '<actuator><motor joint="j1" ctrlrange="0 20"/></actuator></mujoco>')
-    with pytest.raises(ConfigurationError, match=r"force range of joint 'j1' is 0 to 20.*say its torque_limit"):
+    model = ARM.replace(
+        "</mujoco>", '<actuator><motor joint="j1" ctrlrange="0 20"/></actuator></mujoco>'
+    )
+    with pytest.raises(
+        ConfigurationError, match=r"force range of joint 'j1' is 0 to 20.*say its torque_limit"
+    ):
         configure_robot(model, {"j*": 400})
     given = configure_robot(model, {"j*": {"stiffness": 400, "servo": {"torque_limit": 20}}})
     assert given.joints["j1"].servo is not None
@@ -280,7 +335,9 @@ def test_a_force_range_that_pushes_one_way_is_refused_by_name() -> None:
 
 def test_an_assumed_rotor_is_no_heavier_than_its_links() -> None:
     """Catches a rotor of 10 kg·m² beside a link of 0.35, for want of a number."""
-    with pytest.warns(UserWarning, match=r"rotor_inertia of j1 0\.\d+ kg·m².*K/\(100 rad/s\)² would be 10"):
+    with pytest.warns(
+        UserWarning, match=r"rotor_inertia of j1 0\.\d+ kg·m².*K/\(100 rad/s\)² would be 10"
+    ):
         joint = configure_robot(ARM, {"j*": 1e5}).joints["j1"]
     assert 0.2 < joint.rotor_inertia < 0.3
     with warnings.catch_warnings():
@@ -292,17 +349,21 @@ def test_an_assumed_rotor_is_no_heavier_than_its_links() -> None:
 
 @pytest.mark.parametrize("stiffness", [400, {"j1": 4000, "j2": 300}, 60])
 def test_assumed_joints_come_to_rest_in_the_time_that_poses_settle(stiffness: Any) -> None:
-    """Catches damping that fits the lightest link only, and an integrator that lets go for seconds."""
+    """Catches damping that fits the lightest link only, and an integrator that lets go for
+    seconds."""
     joints = stiffness if isinstance(stiffness, dict) else {"j*": stiffness}
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*does not rest")
-        without, left = sag(joints), sag(joints, "input")
+        without = sag(joints)
+        left = sag(joints, "input")
     assert left < 0.002 * without
 
 
 def test_joints_that_swing_where_they_are_scored_at_rest_are_named() -> None:
     """Catches a score at rest that is one of a swing, without a word."""
     restless = {"j*": {"stiffness": 400, "damping": 0.05}}
-    with pytest.warns(UserWarning, match=r"joint 'j\d' does not rest where it is scored.*longer settle_s") as said:
+    with pytest.warns(
+        UserWarning, match=r"joint 'j\d' does not rest where it is scored.*longer settle_s"
+    ) as said:
         sag(restless, "input")
     assert len([one for one in said if "does not rest" in str(one.message)]) == 1

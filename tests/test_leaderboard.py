@@ -1,4 +1,5 @@
-"""The leaderboard: who is in which track, what a cell holds, who is best, and that all of its forms agree."""
+"""The leaderboard: who is in which track, what a cell holds, who is best, and that all of its
+forms agree."""
 
 import csv
 import re
@@ -51,19 +52,26 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
 
 
-SOFT, IDEAL = [[4.0, 6.0], [3.0, 5.0], [8.0, 8.0], [1.0, 1.0], [2.0, 2.0]], [[1.0, 1.0]] * 5
+SOFT = [[4.0, 6.0], [3.0, 5.0], [8.0, 8.0], [1.0, 1.0], [2.0, 2.0]]
+IDEAL = [[1.0, 1.0]] * 5
 
 
 def played() -> list[Evaluation]:
     """Two bases, a residual and who reads more, at 3 s in three scenarios and at 1.6 s in one."""
     slow = [
-        cell("base", {"all": [8.0, 10.0]}, "soft"), cell("base", {"all": [3.0]}, "ideal"),
+        cell("base", {"all": [8.0, 10.0]}, "soft"),
+        cell("base", {"all": [3.0]}, "ideal"),
         cell("base", {"all": [2.0]}, "slope"),
-        cell("best", {"all": [4.0, None]}, "soft"), cell("best", {"all": [1.0]}, "ideal"),
+        cell("best", {"all": [4.0, None]}, "soft"),
+        cell("best", {"all": [1.0]}, "ideal"),
         cell("best", {"all": [1.0]}, "slope"),
-        *family(SOFT, "soft"), *family(IDEAL, "ideal"), *family([[5.0]] * 5, "slope"),
-    ]  # fmt: skip
-    sensor = [cell("sensor", {"all": [n]}, s) for n, s in ((7.0, "soft"), (2.0, "ideal"), (1.0, "slope"))]
+        *family(SOFT, "soft"),
+        *family(IDEAL, "ideal"),
+        *family([[5.0]] * 5, "slope"),
+    ]
+    sensor = [
+        cell("sensor", {"all": [n]}, s) for n, s in ((7.0, "soft"), (2.0, "ideal"), (1.0, "slope"))
+    ]
     named = PolicySpec(name="mine.py:make", label="sensor", track=Track.TORQUE_SENSORS)
     sensor = [Evaluation(e.condition.replace(policy=named), e.episodes) for e in sensor]
     return [*slow, *sensor, cell("base", {"all": [6.0]}, "soft", reference=1.6)]
@@ -79,12 +87,18 @@ _ROWS: list[Standing] = []
 
 def _rows() -> list[Standing]:
     found = played()
-    return standings(found, changes(found, GROUPS), GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2})
+    return standings(
+        found, changes(found, GROUPS), GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2}
+    )
 
 
 def row(policy: str, scope: str, reference: str = "3 s") -> Standing:
     """One of them, of the pelvis error."""
-    return next(s for s in rows() if (s.policy, s.scope, s.reference, s.metric) == (policy, scope, reference, METRIC))
+    return next(
+        s
+        for s in rows()
+        if (s.policy, s.scope, s.reference, s.metric) == (policy, scope, reference, METRIC)
+    )
 
 
 def change_to(paired: Paired | None) -> Estimate:
@@ -113,11 +127,14 @@ def titles(table: Table) -> list[str]:
 
 
 def test_a_score_is_a_mean_of_scenarios_and_of_training_seeds() -> None:
-    """Catches a mean over episodes where scenarios have different numbers, a median, and falls averaged in."""
+    """Catches a mean over episodes where scenarios have different numbers, a median, and falls
+    averaged in."""
     assert row("base", "both").score == Estimate((9.0 + 3.0) / 2.0)
     assert row("best", "both").score == Estimate((4.0 + 1.0) / 2.0)
     assert (row("best", "both").failed, row("best", "both").episodes) == (1, 3)
-    assert row("learned", "both").score == over_seeds([(s + 1.0) / 2.0 for s in (5.0, 4.0, 8.0, 1.0, 2.0)])
+    assert row("learned", "both").score == over_seeds(
+        [(s + 1.0) / 2.0 for s in (5.0, 4.0, 8.0, 1.0, 2.0)]
+    )
     assert (row("learned", "both").training_seeds, row("base", "both").training_seeds) == (5, 0)
 
 
@@ -126,24 +143,33 @@ def test_changes_to_the_base_are_those_of_the_statistics() -> None:
     found = played()
     for scope in ("both", "soft"):
         name = ("learned", scope, "3 s", METRIC)
-        (own,) = [c for c in changes(found, GROUPS) if (c.policy, c.scope, c.reference, c.column.metric) == name]
+        (own,) = [
+            c
+            for c in changes(found, GROUPS)
+            if (c.policy, c.scope, c.reference, c.column.metric) == name
+        ]
         assert row("learned", scope).base == Paired("base", own.relative, own.verdict)
     assert (row("base", "both").base, row("base", "both").rival) == (None, None)
 
 
 def test_a_residual_is_compared_with_the_best_of_each_column() -> None:
-    """Catches one rival for all columns, one that falls, one with further sensors, and changes of single scenarios."""
+    """Catches one rival for all columns, one that falls, one with further sensors, and changes
+    of single scenarios."""
     rivals = {scope: row("learned", scope).rival for scope in ("soft", "both", "ideal", "slope")}
     assert {scope: rival and rival.to for scope, rival in rivals.items()} == {
-        "soft": "base", "both": "base", "ideal": "best", "slope": "best",  # best falls in soft
-    }  # fmt: skip
+        "soft": "base",
+        "both": "base",
+        "ideal": "best",
+        "slope": "best",  # best falls in soft
+    }
     assert change_to(rivals["slope"]).value == pytest.approx(4.0)
     assert change_to(rivals["ideal"]).value == pytest.approx(0.0)
     assert rivals["both"] == row("learned", "both").base
 
 
 def test_columns_are_whole_groups_and_what_is_in_none() -> None:
-    """Catches a group that is shown though one of its scenarios is not played, and a scenario that nobody sees."""
+    """Catches a group that is shown though one of its scenarios is not played, and a scenario
+    that nobody sees."""
     assert titles(board(rows())) == ["both, 3 s", "all, 3 s", "soft, 1.6 s"]
     single = scenarios_board(rows())
     assert single is not None
@@ -160,18 +186,24 @@ def test_columns_are_whole_groups_and_what_is_in_none() -> None:
 def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
     """Catches a policy of one's own in the wrong track, and an order by name."""
     assert {name: list(own) for name, own in tracks(board(rows())).items()} == {
-        str(Track.STANDARD): ["best", "base"], str(Track.TORQUE_SENSORS): ["sensor"], str(Track.TRAINING): ["learned"],
-    }  # fmt: skip
+        str(Track.STANDARD): ["best", "base"],
+        str(Track.TORQUE_SENSORS): ["sensor"],
+        str(Track.TRAINING): ["learned"],
+    }
     condition = Condition(env="walker", policy=PolicySpec(name="mine.py:make"))
     assert condition.track is Track.STANDARD
-    with pytest.raises(ConfigurationError, match=r"track must be .*joint torque sensors.*got 'torque'"):
+    with pytest.raises(
+        ConfigurationError, match=r"track must be .*joint torque sensors.*got 'torque'"
+    ):
         PolicySpec(name="mine.py:make", track="torque")  # type: ignore[arg-type]
 
 
 def test_the_best_of_a_track_has_the_fewest_falls_first() -> None:
     """Catches a mark for who fell in the hard episodes, and a track without any."""
     standard, sensors, _ = tracks(board(rows())).values()
-    best, base, sensor = standard["best"], standard["base"], sensors["sensor"]
+    best = standard["best"]
+    base = standard["base"]
+    sensor = sensors["sensor"]
     assert [bolds(cells[0]) for cells in (best, base)] == [[False, False], [True, True]]
     assert [bolds(cell) for cell in sensor[:2]] == [[True, True]] * 2
     assert plain_text(best[0]) == "2500 / 2500 ✕1/3"
@@ -188,9 +220,18 @@ def bolds(cell: Cell) -> list[bool]:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(2.481, "2.48"), (11.24, "11.2"), (10.0, "10.0"), (9.999, "10.0"), (123.4, "123"), (0.5, "0.500"), (0.0, "0.00"),
-     (1234.0, "1234"), (float("nan"), "-")],
-)  # fmt: skip
+    [
+        (2.481, "2.48"),
+        (11.24, "11.2"),
+        (10.0, "10.0"),
+        (9.999, "10.0"),
+        (123.4, "123"),
+        (0.5, "0.500"),
+        (0.0, "0.00"),
+        (1234.0, "1234"),
+        (float("nan"), "-"),
+    ],
+)
 def test_figures_have_three_digits(value: float, text: str) -> None:
     """Catches 10 beside 11.2, and digits that nobody measured."""
     assert three_digits(value) == text
@@ -207,11 +248,15 @@ def test_all_forms_have_the_same_figures() -> None:
         write_report(Results("x", found, changes(found, GROUPS), folder, standings=rows()))
     again = read_leaderboard(table)
     (mine,), (theirs,) = (
-        [s for s in some if (s.policy, s.scope, s.metric) == ("learned", "soft", METRIC)] for some in (again, rows())
+        [s for s in some if (s.policy, s.scope, s.metric) == ("learned", "soft", METRIC)]
+        for some in (again, rows())
     )
     none = {"score": Estimate(0.0), "base": None, "rival": None, "step_us": 0.0}
     assert replace(mine, **none) == replace(theirs, **none)
-    for found_again, was in ((mine.score, theirs.score), (change_to(mine.rival), change_to(theirs.rival))):
+    for found_again, was in (
+        (mine.score, theirs.score),
+        (change_to(mine.rival), change_to(theirs.rival)),
+    ):
         bounds = [[e.value, e.low, e.high] for e in (found_again, was)]
         assert bounds[0] == pytest.approx(bounds[1], rel=1e-5)
     assert leaderboard_markdown(again) == leaderboard_markdown(rows())
@@ -228,7 +273,8 @@ def test_all_forms_have_the_same_figures() -> None:
     table = claims_table(rows())
     lines = [[plain_text(cell) for cell in line.cells] for line in table.rows]
     assert [head.title for head in table.heads[2:4]] == [
-        f"pelvis error rms, against {other}" for other in ("its base", "the best policy without learning")
+        f"pelvis error rms, against {other}"
+        for other in ("its base", "the best policy without learning")
     ]
     assert [line[:2] for line in lines] == [["learned", "both, 3 s"], ["learned", "all, 3 s"]]
     assert (lines[0][2].endswith("(base)"), lines[0][3]) == (True, "the same")
@@ -237,7 +283,8 @@ def test_all_forms_have_the_same_figures() -> None:
 
 
 def test_the_terminal_has_the_columns_that_it_has_room_for() -> None:
-    """Catches figures broken over lines, a column that is lost in silence, and a best that is not marked."""
+    """Catches figures broken over lines, a column that is lost in silence, and a best that is
+    not marked."""
     for width, is_whole in ((100, True), (60, False)):
         console = Console(width=width, record=True, file=StringIO())
         print_leaderboard(rows(), console)
@@ -253,22 +300,38 @@ def test_the_terminal_has_the_columns_that_it_has_room_for() -> None:
 
 
 def test_a_reference_is_played_in_its_own_scenarios() -> None:
-    """Catches a slow motion that is played everywhere, and one whose scenarios are those of another."""
+    """Catches a slow motion that is played everywhere, and one whose scenarios are those of
+    another."""
     values: dict[str, Any] = {
-        "name": "c", "env": "walker", "references": [3, 1.6], "scenarios": ["nominal", "soft"], "policies": ["input"],
-    }  # fmt: skip
+        "name": "c",
+        "env": "walker",
+        "references": [3, 1.6],
+        "scenarios": ["nominal", "soft"],
+        "policies": ["input"],
+    }
     config = CompareConfig(**values, reference_scenarios={"1.6 s": ["soft"]})
-    assert [(c.reference, c.scenario) for c in config.conditions()] == [(3, "nominal"), (3, "soft"), (1.6, "soft")]
+    assert [(c.reference, c.scenario) for c in config.conditions()] == [
+        (3, "nominal"),
+        (3, "soft"),
+        (1.6, "soft"),
+    ]
     for wrong, message in (
-        ({"1.6": ["soft"]}, "unknown reference with scenarios of its own '1.6'; choose one of: 3 s, 1.6 s"),
+        (
+            {"1.6": ["soft"]},
+            "unknown reference with scenarios of its own '1.6'; choose one of: 3 s, 1.6 s",
+        ),
         ({"1.6 s": ["slope"]}, "unknown scenario of '1.6 s' 'slope'"),
         ({"1.6 s": []}, "reference_scenarios of '1.6 s' must have a scenario"),
         ({"1.6 s": ["soft", "soft"]}, "the scenario of '1.6 s' 'soft' stands twice"),
     ):
         with pytest.raises(ConfigurationError, match=re.escape(message)):
             CompareConfig(**values, reference_scenarios=wrong)
-    with pytest.raises(ConfigurationError, match="a leaderboard is of simulated cells without a sweep"):
-        CompareConfig(**values, leaderboard=True, sweep=Sweep(option="stiffness_scale", values=[1, 2]))
+    with pytest.raises(
+        ConfigurationError, match="a leaderboard is of simulated cells without a sweep"
+    ):
+        CompareConfig(
+            **values, leaderboard=True, sweep=Sweep(option="stiffness_scale", values=[1, 2])
+        )
 
 
 def test_the_leaderboard_of_the_project_has_its_columns() -> None:
@@ -276,9 +339,14 @@ def test_the_leaderboard_of_the_project_has_its_columns() -> None:
     config = load_yaml(ROOT / "configs" / "leaderboard.yaml", CompareConfig)
     conditions = config.conditions()
     cells = {(c.reference_name, c.scenario) for c in conditions}
-    assert {r: sum(reference == r for reference, _ in cells) for r in ("3 s", "24 s", "1.6 s", "1.1 s")} == {
-        "3 s": 15, "24 s": 1, "1.6 s": 5, "1.1 s": 5,
-    }  # fmt: skip
+    assert {
+        r: sum(reference == r for reference, _ in cells) for r in ("3 s", "24 s", "1.6 s", "1.1 s")
+    } == {
+        "3 s": 15,
+        "24 s": 1,
+        "1.6 s": 5,
+        "1.1 s": 5,
+    }
     assert {len(scenarios) for scenarios in config.groups.values()} == {5, 3, 6}
     assert {c.track for c in conditions} >= set(Track)
 
@@ -308,9 +376,13 @@ class Scripted:
 
 
 def test_times_are_medians_of_rounds_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches one policy after the other, compiling that is timed, a mean, and times of the whole round."""
+    """Catches one policy after the other, compiling that is timed, a mean, and times of the
+    whole round."""
     monkeypatch.setattr(train.speed.step_times, "_Player", Scripted)
-    conditions = [Condition(env="walker", policy=PolicySpec(name="zero", label=title)) for title in ("a", "b", "a")]
+    conditions = [
+        Condition(env="walker", policy=PolicySpec(name="zero", label=title))
+        for title in ("a", "b", "a")
+    ]
     assert step_times(conditions, steps=10, rounds=3) == pytest.approx({"a": 2.0, "b": 5.0})
     assert Scripted.log == ["a", "b"] * 4 + ["close a", "close b"]
 
@@ -319,30 +391,38 @@ def test_times_are_medians_of_rounds_in_turn(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a leaderboard that the command does not write, and a user's policy that is not on it."""
+    """Catches a leaderboard that the command does not write, and a user's policy that is not on
+    it."""
     Path("mine.py").write_text(
         "import baselines\n\n\ndef make(env):\n    return baselines.make('uncompensated', env)\n"
     )
     content = {
-        "name": "board", "env": "walker", "references": [{"step_period": 1.1, "num_steps": 1}], "leaderboard": True,
-        "scenarios": ["ideal"], "groups": {"mixture": ["ideal"]},
+        "name": "board",
+        "env": "walker",
+        "references": [{"step_period": 1.1, "num_steps": 1}],
+        "leaderboard": True,
+        "scenarios": ["ideal"],
+        "groups": {"mixture": ["ideal"]},
         "policies": ["uncompensated", {"name": "mine.py:make", "track": "walks on this robot"}],
-    }  # fmt: skip
+    }
     Path("board.yaml").write_text(yaml.safe_dump(content))
 
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     monkeypatch.setattr(train.commands.compare, "run_conditions", run)
-    monkeypatch.setattr(train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1))
+    monkeypatch.setattr(
+        train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
+    )
     monkeypatch.setattr(train.commands.compare, "draw_figures", lambda *_: [])
     main(["compare", "board.yaml"])
     folder = Path("runs/board")
     with (folder / "leaderboard.csv").open(newline="") as file:
         found = [r for r in csv.DictReader(file) if r["pooled"] == "True" and r["metric"] == METRIC]
     assert [(r["policy"], r["track"]) for r in found] == [
-        ("uncompensated", "encoders, foot sensors and IMU"), ("mine.py:make", "walks on this robot"),
-    ]  # fmt: skip
+        ("uncompensated", "encoders, foot sensors and IMU"),
+        ("mine.py:make", "walks on this robot"),
+    ]
     assert found[0]["mean"] == found[1]["mean"]
     with (folder / "episodes.csv").open(newline="") as file:
         episodes = [float(r[METRIC]) for r in csv.DictReader(file)]

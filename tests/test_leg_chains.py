@@ -1,4 +1,5 @@
-"""Statics of the legs: MuJoCo's kinematics, bias forces and contact Jacobians, Pinocchio, finite differences."""
+"""Statics of the legs: MuJoCo's kinematics, bias forces and contact Jacobians, Pinocchio, finite
+differences."""
 
 import copy
 from collections.abc import Callable
@@ -42,18 +43,20 @@ def spider_spec() -> mujoco.MjSpec:
 
 def add_inertia(body: Any, generator: np.random.Generator) -> None:
     """A random mass with a turned inertia off the origin."""
-    body.mass, body.ipos, body.iquat = (
-        generator.uniform(0.5, 4.0),
-        generator.uniform(-0.2, 0.2, 3),
-        [0.7, 0.1, 0.5, 0.5],
-    )
-    body.inertia, body.explicitinertial = generator.uniform(0.02, 0.03, 3), True
+    body.mass = generator.uniform(0.5, 4.0)
+    body.ipos = generator.uniform(-0.2, 0.2, 3)
+    body.iquat = [0.7, 0.1, 0.5, 0.5]
+    body.inertia = generator.uniform(0.02, 0.03, 3)
+    body.explicitinertial = True
 
 
 SPIDER_MODEL = spider_spec().compile()
 MODELS = {
     "thormang": (ROBOT.rigid, [list(LEG_JOINTS[:6]), list(LEG_JOINTS[6:])]),
-    "loaded thormang": (biped(Thormang(torso_load_kg=5.0)).rigid, [list(LEG_JOINTS[:6]), list(LEG_JOINTS[6:])]),
+    "loaded thormang": (
+        biped(Thormang(torso_load_kg=5.0)).rigid,
+        [list(LEG_JOINTS[:6]), list(LEG_JOINTS[6:])],
+    ),
     "spider": (SPIDER_MODEL, SPIDER),
 }
 
@@ -66,15 +69,18 @@ class Posed:
         self.model, self.legs = MODELS[name]
         self.data = mujoco.MjData(self.model)
         self.q = generator.uniform(-1.2, 1.2, (len(self.legs), len(self.legs[0])))
-        self.data.qpos[:3], self.data.qpos[3:7] = generator.normal(size=3), generator.normal(size=4)
+        self.data.qpos[:3] = generator.normal(size=3)
+        self.data.qpos[3:7] = generator.normal(size=4)
         self.data.qpos[3:7] /= np.linalg.norm(self.data.qpos[3:7])
         self.joints = np.array([[self.model.joint(joint).id for joint in leg] for leg in self.legs])
         self.feet = self.model.jnt_bodyid[self.joints[:, -1]]
         self.set(self.q)
-        self.pelvis, self.R = self.data.qpos[:3].copy(), self.data.xmat[1].reshape(3, 3).copy()
+        self.pelvis = self.data.qpos[:3].copy()
+        self.R = self.data.xmat[1].reshape(3, 3).copy()
         self.gravity = self.model.opt.gravity @ self.R
         self.force, self.point_of_foot, self.moment = generator.normal(size=(3, len(self.legs), 3))
-        self.force, self.moment = 300.0 * self.force, 20.0 * self.moment
+        self.force = 300.0 * self.force
+        self.moment = 20.0 * self.moment
 
     def set(self, q: Array) -> None:
         """Move the legs."""
@@ -91,11 +97,14 @@ class Posed:
         return ankle + (R @ self.point_of_foot[..., None])[..., 0]
 
     def torque(self, q: Array, moment: bool = False) -> Array:
-        """Bias force of the rigid robot less JᵀF of forces that are fixed to the pelvis frame, (L, J)."""
+        """Bias force of the rigid robot less JᵀF of forces that are fixed to the pelvis frame,
+        (L, J)."""
         self.set(q)
         torque = self.data.qfrc_bias.copy()
         for leg, foot in enumerate(self.feet):
-            point = self.data.xpos[foot] + self.data.xmat[foot].reshape(3, 3) @ self.point_of_foot[leg]
+            point = (
+                self.data.xpos[foot] + self.data.xmat[foot].reshape(3, 3) @ self.point_of_foot[leg]
+            )
             translation, rotation = np.zeros((2, 3, self.model.nv))
             mujoco.mj_jac(self.model, self.data, translation, rotation, point, foot)
             torque -= translation.T @ self.R @ self.force[leg]
@@ -110,18 +119,25 @@ def test_feet_are_where_mujoco_has_them(name: str, seed: int) -> None:
     """Catches a link that turns about the wrong axis or sense, or whose offset is lost."""
     posed = Posed(name, seed)
     ankle, R = foot_frames(LegChains(posed.model, posed.legs), posed.q)
-    np.testing.assert_allclose(ankle, posed.seen(posed.data.xpos[posed.feet] - posed.pelvis), rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(R, posed.R.T @ posed.data.xmat[posed.feet].reshape(-1, 3, 3), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        ankle, posed.seen(posed.data.xpos[posed.feet] - posed.pelvis), rtol=0.0, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        R, posed.R.T @ posed.data.xmat[posed.feet].reshape(-1, 3, 3), rtol=0.0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_center_of_mass_is_that_of_mujoco_and_of_pinocchio(name: str) -> None:
-    """Catches a body of the trunk that is left out, counted twice, or not turned into the pelvis frame."""
+    """Catches a body of the trunk that is left out, counted twice, or not turned into the pelvis
+    frame."""
     for seed in range(5):
         posed = Posed(name, seed)
         chains = LegChains(posed.model, posed.legs)
         com = chains.center_of_mass(posed.q)
-        np.testing.assert_allclose(com, posed.seen(posed.data.subtree_com[0] - posed.pelvis), rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            com, posed.seen(posed.data.subtree_com[0] - posed.pelvis), rtol=0.0, atol=1e-12
+        )
         assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(posed.model), rel=1e-14)
         names = [joint for leg in posed.legs for joint in leg]
         level = FloatingBody(posed.model, names).center_of_mass(posed.q.reshape(1, -1))[0]
@@ -136,7 +152,9 @@ def test_holding_torque_is_the_bias_force_less_the_contact_forces(name: str) -> 
         chains = LegChains(posed.model, posed.legs)
         torque = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains))
         np.testing.assert_allclose(torque, posed.torque(posed.q), rtol=0.0, atol=1e-9)
-        torque = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains), posed.moment)
+        torque = holding_torque(
+            chains, posed.q, posed.gravity, posed.force, posed.point(chains), posed.moment
+        )
         np.testing.assert_allclose(torque, posed.torque(posed.q, moment=True), rtol=0.0, atol=1e-9)
         bias = posed.data.qfrc_bias[posed.model.jnt_dofadr[posed.joints]]
         unloaded = LegLoads(chains.posture(posed.q), posed.gravity).torque()
@@ -144,10 +162,14 @@ def test_holding_torque_is_the_bias_force_less_the_contact_forces(name: str) -> 
 
 
 def test_holding_torque_is_that_of_pinocchio() -> None:
-    """Catches a slip that MuJoCo's conventions would share: gravity torques of the other engine, pelvis level."""
+    """Catches a slip that MuJoCo's conventions would share: gravity torques of the other engine,
+    pelvis level."""
     q = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 12))
-    still, rest = np.zeros((20, 3)), np.zeros((20, 12))
-    _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(q, still, rest, still, rest)
+    still = np.zeros((20, 3))
+    rest = np.zeros((20, 12))
+    _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(
+        q, still, rest, still, rest
+    )
     torque = LegLoads(ROBOT.chains.posture(q.reshape(20, 2, 6)), ROBOT.rigid.opt.gravity).torque()
     np.testing.assert_allclose(torque.reshape(20, 12), expected, rtol=0.0, atol=1e-10)
 
@@ -155,44 +177,58 @@ def test_holding_torque_is_that_of_pinocchio() -> None:
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("legs_weigh", [True, False])
 def test_a_mass_in_the_foot_is_a_force_that_gravity_directs(name: str, legs_weigh: bool) -> None:
-    """Catches a mass whose lever, sign or carrying links are wrong, and weightless legs that still weigh."""
+    """Catches a mass whose lever, sign or carrying links are wrong, and weightless legs that
+    still weigh."""
     for seed in range(5):
         posed = Posed(name, seed)
-        chains, mass = LegChains(posed.model, posed.legs), np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
+        chains = LegChains(posed.model, posed.legs)
+        mass = np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
         posed.force = mass[:, None] * posed.gravity
         expected = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains))
         if not legs_weigh:
             expected -= LegLoads(chains.posture(posed.q), posed.gravity).torque()
-        statics = LegLoads(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot, legs_weigh=legs_weigh)
+        statics = LegLoads(
+            chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot, legs_weigh=legs_weigh
+        )
         np.testing.assert_allclose(statics.torque(), expected, rtol=0.0, atol=1e-9)
         assert np.abs(expected).max() > 50.0
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_feet_that_a_sensor_weighs_weigh_nothing(name: str) -> None:
-    """Catches feet that still count in the center of mass, the torques or the mass, and links that count no more."""
+    """Catches feet that still count in the center of mass, the torques or the mass, and links
+    that count no more."""
     model, legs = MODELS[name]
     footless = copy.copy(model)
     footless.body_mass[[model.jnt_bodyid[model.joint(leg[-1]).id] for leg in legs]] = 0.0
-    chains, expected = LegChains(model, legs, feet_weigh=False), LegChains(footless, legs)
+    chains = LegChains(model, legs, feet_weigh=False)
+    expected = LegChains(footless, legs)
     q = np.random.default_rng(4).uniform(-1.0, 1.0, (5, len(legs), len(legs[0])))
     assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(footless), rel=1e-12)
     assert chains.mass < mujoco.mj_getTotalmass(model) - 1.0
-    np.testing.assert_allclose(chains.center_of_mass(q), expected.center_of_mass(q), rtol=0.0, atol=1e-12)
-    one, other = (LegLoads(legs.posture(q), model.opt.gravity).torque() for legs in (chains, expected))
+    np.testing.assert_allclose(
+        chains.center_of_mass(q), expected.center_of_mass(q), rtol=0.0, atol=1e-12
+    )
+    one, other = (
+        LegLoads(legs.posture(q), model.opt.gravity).torque() for legs in (chains, expected)
+    )
     np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
     assert ROBOT.chains_above_feet.mass == pytest.approx(57.0 - 2.0 * 1.616, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["thormang", "spider"])
 def test_gradient_of_weights_is_the_difference_quotient_of_mujocos_torque(name: str) -> None:
-    """Catches a force that turns with the foot, a point that stays behind, and a term of j < i that is not mirrored."""
+    """Catches a force that turns with the foot, a point that stays behind, and a term of j < i
+    that is not mirrored."""
     h = 1e-5
     for seed in range(3):
         posed = Posed(name, seed)
-        chains, mass = LegChains(posed.model, posed.legs), np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
+        chains = LegChains(posed.model, posed.legs)
+        mass = np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
         posed.force = mass[:, None] * posed.gravity
-        gradient = LegLoads(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot).gradient()
+        gradient = LegLoads(
+            chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot
+        ).gradient()
         legs, joints = posed.q.shape
         for j in range(joints):
             step = np.zeros((legs, joints))
@@ -205,9 +241,11 @@ def test_gradient_of_weights_is_the_difference_quotient_of_mujocos_torque(name: 
 
 @pytest.mark.parametrize("name", ["thormang", "spider"])
 def test_gradient_of_wrenches_is_the_difference_quotient_of_jacobians(name: str) -> None:
-    """Catches a wrench that keeps its direction while the foot turns, and a term on or below the diagonal.
+    """Catches a wrench that keeps its direction while the foot turns, and a term on or below the
+    diagonal.
 
-    The torque of the quotient is MuJoCo's −JᵀF with the wrench turned into the world by MuJoCo's foot.
+    The torque of the quotient is MuJoCo's −JᵀF with the wrench turned into the world by MuJoCo's
+    foot.
     """
     h = 1e-6
 
@@ -215,8 +253,13 @@ def test_gradient_of_wrenches_is_the_difference_quotient_of_jacobians(name: str)
         posed.set(q)
         found = np.zeros(posed.model.nv)
         for leg, foot in enumerate(posed.feet):
-            R, translation, rotation = posed.data.xmat[foot].reshape(3, 3), *np.zeros((2, 3, posed.model.nv))
-            mujoco.mj_jac(posed.model, posed.data, translation, rotation, posed.data.xpos[foot], foot)
+            R, translation, rotation = (
+                posed.data.xmat[foot].reshape(3, 3),
+                *np.zeros((2, 3, posed.model.nv)),
+            )
+            mujoco.mj_jac(
+                posed.model, posed.data, translation, rotation, posed.data.xpos[foot], foot
+            )
             found -= translation.T @ R @ posed.force[leg] + rotation.T @ R @ posed.moment[leg]
         return found[posed.model.jnt_dofadr[posed.joints]]
 
@@ -236,9 +279,11 @@ def test_gradient_of_wrenches_is_the_difference_quotient_of_jacobians(name: str)
 
 
 def torques_of_figure_1(inward: float) -> dict[str, float]:
-    """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, the center of mass over the ZMP."""
+    """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, the center of mass over the
+    ZMP."""
     ankles = np.array([[0.0, 0.105, 0.1], [0.0, -0.105, 0.15]])
-    zmp, pelvis = np.array([0.0, 0.105 - inward, 0.0]), np.array([0.0, 0.0, 0.66])
+    zmp = np.array([0.0, 0.105 - inward, 0.0])
+    pelvis = np.array([0.0, 0.0, 0.66])
     for _ in range(50):
         q = ROBOT.joint_angles(pelvis, ankles).reshape(2, 6)
         com = ROBOT.chains.center_of_mass(q)
@@ -257,7 +302,8 @@ def torques_of_figure_1(inward: float) -> dict[str, float]:
 def test_stance_leg_of_figure_1_holds_what_the_facts_say(
     inward: float, hip_roll: float, ankle_roll: float, knee: float, hip_pitch: float
 ) -> None:
-    """Catches the force at the ankle axis in place of the ZMP: hip roll 60.4 and ankle roll 0 N·m in the middle row."""
+    """Catches the force at the ankle axis in place of the ZMP: hip roll 60.4 and ankle roll 0
+    N·m in the middle row."""
     torque = torques_of_figure_1(inward)
     assert abs(torque["l_hip_roll"]) == pytest.approx(hip_roll, abs=0.1)
     assert abs(torque["l_ankle_roll"]) == pytest.approx(ankle_roll, abs=0.1)
@@ -289,8 +335,11 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -
         wrenches = LegLoads(legs, wrench=(force[row], moment[row]))
         return [
             *chains.com_and_feet(q[row], (0.1, -0.2, 0.3)),
-            weights.torque(), weights.gradient(), wrenches.torque(), wrenches.gradient(),
-        ]  # fmt: skip
+            weights.torque(),
+            weights.gradient(),
+            wrenches.torque(),
+            wrenches.gradient(),
+        ]
 
     whole = everything(())
     shapes = [(3,), (3, 3), (3, 4), (3, 4, 4), (3, 4), (3, 4, 4)]
@@ -303,8 +352,10 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -
 def test_one_gravity_serves_a_batch() -> None:
     """Catches a gravity that is needed for each world although it is the same in all of them."""
     generator = np.random.default_rng(7)
-    legs, gravity = ROBOT.chains.posture(generator.normal(size=(4, 2, 6))), np.array([0.1, 0.2, -9.8])
-    one, each = LegLoads(legs, gravity), LegLoads(legs, np.tile(gravity, (4, 1)))
+    legs = ROBOT.chains.posture(generator.normal(size=(4, 2, 6)))
+    gravity = np.array([0.1, 0.2, -9.8])
+    one = LegLoads(legs, gravity)
+    each = LegLoads(legs, np.tile(gravity, (4, 1)))
     np.testing.assert_array_equal(one.torque(), each.torque())
     np.testing.assert_array_equal(one.gradient(), each.gradient())
 
@@ -337,12 +388,15 @@ def reversed_everywhere(spec: mujoco.MjSpec) -> None:
 
 def other_order(spec: mujoco.MjSpec) -> None:
     """Two hinges in another order on one leg."""
-    spec.joint("leg1_joint0").axis, spec.joint("leg1_joint1").axis = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+    spec.joint("leg1_joint0").axis = [1.0, 0.0, 0.0]
+    spec.joint("leg1_joint1").axis = [0.0, 1.0, 0.0]
 
 
 def doubled(spec: mujoco.MjSpec) -> None:
     """A link with two hinges."""
-    spec.body("leg0_joint2_link").add_joint(name="second", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[1.0, 0.0, 0.0])
+    spec.body("leg0_joint2_link").add_joint(
+        name="second", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[1.0, 0.0, 0.0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -350,8 +404,11 @@ def doubled(spec: mujoco.MjSpec) -> None:
     [turned, shifted, slanted, reversed_axis, reversed_everywhere, other_order, doubled],
     ids=lambda f: f.__name__,
 )
-def test_a_leg_that_the_formulas_do_not_cover_is_refused(change: Callable[[mujoco.MjSpec], None]) -> None:
-    """Catches torques of a leg whose links are turned, or whose hinges are not where or as they are assumed."""
+def test_a_leg_that_the_formulas_do_not_cover_is_refused(
+    change: Callable[[mujoco.MjSpec], None],
+) -> None:
+    """Catches torques of a leg whose links are turned, or whose hinges are not where or as they
+    are assumed."""
     spec = spider_spec()
     LegChains(spec.compile(), SPIDER)
     change(spec)

@@ -46,14 +46,16 @@ def test_a_batch_of_any_shape_is_its_rows() -> None:
     q = random_angles(12).reshape(3, 4, 6)
     angles = leg_angles(LEG, *foot_pose(LEG, q))
     assert angles.shape == (3, 4, 6)
-    np.testing.assert_allclose(angles[1, 2], leg_angles(LEG, *foot_pose(LEG, q[1, 2])), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        angles[1, 2], leg_angles(LEG, *foot_pose(LEG, q[1, 2])), rtol=0.0, atol=1e-12
+    )
 
 
 def test_a_tilt_is_a_roll_and_then_a_pitch_as_mujoco_turns() -> None:
     """Catches the other order, a sign, and the inverse."""
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><joint axis="0 1 0"/><joint axis="1 0 0"/><geom size="0.01"/></body></worldbody>'
-        "</mujoco>"
+        '<mujoco><worldbody><body><joint axis="0 1 0"/><joint axis="1 0 0"/><geom'
+        ' size="0.01"/></body></worldbody></mujoco>'
     )
     data = mujoco.MjData(model)
     attitude = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 2))

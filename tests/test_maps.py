@@ -1,4 +1,5 @@
-"""Maps over two axes: what an axis may vary, what a cell plays, who is best, and the pictures of it."""
+"""Maps over two axes: what an axis may vary, what a cell plays, who is best, and the pictures of
+it."""
 
 import csv
 import math
@@ -29,8 +30,13 @@ from train.report.change_tables import write_maps
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-K, LOAD, OFFSET = "scenario.stiffness_scale", "scenario.torso_load_kg", "scenario.pelvis_imu.bias_spread_rad"
-AXES: dict[str, Any] = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5, 10]}}
+K = "scenario.stiffness_scale"
+LOAD = "scenario.torso_load_kg"
+OFFSET = "scenario.pelvis_imu.bias_spread_rad"
+AXES: dict[str, Any] = {
+    "x": {"what": K, "values": [0.7, 1]},
+    "y": {"what": LOAD, "values": [0, 5, 10]},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +47,9 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def walker_map(axes: dict[str, Any], **more: Any) -> CompareConfig:
     """A comparison with a map."""
-    return CompareConfig(**{"name": "m", "env": "walker", "policies": ["input"], "map": axes, **more})
+    return CompareConfig(
+        **{"name": "m", "env": "walker", "policies": ["input"], "map": axes, **more}
+    )
 
 
 def at(evaluations: list[Evaluation], **fields: float) -> list[Evaluation]:
@@ -53,9 +61,12 @@ def at(evaluations: list[Evaluation], **fields: float) -> list[Evaluation]:
 
 
 def test_a_map_plays_every_pair_of_values_in_the_environment() -> None:
-    """Catches a diagonal in the place of a grid, a value that stays in the name, and one that reaches the policy."""
+    """Catches a diagonal in the place of a grid, a value that stays in the name, and one that
+    reaches the policy."""
     conditions = walker_map(AXES, scenarios=["sensor"]).conditions()
-    assert [tuple(c.swept.values()) for c in conditions] == [(k, m) for k in (0.7, 1.0) for m in (0.0, 5.0, 10.0)]
+    assert [tuple(c.swept.values()) for c in conditions] == [
+        (k, m) for k in (0.7, 1.0) for m in (0.0, 5.0, 10.0)
+    ]
     played = conditions[1].arguments["scenario"]
     assert played == make_scenario("sensor").replace(stiffness_scale=0.7, torso_load_kg=5.0)
     assert conditions[1].policy_options == {}
@@ -69,21 +80,28 @@ def test_a_field_within_a_sensor_is_varied_and_the_others_stay() -> None:
     found = varied(nominal, {OFFSET: 0.002})
     assert found == nominal.replace(pelvis_imu=nominal.pelvis_imu.replace(bias_spread_rad=0.002))
     assert scenario_fields()[OFFSET] == ("half-width of a further offset, drawn per episode", "rad")
-    assert not {"scenario.name", "scenario.encoder_counts", "scenario.imu"} & scenario_fields().keys()
+    assert (
+        not {"scenario.name", "scenario.encoder_counts", "scenario.imu"} & scenario_fields().keys()
+    )
 
 
 def test_an_axis_of_the_motion_gives_the_references() -> None:
-    """Catches a gait axis beside references that contradict it, and a resolved configuration that cannot be read."""
+    """Catches a gait axis beside references that contradict it, and a resolved configuration
+    that cannot be read."""
     axes = {"x": AXES["x"], "y": {"what": "step_period", "values": [3, [0.8, 0.6, 0.8]]}}
     config = walker_map(axes)
     assert [(c.reference, c.swept[K]) for c in config.conditions()] == [
-        (3, 0.7), (3, 1.0), ([0.8, 0.6, 0.8], 0.7), ([0.8, 0.6, 0.8], 1.0),
-    ]  # fmt: skip
+        (3, 0.7),
+        (3, 1.0),
+        ([0.8, 0.6, 0.8], 0.7),
+        ([0.8, 0.6, 0.8], 1.0),
+    ]
     assert config.map is not None
     assert config.map.y.ticks(config.conditions()[0].environment) == ["3", "2.2"]
     assert CompareConfig(**config.model_dump(mode="json")) == config
     with pytest.raises(
-        ConfigurationError, match=r"varies the step_period, so its values are the references; leave out"
+        ConfigurationError,
+        match=r"varies the step_period, so its values are the references; leave out",
     ):
         walker_map(axes, references=[3])
 
@@ -91,10 +109,19 @@ def test_an_axis_of_the_motion_gives_the_references() -> None:
 @pytest.mark.parametrize(
     ("axis", "message"),
     [
-        ({"what": "stiffness_scale", "values": [1, 2]}, "unknown axis 'stiffness_scale' of map.y.*is varied by sweep"),
+        (
+            {"what": "stiffness_scale", "values": [1, 2]},
+            "unknown axis 'stiffness_scale' of map.y.*is varied by sweep",
+        ),
         ({"what": "scenario.slope", "values": [0, 0.1]}, "Did you mean 'scenario.slope_rad'"),
-        ({"what": "reference", "values": [0, 1]}, "choose one of: step_period, scenario.stiffness_scale"),
-        ({"what": "scenario.slope_rad", "values": [0, 0.6]}, r"slope_rad must be a finite number >= 0 and < 0.5 \[rad"),
+        (
+            {"what": "reference", "values": [0, 1]},
+            "choose one of: step_period, scenario.stiffness_scale",
+        ),
+        (
+            {"what": "scenario.slope_rad", "values": [0, 0.6]},
+            r"slope_rad must be a finite number >= 0 and < 0.5 \[rad",
+        ),
         ({"what": LOAD, "values": [0, "heavy"]}, "values of map.y must be numbers, got 'heavy'"),
         ({"what": LOAD, "values": [0, True]}, "values of map.y must be numbers, got True"),
         ({"what": LOAD, "values": [5, 5]}, "the value 5 of map.y stands twice"),
@@ -103,7 +130,8 @@ def test_an_axis_of_the_motion_gives_the_references() -> None:
     ],
 )
 def test_axes_that_cannot_be_are_refused(axis: dict[str, Any], message: str) -> None:
-    """Catches an hour of work for a misspelt axis, and an error that does not say what an axis can be."""
+    """Catches an hour of work for a misspelt axis, and an error that does not say what an axis
+    can be."""
     with pytest.raises(ConfigurationError, match=message):
         walker_map({"x": AXES["x"], "y": axis})
 
@@ -124,7 +152,10 @@ def test_the_maps_that_come_with_the_project_can_be_played(name: str) -> None:
     assert config.map is not None
     assert [len(axis.values) for axis in config.map.axes] == [5, 5]
     conditions = config.conditions()
-    assert all(sum(c.policy.title == title for c in conditions) == 25 for title in ("input_output", "adaptive_posture"))
+    assert all(
+        sum(c.policy.title == title for c in conditions) == 25
+        for title in ("input_output", "adaptive_posture")
+    )
     assert sum(c.policy.title == "residual of 3 s" for c in conditions) == 25 * 5
 
 
@@ -132,13 +163,21 @@ def test_the_maps_that_come_with_the_project_can_be_played(name: str) -> None:
 
 
 def grid(values: dict[tuple[float, float], dict[str, list[float | None]]]) -> HeatMap:
-    """Map of the pelvis error with given episodes by place and policy; five training seeds have the same."""
+    """Map of the pelvis error with given episodes by place and policy; five training seeds have
+    the same."""
     evaluations = []
     for (k, load), policies in values.items():
         for title, own in policies.items():
-            found = family([own] * 5, "nominal") if title == "learned" else [cell(title, {"all": own}, "nominal")]
+            found = (
+                family([own] * 5, "nominal")
+                if title == "learned"
+                else [cell(title, {"all": own}, "nominal")]
+            )
             evaluations += at(found, **{K: k, LOAD: load})
-    axes: dict[str, Any] = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
+    axes: dict[str, Any] = {
+        "x": {"what": K, "values": [0.7, 1]},
+        "y": {"what": LOAD, "values": [0, 5]},
+    }
     return heat_maps(evaluations, MapConfig(**axes))[0]
 
 
@@ -151,25 +190,40 @@ FOUR: dict[tuple[float, float], dict[str, list[float | None]]] = {
 
 
 def test_a_cell_compares_learning_with_the_best_without_it_there() -> None:
-    """Catches axes that are swapped, one rival for all cells, a wrong sign, and falls that make a policy the best."""
+    """Catches axes that are swapped, one rival for all cells, a wrong sign, and falls that make
+    a policy the best."""
     found = grid(FOUR)
     assert [[c.best for c in row] for row in found.cells] == [["learned", "base"], ["base", None]]
-    assert [[c.best_analytic for c in row] for row in found.cells] == [["best", "base"], ["base", None]]
-    soft, stiff, loaded = found.cells[0][0], found.cells[0][1], found.cells[1][0]
-    assert (soft.learned["learned"].relative.value, soft.learned["learned"].verdict) == (-0.5, "lower")
+    assert [[c.best_analytic for c in row] for row in found.cells] == [
+        ["best", "base"],
+        ["base", None],
+    ]
+    soft = found.cells[0][0]
+    stiff = found.cells[0][1]
+    loaded = found.cells[1][0]
+    assert (soft.learned["learned"].relative.value, soft.learned["learned"].verdict) == (
+        -0.5,
+        "lower",
+    )
     assert stiff.learned["learned"].relative.value == 2.0
-    assert (loaded.learned["learned"].relative.value, loaded.learned["learned"].falls_more) == (-0.25, True)
+    assert (loaded.learned["learned"].relative.value, loaded.learned["learned"].falls_more) == (
+        -0.25,
+        True,
+    )
     assert loaded.failed == {"base": (0, 2), "best": (1, 2), "learned": (5, 10)}
 
 
 def test_a_page_has_the_map_with_what_is_ahead_and_what_failed() -> None:
-    """Catches a table upside down, a change with the wrong sign, and a cell in which every policy fell."""
+    """Catches a table upside down, a change with the wrong sign, and a cell in which every
+    policy fell."""
     (found,) = learned_maps(write_maps([grid(FOUR)], Path("map.csv")))
     assert [line.split(" | ") for line in found.table.splitlines()[2:]] == [
         ["| **5**", "−25 % ✕5", "- ✕10 |"],
         ["| **0**", "−50 %", "+200 % |"],
     ]
-    assert found.sentence.startswith("**Pelvis error, learned.** Ahead in 2 of 4 cells, behind in 1. ")
+    assert found.sentence.startswith(
+        "**Pelvis error, learned.** Ahead in 2 of 4 cells, behind in 1. "
+    )
     assert found.sentence.endswith("is base in 2 of 4 cells.")
     Path("none.csv").write_text("policy,verdict\ninput,\n")
     with pytest.raises(ConfigurationError, match=r"none\.csv compares no residual"):
@@ -180,17 +234,27 @@ def test_the_truth_wins_no_cell_and_further_sensors_are_no_rival() -> None:
     """Catches learning compared with who reads what no robot has, or what this one has not."""
     spec = Condition(env="walker", policy=PolicySpec(name="oracle"))
     assert spec.track is Track.TRUTH
-    assert spec.replace(policy=PolicySpec(name="oracle", track=Track.LINK_ENCODERS)).track is Track.LINK_ENCODERS
+    assert (
+        spec.replace(policy=PolicySpec(name="oracle", track=Track.LINK_ENCODERS)).track
+        is Track.LINK_ENCODERS
+    )
     cells = [cell("base", {"all": [4.0]}, "nominal"), cell("oracle", {"all": [1.0]}, "nominal")]
     sensors = cell("link_encoder", {"all": [2.0]}, "nominal")
     named = [
         *cells[:1],
-        *(Evaluation(e.condition.replace(policy=PolicySpec(name=e.condition.policy.title)), e.episodes) for e in
-          (cells[1], sensors)),
+        *(
+            Evaluation(
+                e.condition.replace(policy=PolicySpec(name=e.condition.policy.title)), e.episodes
+            )
+            for e in (cells[1], sensors)
+        ),
         *family([[3.0]] * 5, "nominal"),
-    ]  # fmt: skip
+    ]
     everywhere = [e for k in (0.7, 1.0) for m in (0.0, 5.0) for e in at(named, **{K: k, LOAD: m})]
-    axes: dict[str, Any] = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
+    axes: dict[str, Any] = {
+        "x": {"what": K, "values": [0.7, 1]},
+        "y": {"what": LOAD, "values": [0, 5]},
+    }
     for found in heat_maps(everywhere, MapConfig(**axes))[0].flat:
         assert (found.best, found.best_analytic) == ("link_encoder", "base")
 
@@ -212,14 +276,18 @@ def test_a_cell_is_held_out_unless_training_saw_the_same_scenario() -> None:
         ideal = [Evaluation(e.condition.replace(scenario="ideal"), e.episodes) for e in found]
         row = next(row for row in changes(at(ideal, **{K: k})) if row.policy == "learned")
         rows[k] = row.marks
-    assert rows == {0.7: (), 0.6: ("held out",)}  # the family of these tests was trained on ideal+soft
+    assert rows == {
+        0.7: (),
+        0.6: ("held out",),
+    }  # the family of these tests was trained on ideal+soft
 
 
 # How it is shown.
 
 
 def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
-    """Catches letters that do not fit the key, green where learning is behind, and stars that are missing."""
+    """Catches letters that do not fit the key, green where learning is behind, and stars that
+    are missing."""
     best, learned, *levels = panels(grid(FOUR))
     assert [entry[:2] for entry in best.key] == [("A", "base"), ("B", "best"), ("C", "learned")]
     assert [[s.text for s in row] for row in best.squares] == [["C", "A"], ["A", "-"]]
@@ -228,25 +296,35 @@ def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
     assert learned.squares[0][1].colour == blend("#b42318", 0.75)
     assert learned.squares[1][0].small == "to A ✕5/10"
     assert [panel.title.split(",")[0] for panel in levels] == ["base", "best", "learned"]
-    few = grid({place: {t: v for t, v in own.items() if t != "best"} for place, own in FOUR.items()})
+    few = grid(
+        {place: {t: v for t, v in own.items() if t != "best"} for place, own in FOUR.items()}
+    )
     assert panels(few)[1].squares[0][0].small == ""  # one rival alone needs no letter
     assert (Square("", "", "#1a7f5a").ink, Square("", "", "#ffffff").ink) == ("#ffffff", "#1f2328")
 
 
 def test_report_pictures_and_table_of_a_map_agree() -> None:
-    """Catches a map that is upside down on the page, a picture that is missing, and a table with other figures."""
+    """Catches a map that is upside down on the page, a picture that is missing, and a table with
+    other figures."""
     found = grid(FOUR)
     evaluations = [
-        e for (k, load), own in FOUR.items()
-        for e in at([cell("base", {"all": own["base"]}, "nominal"), *family([own["learned"]] * 5, "nominal")],
-                    **{K: k, LOAD: load})
-    ]  # fmt: skip
+        e
+        for (k, load), own in FOUR.items()
+        for e in at(
+            [
+                cell("base", {"all": own["base"]}, "nominal"),
+                *family([own["learned"]] * 5, "nominal"),
+            ],
+            **{K: k, LOAD: load},
+        )
+    ]
     with run_folder("x", {}, 0) as folder:
         (picture,) = draw_maps([found], folder)
         write_report(Results("x", evaluations, changes(evaluations), folder, maps=[found]))
         table = write_maps([found], folder / "map.csv")
     assert picture.name == "map_step_period_3_s_nominal_pelvis_error_rms_rad.png"
-    page, text = (folder / "report.html").read_text(), (folder / "report.md").read_text()
+    page = (folder / "report.html").read_text()
+    text = (folder / "report.md").read_text()
     headings = re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)
     assert headings[:2] == ["What was compared", "Maps"]
     assert not {"Ladder of policies", "Curves over time", "Sweeps"} & set(headings)
@@ -265,9 +343,16 @@ def test_report_pictures_and_table_of_a_map_agree() -> None:
     assert "best of 4 cells: base in 2, learned in 1." in text
     assert "of 3 cells lower in 2, higher in 1; from −50 % to +200 %." in text
     with table.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["metric"] == METRIC and row["policy"] == "learned"]
+        rows = [
+            row
+            for row in csv.DictReader(file)
+            if row["metric"] == METRIC and row["policy"] == "learned"
+        ]
     assert [(row["x"], row["y"], row["is_best"]) for row in rows] == [
-        ("0.7", "0", "True"), ("1", "0", "False"), ("0.7", "5", "False"), ("1", "5", "False"),
-    ]  # fmt: skip
+        ("0.7", "0", "True"),
+        ("1", "0", "False"),
+        ("0.7", "5", "False"),
+        ("1", "5", "False"),
+    ]
     assert [float(row["change"]) for row in rows[:3]] == [-0.5, 2.0, -0.25]
     assert math.isclose(float(rows[0]["mean"]), 1.0)

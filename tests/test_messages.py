@@ -14,7 +14,14 @@ import pytest
 import baselines
 from elastic_env.core import installed
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ElasticError, listed, missing_extra, shortened, shown, unknown_name
+from elastic_env.core.errors import (
+    ElasticError,
+    listed,
+    missing_extra,
+    shortened,
+    shown,
+    unknown_name,
+)
 from elastic_env.robots.gallery import gallery_robot
 from train.commands.bench import BenchConfig
 from train.commands.cli import main
@@ -25,7 +32,8 @@ from train.evaluate.rollout import make_policy
 from train.learn.algorithms import algorithm_class
 from train.learn.train_config import TrainConfig
 
-MOST, LONGEST = 200, 2500
+MOST = 200
+LONGEST = 2500
 LONG = ["x" * 10_000, "a b " * 2_500, "ä'" * 5_000, "d/" * 5_000 + "e.yaml", "m:" + "f" * 10_000]
 
 
@@ -89,13 +97,23 @@ def test_a_users_text_stays_short_in_an_error(entry: Callable[[str], Any]) -> No
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["compare", "@"], ["train", "@"], ["train", "--resume", "@"], ["bench", "@"], ["robot", "@"], ["@"],
-        ["evaluate", "--scenario", "@"], ["play", "--video", "@"], ["evaluate", "--jobs", "@"],
+        ["compare", "@"],
+        ["train", "@"],
+        ["train", "--resume", "@"],
+        ["bench", "@"],
+        ["robot", "@"],
+        ["@"],
+        ["evaluate", "--scenario", "@"],
+        ["play", "--video", "@"],
+        ["evaluate", "--jobs", "@"],
         ["evaluate", "--output", "@"],
     ],
-)  # fmt: skip
+)
 def test_the_command_line_stays_short(
-    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     """Catches a terminal that is flooded by what was typed."""
     monkeypatch.chdir(tmp_path)
@@ -110,7 +128,13 @@ def test_the_command_line_stays_short(
 
 def test_what_is_shown_has_its_begin_and_end() -> None:
     """Catches a text that is cut where it tells most, and one that is cut though it is short."""
-    for value in ("x" * 10**4, ["y" * 50] * 100, 10**5000, "\x00" * 190, {str(i): i for i in range(1000)}):
+    for value in (
+        "x" * 10**4,
+        ["y" * 50] * 100,
+        10**5000,
+        "\x00" * 190,
+        {str(i): i for i in range(1000)},
+    ):
         assert len(shown(value)) <= MOST
     path = "/" + "a" * 300 + "/run.yaml"
     assert len(shortened(path)) == MOST
@@ -132,18 +156,31 @@ def test_our_own_words_are_not_cut() -> None:
 def test_an_extra_is_installed_as_this_project_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an index that does not have the package, and a checkout that is not there."""
     root = Path(__file__).parents[1]
-    assert str(missing_extra("torch", "train", "training")) == (
-        f"training needs the package torch; install it with: pip install -c constraints.txt '.[train]' in {root}"
+    assert (
+        str(missing_extra("torch", "train", "training"))
+        == "training needs the package torch; install it with: pip install -c constraints.txt"
+        f" '.[train]' in {root}"
     )
-    needs = ["numpy>=2.0", 'torch>=2.13; extra == "train"', "cmaes>=0.13 ; extra == 'train'", 'dask>=1; extra == "x"']
+    needs = [
+        "numpy>=2.0",
+        'torch>=2.13; extra == "train"',
+        "cmaes>=0.13 ; extra == 'train'",
+        'dask>=1; extra == "x"',
+    ]
     monkeypatch.setattr(installed, "checkout", lambda: None)
     monkeypatch.setattr(installed, "requires", lambda _: needs)
     said = str(missing_extra("torch", "train", "training"))
-    assert said == "training needs the package torch; install it with: pip install 'torch>=2.13' 'cmaes>=0.13'"
+    assert (
+        said == "training needs the package torch; install it with: pip install 'torch>=2.13'"
+        " 'cmaes>=0.13'"
+    )
 
 
-def test_configurations_are_where_a_message_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Catches a user outside of the checkout who is told that there is no file, and not where they are."""
+def test_configurations_are_where_a_message_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a user outside of the checkout who is told that there is no file, and not where
+    they are."""
     monkeypatch.chdir(tmp_path)
     root = Path(__file__).parents[1]
 
@@ -153,7 +190,10 @@ def test_configurations_are_where_a_message_says(monkeypatch: pytest.MonkeyPatch
         return str(caught.value)
 
     found = said("configs/paper.yaml")
-    assert found == f"no configuration file at configs/paper.yaml; that of elastic-env is {root / 'configs/paper.yaml'}"
+    assert (
+        found == "no configuration file at configs/paper.yaml; that of elastic-env is"
+        f" {root / 'configs/paper.yaml'}"
+    )
     assert said("configs/papr.yaml").endswith(f"; those of elastic-env are in {root / 'configs'}")
     assert said("mine.yaml") == "no configuration file at mine.yaml"
     monkeypatch.setattr(installed, "checkout", lambda: None)
@@ -161,4 +201,6 @@ def test_configurations_are_where_a_message_says(monkeypatch: pytest.MonkeyPatch
     own.dist = SimpleNamespace(locate_file=lambda path: Path(os.sep, "site", path))  # type: ignore[assignment]
     monkeypatch.setattr(installed, "files", lambda _: [own])
     assert "the folder configs is in the source of elastic-env" in said("configs/paper.yaml")
-    assert said("configs/paper.yaml").endswith("With the package come /site/train/commands/bench.yaml")
+    assert said("configs/paper.yaml").endswith(
+        "With the package come /site/train/commands/bench.yaml"
+    )

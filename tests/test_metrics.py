@@ -39,7 +39,8 @@ def masks(scored: Sequence[bool] | BoolArray) -> dict[str, BoolArray]:
 
 @given(log=logs)
 def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray]) -> None:
-    """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing was sampled."""
+    """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing
+    was sampled."""
     values, sampled = log
     for name, function in STATISTICS.items():
         running = RunningStatistic(name, 1, values.shape[1])
@@ -52,7 +53,8 @@ def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray
 
 
 def test_scored_and_all_steps_are_kept_apart() -> None:
-    """Catches a metric of all steps that leaves out the standing, and one of scored steps that does not."""
+    """Catches a metric of all steps that leaves out the standing, and one of scored steps that
+    does not."""
     metrics = EpisodeMetrics(METRICS, 1)
     for k, scored in enumerate([False, True, True, False]):
         metrics.update({"x": np.array([float(k)]), "y": np.array([-2.0 * k])}, masks([scored]))
@@ -88,8 +90,11 @@ def test_values_do_not_share_memory_with_what_comes_later() -> None:
 
 
 @given(log=logs, split=st.integers(0, 12))
-def test_how_many_steps_are_taken_at_once_does_not_matter(log: tuple[Array, BoolArray], split: int) -> None:
-    """Catches sums that depend on the grouping of steps, and so on when other worlds end: equal to the last bit."""
+def test_how_many_steps_are_taken_at_once_does_not_matter(
+    log: tuple[Array, BoolArray], split: int
+) -> None:
+    """Catches sums that depend on the grouping of steps, and so on when other worlds end: equal
+    to the last bit."""
     values, sampled = log
     for name in STATISTICS:
         one_by_one, grouped = (RunningStatistic(name, 1, values.shape[1]) for _ in range(2))

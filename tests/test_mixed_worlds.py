@@ -1,4 +1,5 @@
-"""Worlds of several scenarios in one vector environment, against environments of one scenario each."""
+"""Worlds of several scenarios in one vector environment, against environments of one scenario
+each."""
 
 import copy
 from typing import Any
@@ -19,7 +20,18 @@ from train.evaluate.episodes import evaluate, evaluate_together
 
 ID = "elastic_env/WalkInPlace-v0"
 SHORT: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
-SCENARIOS = ["nominal", "soft", "spread", "payload", "sensor", "slope", "push", "imu", "drawn", "soft+backlash"]
+SCENARIOS = [
+    "nominal",
+    "soft",
+    "spread",
+    "payload",
+    "sensor",
+    "slope",
+    "push",
+    "imu",
+    "drawn",
+    "soft+backlash",
+]
 SENSORS = ["link_encoder", "joint_torque", "accelerometer"]
 EACH = 2
 
@@ -27,36 +39,54 @@ EACH = 2
 def worlds(scenario: str | list[str], num_envs: int, **options: Any) -> Any:
     """A vector environment of a short walk."""
     return gymnasium.make_vec(
-        ID, num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=2, scenario=scenario,
-        **SHORT, **options,
-    )  # fmt: skip
+        ID,
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        num_threads=2,
+        scenario=scenario,
+        **SHORT,
+        **options,
+    )
 
 
 def mixed(scenarios: list[str], **options: Any) -> Any:
     """`EACH` worlds of every scenario."""
-    return worlds([scenario for scenario in scenarios for _ in range(EACH)], EACH * len(scenarios), **options)
+    return worlds(
+        [scenario for scenario in scenarios for _ in range(EACH)], EACH * len(scenarios), **options
+    )
 
 
 def played(env: Any, seeds: list[int], offsets: Array) -> list[Array]:
-    """Observations, rewards and signals of a walk from given seeds, under offsets, (steps, worlds, 12) [rad]."""
+    """Observations, rewards and signals of a walk from given seeds, under offsets, (steps,
+    worlds, 12) [rad]."""
     observation, info = env.reset(seed=seeds)
     found = [observation]
     for offset in offsets:
         observation, reward, *_, info = env.step(offset)
-        found += [observation, reward, info["zmp_deviation"], info["pelvis_error"], info["joint_torque"]]
+        found += [
+            observation,
+            reward,
+            info["zmp_deviation"],
+            info["pelvis_error"],
+            info["joint_torque"],
+        ]
     return [*found, *env.unwrapped.truth().stiffness.T]
 
 
 def some_offsets(steps: int, num_worlds: int) -> Array:
     """Offsets that move all joints, by some mrad."""
     generator = np.random.default_rng(7)
-    return np.cumsum(generator.uniform(-2e-3, 2e-3, (steps, num_worlds, 12)), axis=0).clip(-0.02, 0.02)
+    return np.cumsum(generator.uniform(-2e-3, 2e-3, (steps, num_worlds, 12)), axis=0).clip(
+        -0.02, 0.02
+    )
 
 
 @pytest.mark.parametrize("sensors", [[], SENSORS])
 def test_a_world_is_the_same_beside_worlds_of_other_scenarios(sensors: list[str]) -> None:
-    """Catches a scenario that takes its plant, bank, sensors, push or noise from another one, in any bit."""
-    seeds, offsets = list(range(EACH * len(SCENARIOS))), some_offsets(150, EACH * len(SCENARIOS))
+    """Catches a scenario that takes its plant, bank, sensors, push or noise from another one, in
+    any bit."""
+    seeds = list(range(EACH * len(SCENARIOS)))
+    offsets = some_offsets(150, EACH * len(SCENARIOS))
     together = played(mixed(SCENARIOS, sensors=sensors), seeds, offsets)
     for index, scenario in enumerate(SCENARIOS):
         own = slice(EACH * index, EACH * (index + 1))
@@ -68,7 +98,8 @@ def test_a_world_is_the_same_beside_worlds_of_other_scenarios(sensors: list[str]
 def test_a_copy_of_a_mixture_goes_on_as_the_original() -> None:
     """Catches models of drawn robots that a copy does not have."""
     names = ["spread", "payload", "drawn", "slope"]
-    first, offsets = mixed(names), some_offsets(60, EACH * len(names))
+    first = mixed(names)
+    offsets = some_offsets(60, EACH * len(names))
     played(first, [5, 6, 7, 8, 9, 10, 11, 12], offsets[:30])
     second = copy.deepcopy(first.unwrapped)
     for offset in offsets[30:]:
@@ -94,8 +125,11 @@ def test_policies_play_in_a_mixture_and_the_oracle_is_told_that_it_cannot() -> N
         (["nominal", "sloppy"], "sloppy"),
     ],
 )
-def test_a_list_that_does_not_fit_is_an_error_with_what_it_has(scenario: list[str], problem: str) -> None:
-    """Catches a list that is repeated or cut, and worlds whose policies would have to know different friction."""
+def test_a_list_that_does_not_fit_is_an_error_with_what_it_has(
+    scenario: list[str], problem: str
+) -> None:
+    """Catches a list that is repeated or cut, and worlds whose policies would have to know
+    different friction."""
     with pytest.raises(ConfigurationError, match=problem):
         worlds(scenario, 2)
     with pytest.raises(ConfigurationError):
@@ -105,12 +139,19 @@ def test_a_list_that_does_not_fit_is_an_error_with_what_it_has(scenario: list[st
 def cell(policy: str, scenario: str, episodes: int = 2, **changes: Any) -> Condition:
     """A cell of a comparison of short walks."""
     return Condition(
-        env="walker", policy=PolicySpec(name=policy), reference={"step_period": [0.2, 0.3, 0.2], "num_steps": 2},
-        scenario=scenario, episodes=episodes, seed=4, **changes,
-    )  # fmt: skip
+        env="walker",
+        policy=PolicySpec(name=policy),
+        reference={"step_period": [0.2, 0.3, 0.2], "num_steps": 2},
+        scenario=scenario,
+        episodes=episodes,
+        seed=4,
+        **changes,
+    )
 
 
-@pytest.mark.parametrize("policy", ["adaptive_posture", "link_encoder", "thormang", "residual:walker_3s_offset/seed_0"])
+@pytest.mark.parametrize(
+    "policy", ["adaptive_posture", "link_encoder", "thormang", "residual:walker_3s_offset/seed_0"]
+)
 def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> None:
     """Catches policies, scores, traces and seeds that depend on the worlds beside."""
     cells = [cell(policy, scenario) for scenario in ("nominal", "payload", "drawn", "imu")]
@@ -125,12 +166,20 @@ def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> 
 
 
 def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> None:
-    """Catches cells that are lost, that no environment can have in common, and one core that waits for the others."""
+    """Catches cells that are lost, that no environment can have in common, and one core that
+    waits for the others."""
     scenarios = ("ideal", "nominal", "soft", "push", "slope", "spread")
-    cells = [cell(name, scenario) for scenario in scenarios for name in ("input", "oracle", "iterative", "dynamic")]
+    cells = [
+        cell(name, scenario)
+        for scenario in scenarios
+        for name in ("input", "oracle", "iterative", "dynamic")
+    ]
     batches = in_batches(cells, cores=1)
     assert sorted(number for batch in batches for number in batch) == list(range(len(cells)))
-    found = [{(cells[number].policy.name, cells[number].scenario) for number in batch} for batch in batches]
+    found = [
+        {(cells[number].policy.name, cells[number].scenario) for number in batch}
+        for batch in batches
+    ]
     for policy in ("input", "dynamic"):
         assert {(policy, "ideal")} in found
         assert {(policy, scenario) for scenario in scenarios[1:]} in found
@@ -138,15 +187,22 @@ def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> Non
     assert [len(batch) for batch in alone] == [1] * 12
     assert len(in_batches(cells, cores=8)) >= 16
     assert all(len(batch) == 1 for batch in in_batches(cells, cores=len(cells)))
-    testbed = [Condition(policy=PolicySpec(name="input"), scenario=name) for name in ("nominal", "soft")]
+    testbed = [
+        Condition(policy=PolicySpec(name="input"), scenario=name) for name in ("nominal", "soft")
+    ]
     assert in_batches(testbed, cores=1) == [[0], [1]]
 
 
 def test_a_map_of_a_scenario_shares_worlds_and_varied_options_do_not() -> None:
     """Catches a policy that plays cells of another value of its option."""
-    cells = [cell("input", "nominal", swept={"scenario.stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)]
+    cells = [
+        cell("input", "nominal", swept={"scenario.stiffness_scale": value})
+        for value in (0.8, 0.9, 1.0, 1.1)
+    ]
     assert in_batches(cells, cores=1) == [[0, 1], [2, 3]]
-    cells = [cell("input", "nominal", swept={"stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)]
+    cells = [
+        cell("input", "nominal", swept={"stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)
+    ]
     assert in_batches(cells, cores=1) == [[0], [1], [2], [3]]
 
 
@@ -162,8 +218,11 @@ def failing(env: Any) -> Any:
     return Failing(env.unwrapped.task.observation_table)
 
 
-def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a failure in one scenario that takes the results of the others with it, or has another's name."""
+def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a failure in one scenario that takes the results of the others with it, or has
+    another's name."""
     monkeypatch.setattr(play, "can_share_worlds", lambda condition: True)
     cells = [cell(f"{__name__}:failing", scenario) for scenario in ("payload", "nominal")]
     failed, passed = play._evaluate(cells, lambda _: None)

@@ -28,8 +28,9 @@ INERTIAL = (
 )
 LINK = f'<link name="{{}}">{INERTIAL.format(1.0)}{{}}</link>'
 JOINT = (
-    '<joint name="{}" type="revolute"><origin xyz="0 0 {}"/><parent link="{}"/><child link="{}"/><axis xyz="0 1 0"/>'
-    '<limit lower="-2" upper="2" effort="60" velocity="3"/>{}</joint>'
+    '<joint name="{}" type="revolute"><origin xyz="0 0 {}"/><parent link="{}"/><child'
+    ' link="{}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60"'
+    ' velocity="3"/>{}</joint>'
 )
 TORQUE = [-3.35464859, -1.23822455]
 """Of the arm below at (0.5, 0.5) rad, by MuJoCo's own inverse dynamics [N·m]."""
@@ -37,7 +38,9 @@ TORQUE = [-3.35464859, -1.23822455]
 
 def urdf(fore: str = "", also: str = "", second: str = "elbow", head: str = "") -> str:
     links = LINK.format("base", "") + LINK.format("upper", "") + LINK.format("fore", fore)
-    joints = JOINT.format("shoulder", 0.1, "base", "upper", "") + JOINT.format(second, 0.3, "upper", "fore", "")
+    joints = JOINT.format("shoulder", 0.1, "base", "upper", "") + JOINT.format(
+        second, 0.3, "upper", "fore", ""
+    )
     return f'{head}<robot name="arm">{links}{joints}{also}</robot>'
 
 
@@ -52,9 +55,9 @@ ROD = '<geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="1"/>'
 
 def mjcf(hand: str = "", also: str = "", first: str = 'name="j1"', head: str = "") -> str:
     return (
-        f'<mujoco><compiler angle="radian"/>{head}<worldbody><body name="a" pos="0 0 0.1"><joint {first} axis="0 1 0"/>'
-        f'{ROD}<body name="b" pos="0 0 0.3"><joint name="j2" axis="0 1 0"/>{ROD}{hand}</body></body></worldbody>{also}'
-        "</mujoco>"
+        f'<mujoco><compiler angle="radian"/>{head}<worldbody><body name="a" pos="0 0 0.1"><joint'
+        f' {first} axis="0 1 0"/>{ROD}<body name="b" pos="0 0 0.3"><joint name="j2" axis="0 1'
+        f' 0"/>{ROD}{hand}</body></body></worldbody>{also}</mujoco>'
     )
 
 
@@ -78,7 +81,10 @@ def robot(model: Any, joints: Any = 400.0) -> Any:
     return gymnasium.make("elastic_env/Robot-v0", model=model, joints=given)
 
 
-READERS: list[Callable[[Any], Any]] = [robot, lambda model: PositionCompensator.from_model(model, 400.0)]
+READERS: list[Callable[[Any], Any]] = [
+    robot,
+    lambda model: PositionCompensator.from_model(model, 400.0),
+]
 
 
 def refusals(model: Any) -> list[str]:
@@ -105,8 +111,11 @@ def torque(model: Any, **options: Any) -> list[float]:
         urdf().replace('name="arm"', 'name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"'),
     ],
 )
-def test_a_model_is_read_as_the_programs_read_it_that_it_was_written_for(text: str, tmp_path: Path) -> None:
-    """Catches prefixes without namespace that end as "no XML", and text that only one reader takes."""
+def test_a_model_is_read_as_the_programs_read_it_that_it_was_written_for(
+    text: str, tmp_path: Path
+) -> None:
+    """Catches prefixes without namespace that end as "no XML", and text that only one reader
+    takes."""
     file = tmp_path / "arm.urdf"
     file.write_text(text, encoding="utf-8")
     for model in (text, file, str(file)):
@@ -114,14 +123,21 @@ def test_a_model_is_read_as_the_programs_read_it_that_it_was_written_for(text: s
     robot(text).close()
 
 
-@pytest.mark.parametrize("encoding", ["gbk", "Shift_JIS", "UTF-16", "ISO-8859-1", "utf-8", "UTF-8-SIG"])
+@pytest.mark.parametrize(
+    "encoding", ["gbk", "Shift_JIS", "UTF-16", "ISO-8859-1", "utf-8", "UTF-8-SIG"]
+)
 @pytest.mark.parametrize("kind", ["urdf", "xml"])
 def test_a_file_is_read_by_its_own_encoding(encoding: str, kind: str, tmp_path: Path) -> None:
-    """Catches encodings of several bytes that end as a ValueError, and MJCF that MuJoCo reads as UTF-8 alone."""
+    """Catches encodings of several bytes that end as a ValueError, and MJCF that MuJoCo reads as
+    UTF-8 alone."""
     part = "ärm" if encoding == "ISO-8859-1" else "腕"
     declared = "utf-8" if encoding == "UTF-8-SIG" else encoding
     text = f'<?xml version="1.0" encoding="{declared}"?>'
-    text += urdf().replace('"fore"', f'"{part}"') if kind == "urdf" else mjcf().replace('name="b"', f'name="{part}"')
+    text += (
+        urdf().replace('"fore"', f'"{part}"')
+        if kind == "urdf"
+        else mjcf().replace('name="b"', f'name="{part}"')
+    )
     file = tmp_path / f"arm.{kind}"
     file.write_bytes(text.encode(encoding))
     model = compiled_model(file)
@@ -136,20 +152,36 @@ def test_a_file_is_read_by_its_own_encoding(encoding: str, kind: str, tmp_path: 
             b'<?xml version="1.0" encoding="no-such"?><robot/>',
             r"encoding 'no-such', which is not known; save.*UTF-8",
         ),
-        (b'<?xml version="1.0" encoding="zip"?><robot/>', r"'zip', which is not known; save the file in UTF-8"),
+        (
+            b'<?xml version="1.0" encoding="zip"?><robot/>',
+            r"'zip', which is not known; save the file in UTF-8",
+        ),
         (b'<?xml version="1.0" encoding="idna"?><robot/>', r"'idna', which is not known"),
-        (b'<?xml version="1.0" encoding="gbk"?><robot name="\xff\xff"/>', r"not in its encoding, gbk; save .*UTF-8"),
+        (
+            b'<?xml version="1.0" encoding="gbk"?><robot name="\xff\xff"/>',
+            r"not in its encoding, gbk; save .*UTF-8",
+        ),
         (b"<robot name='\xe4'/>", r"not in its encoding, utf-8; save the file in UTF-8"),
         (b"", r"is no XML: no element found"),
         (b"<a><b></a>", r"is no XML: mismatched tag"),
         (b"<sdf/>", r"root of .* must be <mujoco> or <robot>, got 'sdf'"),
-        (b'<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>', r"declares the entity 'a', which is not read"),
-        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "/etc/passwd">]><robot>&a;</robot>', r"declares the entity 'a'"),
-        (b"<robot>" + b"<link>" * 300 + b"</link>" * 300 + b"</robot>", r"at most 200 elements deep"),
+        (
+            b'<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>',
+            r"declares the entity 'a', which is not read",
+        ),
+        (
+            b'<!DOCTYPE r [<!ENTITY a SYSTEM "/etc/passwd">]><robot>&a;</robot>',
+            r"declares the entity 'a'",
+        ),
+        (
+            b"<robot>" + b"<link>" * 300 + b"</link>" * 300 + b"</robot>",
+            r"at most 200 elements deep",
+        ),
     ],
 )
 def test_what_is_no_model_is_said(content: bytes, message: str, tmp_path: Path) -> None:
-    """Catches tracebacks of codecs, of the XML parser and of its recursion, and entities that grow or read files."""
+    """Catches tracebacks of codecs, of the XML parser and of its recursion, and entities that
+    grow or read files."""
     file = tmp_path / "arm.urdf"
     file.write_bytes(content)
     first, second = refusals(file)
@@ -162,7 +194,9 @@ def test_what_is_no_model_is_said(content: bytes, message: str, tmp_path: Path) 
     "text",
     [
         urdf(also="<xacro:hand/>"),
-        urdf(also='<x:hand xmlns:x="nothing"/>').replace("<robot", '<robot xmlns:x="http://wiki.ros.org/xacro"'),
+        urdf(also='<x:hand xmlns:x="nothing"/>').replace(
+            "<robot", '<robot xmlns:x="http://wiki.ros.org/xacro"'
+        ),
         urdf().replace('<mass value="1.0"/>', '<mass xacro:value="1.0"/>', 1),
         urdf().replace('value="1.0"', 'value="${mass}"', 1),
         urdf().replace('name="arm"', 'name="$(arg name)"'),
@@ -171,7 +205,8 @@ def test_what_is_no_model_is_said(content: bytes, message: str, tmp_path: Path) 
     ],
 )
 def test_xacro_has_to_be_expanded_first(text: str) -> None:
-    """Catches a hand that is left out without a word, as MuJoCo ignores elements that it does not know."""
+    """Catches a hand that is left out without a word, as MuJoCo ignores elements that it does
+    not know."""
     for said in refusals(text):
         assert "expand it first: xacro arm.urdf.xacro > arm.urdf" in said
 
@@ -179,35 +214,65 @@ def test_xacro_has_to_be_expanded_first(text: str) -> None:
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (urdf(second="shoulder"), r"has the joint 'shoulder' 2 times; give each joint its own name"),
+        (
+            urdf(second="shoulder"),
+            r"has the joint 'shoulder' 2 times; give each joint its own name",
+        ),
         (urdf(also=LINK.format("fore", "")), r"has the link 'fore' 2 times"),
-        (urdf(also=JOINT.format("loop", 0.1, "base", "fore", "")), r"link 'fore' .* is the child of two joints"),
+        (
+            urdf(also=JOINT.format("loop", 0.1, "base", "fore", "")),
+            r"link 'fore' .* is the child of two joints",
+        ),
         (urdf(also=JOINT.format("loop", 0.1, "fore", "base", "")), r"joined in a circle"),
-        (urdf(also=JOINT.format("x", 0.1, "base", "lost", "")), r"joint 'x' .* needs a child that is a link .*'lost'"),
+        (
+            urdf(also=JOINT.format("x", 0.1, "base", "lost", "")),
+            r"joint 'x' .* needs a child that is a link .*'lost'",
+        ),
         (urdf().replace('lower="-2"', 'lower="3"', 1), r"limit"),
-        (urdf().replace('value="1.0"', 'value="nan"', 1), r"value of <mass> .* must be numbers, got 'nan'"),
+        (
+            urdf().replace('value="1.0"', 'value="nan"', 1),
+            r"value of <mass> .* must be numbers, got 'nan'",
+        ),
         (urdf().replace('value="1.0"', 'value="1e999"', 2), r"mass of body|mass"),
         (
             urdf().replace(INERTIAL.format(1.0) + "</link><joint", "</link><joint"),
             r"every link that moves needs a mass",
         ),
         (
-            urdf(fore='<visual><geometry><mesh filename="package://a/b.stl"/></geometry></visual>').replace(
-                'izz="0.002"', 'izz="0.2"'
-            ),
+            urdf(
+                fore='<visual><geometry><mesh filename="package://a/b.stl"/></geometry></visual>'
+            ).replace('izz="0.002"', 'izz="0.2"'),
             r"no main value above the sum",
         ),
-        (mjcf(first='name="j1" armature="-1"'), r"armature of joint 'j1' .* must be finite and >= 0, got"),
+        (
+            mjcf(first='name="j1" armature="-1"'),
+            r"armature of joint 'j1' .* must be finite and >= 0, got",
+        ),
         (mjcf(first='name="j1" damping="-1"'), r"damping of joint 'j1'"),
-        (mjcf(first='name="j1" range="1 -1"'), r"limits of joint 'j1' .* contradict themselves: 1 to -1"),
-        (mjcf(first='name="j1" range="1 -1" limited="true"'), r"lower limit must be below the upper one"),
+        (
+            mjcf(first='name="j1" range="1 -1"'),
+            r"limits of joint 'j1' .* contradict themselves: 1 to -1",
+        ),
+        (
+            mjcf(first='name="j1" range="1 -1" limited="true"'),
+            r"lower limit must be below the upper one",
+        ),
         (mjcf(head='<option gravity="0 0 nan"/>'), r"gravity of <option> .* must be numbers"),
-        (mjcf(head='<option><flag gravity="disable"/></option>'), r'<flag gravity="disable"/> .*take the flag out'),
+        (
+            mjcf(head='<option><flag gravity="disable"/></option>'),
+            r'<flag gravity="disable"/> .*take the flag out',
+        ),
         (mjcf(head='<option><flag spring="disable"/></option>'), r'<flag spring="disable"/>'),
         (mjcf(head='<option wind="9 0 0" density="1.2"/>'), r"has wind, whose force on the links"),
         (mjcf(first='axis2="1"'), r"unrecognized attribute"),
-        (mjcf(also='<keyframe><key qpos="1 2 3"/></keyframe>'), r"invalid qpos size, expected 2, got 3"),
-        (mjcf(also='<equality><connect body1="a" body2="lost" anchor="0 0 0"/></equality>'), r"unknown element 'lost'"),
+        (
+            mjcf(also='<keyframe><key qpos="1 2 3"/></keyframe>'),
+            r"invalid qpos size, expected 2, got 3",
+        ),
+        (
+            mjcf(also='<equality><connect body1="a" body2="lost" anchor="0 0 0"/></equality>'),
+            r"unknown element 'lost'",
+        ),
         (
             mjcf(first='name="j1" axis="0 1 0"/><joint name="j0"'),
             r"that j. and j. move have no inertia.*one axis",
@@ -222,7 +287,8 @@ def test_xacro_has_to_be_expanded_first(text: str) -> None:
     ],
 )
 def test_everybody_refuses_a_bad_model_in_the_same_words(model: Any, message: str) -> None:
-    """Catches tracebacks of MuJoCo and NumPy, models that one reader takes, and text that floods the terminal."""
+    """Catches tracebacks of MuJoCo and NumPy, models that one reader takes, and text that floods
+    the terminal."""
     first, second = refusals(model)
     assert first == second
     assert len(first) < 700
@@ -233,26 +299,42 @@ def test_everybody_refuses_a_bad_model_in_the_same_words(model: Any, message: st
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (mjcf(HAND, LOOP.replace('body1="l"', 'body1="b"').replace('"r"', '"a"')), r"equality constraint of b and a"),
+        (
+            mjcf(HAND, LOOP.replace('body1="l"', 'body1="b"').replace('"r"', '"a"')),
+            r"equality constraint of b and a",
+        ),
         (mjcf(HAND, LOOP), r"equality constraint of l and r.*'gl: held', 'gr: held'"),
-        (mjcf(HAND, tied("gl", "gr", attributes='stiffness="3"')), r"tendon 'cord' has stiffness.*'gl: held'"),
+        (
+            mjcf(HAND, tied("gl", "gr", attributes='stiffness="3"')),
+            r"tendon 'cord' has stiffness.*'gl: held'",
+        ),
         (mjcf(HAND, tied("gl", "gr", attributes='armature="3"')), r"tendon 'cord' has .*inertia"),
         (
-            mjcf(also=tied("j1", "j2") + '<actuator><position name="s" tendon="cord" kp="30"/></actuator>'),
-            r"actuator 's' drives j1, j2 by a tendon, which is not compensated; drive each joint .*out of the model$",
+            mjcf(
+                also=tied("j1", "j2")
+                + '<actuator><position name="s" tendon="cord" kp="30"/></actuator>'
+            ),
+            (
+                r"actuator 's' drives j1, j2 by a tendon, which is not compensated; drive each"
+                r" joint .*out of the model$"
+            ),
         ),
         (
             mjcf(HAND, tied("j2", "gl") + '<actuator><motor name="m" tendon="cord"/></actuator>'),
             r"actuator 'm' drives j2, gl by a tendon.*'j2: held', 'gl: held'",
         ),
         (
-            mjcf('<site name="tip"/>', '<actuator><general name="jet" site="tip" gear="1 0 0 0 0 0"/></actuator>'),
+            mjcf(
+                '<site name="tip"/>',
+                '<actuator><general name="jet" site="tip" gear="1 0 0 0 0 0"/></actuator>',
+            ),
             r"actuator 'jet' drives j1, j2 by a site",
         ),
     ],
 )
 def test_what_acts_beside_the_joints_is_refused_with_its_name(model: str, message: str) -> None:
-    """Catches a drive or a constraint that is taken out without a word, and advice that does not help."""
+    """Catches a drive or a constraint that is taken out without a word, and advice that does not
+    help."""
     first, second = refusals(model)
     assert first == second
     with pytest.raises(ConfigurationError, match=message):
@@ -264,22 +346,44 @@ def test_what_acts_beside_the_joints_is_refused_with_its_name(model: str, messag
     [
         (mjcf(HAND, LOOP), HELD_HAND),
         (mjcf(HAND, tied("gl", "gr", attributes='stiffness="3"')), HELD_HAND),
-        (mjcf(HAND, tied("gl", "gr") + '<actuator><position tendon="cord"/></actuator>'), HELD_HAND),
-        (mjcf(also='<equality><connect body1="b" body2="world" anchor="0 0 0.3" active="false"/></equality>'), TORQUE),
-        (mjcf('<body name="f" pos="0 0 0.3"><joint type="slide"/><geom size=".02" mass="1e-9"/></body>'), TORQUE),
+        (
+            mjcf(HAND, tied("gl", "gr") + '<actuator><position tendon="cord"/></actuator>'),
+            HELD_HAND,
+        ),
+        (
+            mjcf(
+                also=(
+                    '<equality><connect body1="b" body2="world" anchor="0 0 0.3"'
+                    ' active="false"/></equality>'
+                )
+            ),
+            TORQUE,
+        ),
+        (
+            mjcf(
+                '<body name="f" pos="0 0 0.3"><joint type="slide"/><geom size=".02"'
+                ' mass="1e-9"/></body>'
+            ),
+            TORQUE,
+        ),
     ],
 )
 def test_what_is_held_is_no_reason_to_refuse(model: str, expected: list[float]) -> None:
-    """Catches loops, tendons and slides without a name within a held gripper, and constraints that do not act."""
+    """Catches loops, tendons and slides without a name within a held gripper, and constraints
+    that do not act."""
     np.testing.assert_allclose(torque(model, joints=["j1", "j2"]), expected, rtol=1e-6)
     robot(model, {"j*": 400.0}).close()
 
 
 def test_a_joint_without_a_name_is_held_where_nobody_commands_it() -> None:
-    """Catches an empty name as a key. Closed form: elbow alone, whose rod and finger hang from it."""
-    finger = '<body pos="0 0 0.3"><joint type="slide" axis="0 0 1"/><geom size=".02" mass=".1"/></body>'
+    """Catches an empty name as a key. Closed form: elbow alone, whose rod and finger hang from
+    it."""
+    finger = (
+        '<body pos="0 0 0.3"><joint type="slide" axis="0 0 1"/><geom size=".02" mass=".1"/></body>'
+    )
     model = (
-        f'<mujoco><worldbody><body name="a"><joint name="elbow" axis="0 1 0"/>{ROD}{finger}</body></worldbody></mujoco>'
+        '<mujoco><worldbody><body name="a"><joint name="elbow" axis="0 1'
+        f' 0"/>{ROD}{finger}</body></worldbody></mujoco>'
     )
     found = PositionCompensator.from_model(model, 400.0).torque([0.3])
     np.testing.assert_allclose(found, [-9.81 * (1.0 * 0.15 + 0.1 * 0.3) * np.sin(0.3)], rtol=1e-9)
@@ -289,9 +393,12 @@ def test_a_joint_without_a_name_is_held_where_nobody_commands_it() -> None:
 
 
 def test_fingers_that_mimic_one_another_are_held_unless_they_are_named() -> None:
-    """Catches an arm that is refused for its gripper, and coupled joints of the arm that are taken for fingers."""
+    """Catches an arm that is refused for its gripper, and coupled joints of the arm that are
+    taken for fingers."""
     model = urdf(also=FINGERS)
-    with pytest.warns(UserWarning, match="finger_l, finger_r are coupled in the model .*, and are held"):
+    with pytest.warns(
+        UserWarning, match="finger_l, finger_r are coupled in the model .*, and are held"
+    ):
         env = robot(model)
     assert list(env.unwrapped.task.config.joints) == ["shoulder", "elbow"]
     env.close()
@@ -299,7 +406,9 @@ def test_fingers_that_mimic_one_another_are_held_unless_they_are_named() -> None
         assert PositionCompensator.from_model(model, 400.0).joints == ("shoulder", "elbow")
     named = {"*": 400.0, "finger_r": 20.0}
     for read in (lambda: robot(model, named), lambda: PositionCompensator.from_model(model, named)):
-        with pytest.raises(ConfigurationError, match=r"of finger_r and finger_l.*: K', .*'finger_r: held'"):
+        with pytest.raises(
+            ConfigurationError, match=r"of finger_r and finger_l.*: K', .*'finger_r: held'"
+        ):
             read()
     couple = '<equality><joint joint1="j1" joint2="j2"/></equality>'
     assert coupled_fingers(mujoco.MjModel.from_xml_string(mjcf(HAND, couple))) == []
@@ -308,9 +417,15 @@ def test_fingers_that_mimic_one_another_are_held_unless_they_are_named() -> None
 @pytest.mark.parametrize(
     ("also", "message"),
     [
-        ('<worldbody><replicate count="100000000"><site/></replicate></worldbody>', "at most 20000 elements.*100000"),
         (
-            '<worldbody><replicate count="900"><replicate count="900"><site/></replicate></replicate></worldbody>',
+            '<worldbody><replicate count="100000000"><site/></replicate></worldbody>',
+            "at most 20000 elements.*100000",
+        ),
+        (
+            (
+                '<worldbody><replicate count="900"><replicate'
+                ' count="900"><site/></replicate></replicate></worldbody>'
+            ),
             "at most 20000 elements",
         ),
         (f"<worldbody>{'<site/>' * 30_000}</worldbody>", "at most 20000 elements"),
@@ -319,16 +434,28 @@ def test_fingers_that_mimic_one_another_are_held_unless_they_are_named() -> None
             '<asset><hfield name="h" nrow="50000" ncol="50000" size="1 1 1 1"/></asset>',
             "4000000 nrow times ncol.*2500000000",
         ),
-        ('<asset><texture name="t" builtin="flat" width="30000" height="30000"/></asset>', "at most 4096 width"),
-        ('<asset><mesh name="m" builtin="supertorus" params="5000 .3 1 1"/></asset>', "at most 300 as params"),
+        (
+            '<asset><texture name="t" builtin="flat" width="30000" height="30000"/></asset>',
+            "at most 4096 width",
+        ),
+        (
+            '<asset><mesh name="m" builtin="supertorus" params="5000 .3 1 1"/></asset>',
+            "at most 300 as params",
+        ),
         ('<size nuserdata="2000000000"/>', "at most 1000000 nuserdata"),
         ('<size nkey="2000000000"/>', "at most 10000 nkey"),
         ('<size memory="100T"/>', "memory of <size>"),
         ('<option iterations="1000000000"/>', "at most 10000 iterations"),
         ('<sensor><user dim="500000000"/></sensor>', "at most 10000 dim"),
         ('<compiler><lengthrange timestep="1e-9"/></compiler>', "timestep of <lengthrange>"),
-        ('<worldbody><flexcomp name="f" count="900 900 1"/></worldbody>', "deformable body .<flexcomp>."),
-        ("<worldbody>" + "<frame>" * 400 + "</frame>" * 400 + "</worldbody>", "at most 200 elements deep"),
+        (
+            '<worldbody><flexcomp name="f" count="900 900 1"/></worldbody>',
+            "deformable body .<flexcomp>.",
+        ),
+        (
+            "<worldbody>" + "<frame>" * 400 + "</frame>" * 400 + "</worldbody>",
+            "at most 200 elements deep",
+        ),
     ],
 )
 def test_a_small_file_does_not_ask_for_much(also: str, message: str) -> None:
@@ -349,10 +476,13 @@ def test_a_long_chain_of_links_is_refused() -> None:
 
 
 def test_files_that_a_model_names_are_regular_and_bounded(tmp_path: Path) -> None:
-    """Catches a FIFO that waits for ever, links to devices, circles of files, and a picture that fills the memory."""
+    """Catches a FIFO that waits for ever, links to devices, circles of files, and a picture that
+    fills the memory."""
     os.mkfifo(tmp_path / "fifo.xml")
     (tmp_path / "null.stl").symlink_to("/dev/zero")
-    (tmp_path / "self.xml").write_text('<mujoco><asset><model name="q" file="self.xml"/></asset></mujoco>')
+    (tmp_path / "self.xml").write_text(
+        '<mujoco><asset><model name="q" file="self.xml"/></asset></mujoco>'
+    )
     (tmp_path / "loop.xml").write_text('<mujoco><include file="loop.xml"/></mujoco>')
     head = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (600_000).to_bytes(4, "big") * 2
     (tmp_path / "large.png").write_bytes(head)
@@ -385,7 +515,8 @@ def test_a_link_to_a_model_is_read(tmp_path: Path) -> None:
 
 
 def test_options_of_mujoco_in_a_urdf_are_used() -> None:
-    """Catches an element <mujoco> that is thrown away: it says the gravity, and how inertias are mended."""
+    """Catches an element <mujoco> that is thrown away: it says the gravity, and how inertias are
+    mended."""
     model = urdf(also='<mujoco><option gravity="0 0 -1.62"/></mujoco>')
     np.testing.assert_allclose(torque(model), np.multiply(TORQUE, 1.62 / 9.81), rtol=1e-7)
 
@@ -394,7 +525,9 @@ def test_a_shape_that_mujoco_cannot_read_does_not_change_the_judgement(tmp_path:
     """Catches a robot that one reader takes and the one with pictures does not."""
     (tmp_path / "bad.stl").write_bytes(b"no mesh")
     for shape in ('<mesh filename="bad.stl"/>', '<box size="0 0 0"/>', '<box size="a b"/>'):
-        (tmp_path / "arm.urdf").write_text(urdf(fore=f"<visual><geometry>{shape}</geometry></visual>"))
+        (tmp_path / "arm.urdf").write_text(
+            urdf(fore=f"<visual><geometry>{shape}</geometry></visual>")
+        )
         np.testing.assert_allclose(torque(tmp_path / "arm.urdf"), TORQUE, rtol=1e-7)
         with pytest.warns(UserWarning, match="rods between the joints"):
             robot(tmp_path / "arm.urdf").close()
@@ -410,7 +543,9 @@ def test_make_elastic_reads_the_same_models() -> None:
             make_elastic(bad, {"elbow": joint})
         assert str(error.value) == refusals(bad)[0]
     with pytest.raises(ConfigurationError, match="MuJoCo cannot compile the specification"):
-        make_elastic(mujoco.MjSpec.from_string(mjcf().replace('mass="1"', 'mass="0"')), {"j1": joint})
+        make_elastic(
+            mujoco.MjSpec.from_string(mjcf().replace('mass="1"', 'mass="0"')), {"j1": joint}
+        )
 
 
 def test_everybody_takes_a_specification_and_says_what_a_compiled_model_is_good_for() -> None:
@@ -418,7 +553,9 @@ def test_everybody_takes_a_specification_and_says_what_a_compiled_model_is_good_
     np.testing.assert_allclose(torque(spec), TORQUE, rtol=1e-7)
     np.testing.assert_allclose(torque(spec.compile()), TORQUE, rtol=1e-7)
     assert read_model(spec).spec is not spec
-    with pytest.raises(ConfigurationError, match=r"a compiled model cannot be made elastic; give its file"):
+    with pytest.raises(
+        ConfigurationError, match=r"a compiled model cannot be made elastic; give its file"
+    ):
         robot(spec.compile())
 
 
@@ -433,7 +570,9 @@ from_mujoco(lambda: mujoco.MjSpec.from_string(text), "the model", "read")
 
 def test_ctrl_c_reaches_a_long_compilation() -> None:
     """Catches MuJoCo in the main thread, which hears no signal for minutes."""
-    process = subprocess.Popen([sys.executable, "-c", LONG], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", LONG], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     assert process.stdout is not None
     process.stdout.readline()
     time.sleep(0.3)
@@ -446,12 +585,15 @@ def test_ctrl_c_reaches_a_long_compilation() -> None:
 def test_warnings_of_mujoco_write_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches MUJOCO_LOG.TXT in the folder of a user."""
     monkeypatch.chdir(tmp_path)
-    compiled_model(urdf(also=FINGERS.replace('"finger_r" type="revolute"', '"finger_r" type="fixed"')))
+    compiled_model(
+        urdf(also=FINGERS.replace('"finger_r" type="revolute"', '"finger_r" type="fixed"'))
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_takes_the_text_of_a_model_and_does_not_print_it(tmp_path: Path) -> None:
-    """Catches a mark or a declared encoding that the written file does not have, and a flood on the terminal."""
+    """Catches a mark or a declared encoding that the written file does not have, and a flood on
+    the terminal."""
     text = urdf(head='\ufeff<?xml version="1.0" encoding="gbk"?>\n')
     arguments = robot_arguments(Robot(model=text, stiffness=400.0))
     file = write_robot(arguments, tmp_path)
@@ -470,4 +612,6 @@ def test_more_elastic_joints_than_can_be_simulated_are_refused() -> None:
     said = refusals(model)
     with pytest.raises(ConfigurationError) as error:
         make_elastic(model, {f"k{i}": joint for i in range(90)})
-    assert {*said, str(error.value)} == {"at most 80 joints can be elastic, got 90; name those that matter"}
+    assert {*said, str(error.value)} == {
+        "at most 80 joints can be elastic, got 90; name those that matter"
+    }

@@ -1,4 +1,5 @@
-"""What others write: configurations and residual folders with mistakes are taken or refused, in time and in bounds."""
+"""What others write: configurations and residual folders with mistakes are taken or refused, in
+time and in bounds."""
 
 import json
 import os
@@ -29,24 +30,35 @@ from train.learn.train_config import TrainConfig, training_worlds
 from train.runs.kinds import TELLING
 
 ROOT = Path(__file__).parents[1]
-CASES, LONGEST_S, MOST_BYTES = 2000, 300, 2 * 10**9
+CASES = 2000
+LONGEST_S = 300
+MOST_BYTES = 2 * 10**9
 
 
 def test_mutated_configurations_and_folders_are_taken_or_refused(tmp_path: Path) -> None:
-    """Catches a traceback, more than 2 GB, a case that does not end, and a file outside of the working folder."""
-    limit = f"import resource; resource.setrlimit(resource.RLIMIT_DATA, ({MOST_BYTES}, {MOST_BYTES}))"
+    """Catches a traceback, more than 2 GB, a case that does not end, and a file outside of the
+    working folder."""
+    limit = (
+        f"import resource; resource.setrlimit(resource.RLIMIT_DATA, ({MOST_BYTES}, {MOST_BYTES}))"
+    )
     code = f"{limit}; from tests.mutations import main; raise SystemExit(main(0, {CASES}) > 0)"
     (tmp_path / "tmp").mkdir()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "tmp")}
     played = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=LONGEST_S
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
     )
     assert played.returncode == 0, played.stdout[-3000:] + played.stderr[-3000:]
     assert [path.name for path in tmp_path.rglob("*")] == ["tmp"]
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 100_000, '{"a": 1, "a": 2}', "NaN", "1e999", "9" * 5000, '"\\u0000"', '"\\ud800"']
+    "text",
+    ["[" * 100_000, '{"a": 1, "a": 2}', "NaN", "1e999", "9" * 5000, '"\\u0000"', '"\\ud800"'],
 )
 def test_json_has_limits(text: str) -> None:
     """Catches a RecursionError, a key that hides another, and values that no file can hold."""
@@ -62,19 +74,35 @@ def copied(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("name", "tensor", "message"),
     [
-        ("bias0", np.zeros((64, 1), dtype=np.float32), r"bias0 must have the shape \(n,\).*got \(64, 1\)"),
+        (
+            "bias0",
+            np.zeros((64, 1), dtype=np.float32),
+            r"bias0 must have the shape \(n,\).*got \(64, 1\)",
+        ),
         ("bias1", np.zeros((), dtype=np.float32), r"bias1 must have the shape \(n,\).*got \(\)"),
-        ("weight1", np.zeros((64, 63), dtype=np.float32), r"weight1 must have the shape \(64, 64\), got \(64, 63\)"),
-        ("weight1", np.zeros((64, 64), dtype=np.int32), "weight1.*must be of type F32 or F64, got I32"),
+        (
+            "weight1",
+            np.zeros((64, 63), dtype=np.float32),
+            r"weight1 must have the shape \(64, 64\), got \(64, 63\)",
+        ),
+        (
+            "weight1",
+            np.zeros((64, 64), dtype=np.int32),
+            "weight1.*must be of type F32 or F64, got I32",
+        ),
         ("weight0", np.full((64, 14), np.inf, dtype=np.float32), "weight0 must be finite"),
         ("weight0", np.full((64, 14), 1e30, dtype=np.float32), "weight0 must be finite.*within"),
         ("bias9", np.zeros(3, dtype=np.float32), "must be mean, std, weight0"),
     ],
 )
-def test_tensors_that_make_no_network_are_refused(name: str, tensor: Any, message: str, tmp_path: Path) -> None:
+def test_tensors_that_make_no_network_are_refused(
+    name: str, tensor: Any, message: str, tmp_path: Path
+) -> None:
     """Catches a tensor that passes when it is read and fails, or gives no number, in `predict`."""
     folder = copied(tmp_path)
-    save_file(load_file(folder / "weights.safetensors") | {name: tensor}, folder / "weights.safetensors")
+    save_file(
+        load_file(folder / "weights.safetensors") | {name: tensor}, folder / "weights.safetensors"
+    )
     with pytest.raises(ConfigurationError, match=rf"weights\.safetensors.*{message}"):
         load_residual(folder)
 
@@ -83,7 +111,11 @@ def test_tensors_that_make_no_network_are_refused(name: str, tensor: Any, messag
     ("path", "value", "message"),
     [
         (("settings", "joints"), [], "settings.joints must have at least 1 entry"),
-        (("settings", "decision_period"), 10**30, "settings.decision_period must be a whole number >= 1 and <= 100000"),
+        (
+            ("settings", "decision_period"),
+            10**30,
+            "settings.decision_period must be a whole number >= 1 and <= 100000",
+        ),
         (("training", "config"), [], "config must be a mapping"),
         (("training", "config", "seeds"), 5, "config.seeds must be a list, got 5"),
         (("training", "config", "scenarios"), 7, "config.scenarios must be a list, got 7"),
@@ -102,7 +134,9 @@ def test_descriptions_that_nobody_can_use_are_refused(
         holder = holder[key]
     holder[path[-1]] = value
     (folder / "residual.json").write_text(json.dumps(content))
-    with pytest.raises(ConfigurationError, match=rf"residual\.json describes no residual: .*{message}"):
+    with pytest.raises(
+        ConfigurationError, match=rf"residual\.json describes no residual: .*{message}"
+    ):
         read_description(folder)
 
 
@@ -112,7 +146,9 @@ def test_a_motion_of_training_that_no_report_can_name_is_refused_at_once(tmp_pat
     content = json.loads((folder / "residual.json").read_text())
     content["training"]["config"]["reference"] = {"steps": 3}
     (folder / "residual.json").write_text(json.dumps(content))
-    with pytest.raises(ConfigurationError, match=r"residual\.json: training\.config\.reference: .*'step_period'"):
+    with pytest.raises(
+        ConfigurationError, match=r"residual\.json: training\.config\.reference: .*'step_period'"
+    ):
         expand([PolicySpec(name=f"residual:{folder}")])
 
 
@@ -126,12 +162,22 @@ def test_a_residual_far_down_in_folders_needs_no_label(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "model", "message"),
     [
-        ("testbed.yaml", TrainConfig, "this is the configuration of a comparison: elastic compare FILE"),
-        ("train_testbed.yaml", CompareConfig, "this is the configuration of a training: elastic train FILE"),
+        (
+            "testbed.yaml",
+            TrainConfig,
+            "this is the configuration of a comparison: elastic compare FILE",
+        ),
+        (
+            "train_testbed.yaml",
+            CompareConfig,
+            "this is the configuration of a training: elastic train FILE",
+        ),
         ("bench.yaml", CompareConfig, "this is the configuration of a bench: elastic bench FILE"),
     ],
 )
-def test_a_configuration_of_another_command_is_recognised(file: str, model: Any, message: str) -> None:
+def test_a_configuration_of_another_command_is_recognised(
+    file: str, model: Any, message: str
+) -> None:
     """Catches twenty unknown parameters in the place of one sentence."""
     with pytest.raises(ConfigurationError, match=message):
         load_yaml(ROOT / "configs" / file, model)
@@ -141,14 +187,18 @@ def test_telling_keys_are_those_of_one_kind_alone() -> None:
     """Catches a key that was renamed, and one that tells nothing."""
     models = {"comparison": CompareConfig, "training": TrainConfig, "bench": BenchConfig}
     for kind, (_, keys) in TELLING.items():
-        others = {name for other, model in models.items() if other != kind for name in model.model_fields}
+        others = {
+            name for other, model in models.items() if other != kind for name in model.model_fields
+        }
         assert keys <= set(models[kind].model_fields) - others
 
 
 def test_worlds_beyond_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a training that ends by the kernel's hand, without a word."""
     monkeypatch.setattr("os.sysconf", lambda name: 4096 if name == "SC_PAGE_SIZE" else 10**6)
-    with pytest.raises(ConfigurationError, match=r"100000 worlds take about 10 GB.* has 4\.1 GB; .*at most 40960"):
+    with pytest.raises(
+        ConfigurationError, match=r"100000 worlds take about 10 GB.* has 4\.1 GB; .*at most 40960"
+    ):
         training_worlds(TrainConfig(worlds=100_000), [("nominal", 100_000)], 1)
 
 
@@ -156,7 +206,9 @@ def test_worlds_beyond_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -
 def test_worlds_of_a_vector_environment_beyond_the_memory_are_refused(name: str) -> None:
     """Catches a computer that stands still, and a number that Python does not turn into text."""
     for worlds in (10**12, 10**5000):
-        with pytest.raises(ConfigurationError, match=r"worlds take about .* GB of memory.*set num_envs to at most"):
+        with pytest.raises(
+            ConfigurationError, match=r"worlds take about .* GB of memory.*set num_envs to at most"
+        ):
             gymnasium.make_vec(name, num_envs=worlds, vectorization_mode="vector_entry_point")
 
 
@@ -167,10 +219,14 @@ def test_a_physics_step_that_never_ends_a_control_period_is_refused(timestep_s: 
         substeps(0.004, timestep_s)
 
 
-@pytest.mark.parametrize("name", ["json:loads", "os:getpid", "no_such_module:f", "json:no_such", "os:sep", "a\\b:c"])
+@pytest.mark.parametrize(
+    "name", ["json:loads", "os:getpid", "no_such_module:f", "json:no_such", "os:sep", "a\\b:c"]
+)
 def test_a_function_that_makes_no_policy_is_explained(name: str) -> None:
     """Catches a traceback for a function that takes no environment."""
-    with pytest.raises(ConfigurationError, match=r'"module:function", a function that takes the environment'):
+    with pytest.raises(
+        ConfigurationError, match=r'"module:function", a function that takes the environment'
+    ):
         make_policy(PolicySpec(name=name), object())
 
 

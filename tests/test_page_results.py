@@ -1,4 +1,5 @@
-"""Figures of README and docs: they come from docs/results, each page shows what is there, and nothing else."""
+"""Figures of README and docs: they come from docs/results, each page shows what is there, and
+nothing else."""
 
 import csv
 import re
@@ -12,7 +13,17 @@ import pytest
 
 from docs.pages.cells import KEPT, Cells, Kept, condense, in_table_unit, keep, read_rows
 from docs.pages.learned import MAPS, learned_maps
-from docs.pages.write import PARTS, PICTURES, TABLES, Results, figure, marks, page_with, pages, reads
+from docs.pages.write import (
+    PARTS,
+    PICTURES,
+    TABLES,
+    Results,
+    figure,
+    marks,
+    page_with,
+    pages,
+    reads,
+)
 from docs.pages.write import main as write_pages
 from elastic_env.core.errors import ConfigurationError
 from train.report.leaderboard import leaderboard_markdown, read_leaderboard
@@ -33,12 +44,16 @@ def results_of_the_docs() -> Results:
 
 def changed_rows(name: str, change: Callable[[str, str], str]) -> list[dict[str, str]]:
     """Rows of a table with every cell changed: its column and its text."""
-    return [{key: change(key, text) for key, text in row.items()} for row in read_rows(RESULTS / f"{name}.csv")]
+    return [
+        {key: change(key, text) for key, text in row.items()}
+        for row in read_rows(RESULTS / f"{name}.csv")
+    ]
 
 
 def with_changed(name: str, change: Callable[[str, str], str], folder: Path) -> Results:
     """All results, with one table changed."""
-    before, rows = results_of_the_docs(), changed_rows(name, change)
+    before = results_of_the_docs()
+    rows = changed_rows(name, change)
     if name in before.tables:
         return replace(before, tables={**before.tables, name: rows})
     table = write_records(rows, folder / f"{name}.csv")
@@ -71,16 +86,36 @@ def test_pages_are_those_of_the_results_beside_them() -> None:
     """Catches a figure that somebody typed, and results that were renewed without the page."""
     results = results_of_the_docs()
     shown = {page.name: page.read_text(encoding="utf-8") for page in pages(ROOT)}
-    assert {"README.md", "leaderboard.md", "learned.md", "walker.md", "testbed.md", "iterative.md"} <= set(shown)
+    assert {
+        "README.md",
+        "leaderboard.md",
+        "learned.md",
+        "walker.md",
+        "testbed.md",
+        "iterative.md",
+    } <= set(shown)
     assert {name: page_with(text, results) for name, text in shown.items()} == shown
     for name, picture in PICTURES.items():
-        assert (ROOT / "docs" / "images" / name).read_text(encoding="utf-8") == picture.text(results)
+        assert (ROOT / "docs" / "images" / name).read_text(encoding="utf-8") == picture.text(
+            results
+        )
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other(name: str, tmp_path: Path) -> None:
+def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other(
+    name: str, tmp_path: Path
+) -> None:
     """Catches a page that repeats a figure outside its marks, and a part that ignores its table."""
-    place = {"x", "y", "failed", "episodes", "training_seeds", "seeds", "covered", "stiffness_nm_per_rad"}
+    place = {
+        "x",
+        "y",
+        "failed",
+        "episodes",
+        "training_seeds",
+        "seeds",
+        "covered",
+        "stiffness_nm_per_rad",
+    }
     place |= {"damping_nms_per_rad", "joints", "time_s", "single_support"}
     changed = with_changed(name, lambda key, text: text if key in place else larger(text), tmp_path)
     before = results_of_the_docs()
@@ -89,31 +124,46 @@ def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other
         assert (own.text(changed) != own.text(before)) == (name in own.reads and not pictures), part
     for page in pages(ROOT):
         text = page.read_text(encoding="utf-8")
-        assert (page_with(text, changed) != text) == (name in reads(text) and name not in DRAWN), page.name
+        assert (page_with(text, changed) != text) == (name in reads(text) and name not in DRAWN), (
+            page.name
+        )
     for own in PICTURES.values():
         assert (own.text(changed) != own.text(before)) == (name in own.reads)
 
 
 @pytest.mark.parametrize(
-    ("name", "metric"), [(kept.table or name, metric) for name, kept in KEPT.items() for metric in kept.metrics]
+    ("name", "metric"),
+    [(kept.table or name, metric) for name, kept in KEPT.items() for metric in kept.metrics],
 )
 def test_every_kept_figure_is_shown(name: str, metric: str, tmp_path: Path) -> None:
     """Catches a metric that is kept for nobody, and a table that shows another one in its place."""
-    changed = with_changed(name, lambda key, text: larger(text) if key == metric else text, tmp_path)
+    changed = with_changed(
+        name, lambda key, text: larger(text) if key == metric else text, tmp_path
+    )
     texts = [page.read_text(encoding="utf-8") for page in pages(ROOT)]
     assert any(page_with(text, changed) != text for text in texts if name in reads(text))
 
 
 def test_one_number_changes_a_sentence(checkout: Path) -> None:
-    """Catches a figure within a sentence that stays, or that is rounded to other digits than the author's."""
-    text = "It is <!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->9.99<!-- / --> mrad."
+    """Catches a figure within a sentence that stays, or that is rounded to other digits than the
+    author's."""
+    text = (
+        "It is <!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->9.99<!-- / -->"
+        " mrad."
+    )
     Path("docs", "one.md").write_text(text)
     write_pages([])
     assert re.sub("<!--.*?-->", "", Path("docs", "one.md").read_text()) == "It is 1.63 mrad."
     results = Results.read(checkout / "docs" / "results")
-    assert figure(results, "paper; input_output; 24 s; nominal; worst; pelvis_roll_peak_rad", "1") == "3"
+    assert (
+        figure(results, "paper; input_output; 24 s; nominal; worst; pelvis_roll_peak_rad", "1")
+        == "3"
+    )
     for wrong, message in (
-        ("paper; nobody; 3 s; nominal; pelvis_roll_rms_rad", "no cell nobody, 3 s, nominal, median"),
+        (
+            "paper; nobody; 3 s; nominal; pelvis_roll_rms_rad",
+            "no cell nobody, 3 s, nominal, median",
+        ),
         ("nothing; input; 3 s; nominal; x", "is no figure"),
         ("paper; input; 3 s; x", "is no figure"),
     ):
@@ -123,42 +173,65 @@ def test_one_number_changes_a_sentence(checkout: Path) -> None:
 
 def test_a_page_is_written_between_its_marks_and_nowhere_else(checkout: Path) -> None:
     """Catches text of the page that is lost, tables that pile up, and a page without marks."""
-    results, page = Results.read(checkout / "docs" / "results"), Path("README.md")
+    results = Results.read(checkout / "docs" / "results")
+    page = Path("README.md")
     page.write_text(f"before\n{BEGIN}\nold 1.23\n{END}\nafter\n")
     Path("docs", "other.md").write_text("no marks")
     for _ in range(2):
         write_pages([])
-        assert page.read_text() == f"before\n{BEGIN}\n\n{leaderboard_markdown(results.standings)}\n{END}\nafter\n"
+        assert (
+            page.read_text()
+            == f"before\n{BEGIN}\n\n{leaderboard_markdown(results.standings)}\n{END}\nafter\n"
+        )
     assert Path("docs", "other.md").read_text() == "no marks"
     for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):
         with pytest.raises(ConfigurationError, match="needs the lines"):
             page_with(text, results)
     Path("docs", "results", "gallery.csv").unlink()
-    with pytest.raises(ConfigurationError, match=r"gallery.csv is missing; python -m docs.pages.gallery"):
+    with pytest.raises(
+        ConfigurationError, match=r"gallery.csv is missing; python -m docs.pages.gallery"
+    ):
         write_pages([])
     Path("docs", "results", "demo_episodes.csv").unlink()
-    with pytest.raises(ConfigurationError, match=r"demo_episodes.csv is missing; copy it from runs/demo"):
+    with pytest.raises(
+        ConfigurationError, match=r"demo_episodes.csv is missing; copy it from runs/demo"
+    ):
         write_pages([])
 
 
 # What is kept of a comparison.
 
 EPISODES = [
-    {"policy": p, "reference": "3 s", "scenario": s, "termination": end, "pelvis_error_rms_rad": value}
+    {
+        "policy": p,
+        "reference": "3 s",
+        "scenario": s,
+        "termination": end,
+        "pelvis_error_rms_rad": value,
+    }
     for p, s, end, value in (
-        ("input", "soft", "", "0.001"), ("input", "soft", "", "0.003"), ("input", "soft", "", "0.008"),
-        ("input", "soft", "fell", "0.5"), ("zero", "soft", "fell", ""), ("input", "push", "", "0.002"),
+        ("input", "soft", "", "0.001"),
+        ("input", "soft", "", "0.003"),
+        ("input", "soft", "", "0.008"),
+        ("input", "soft", "fell", "0.5"),
+        ("zero", "soft", "fell", ""),
+        ("input", "push", "", "0.002"),
     )
-]  # fmt: skip
+]
 
 
 def test_a_cell_has_its_statistics_without_those_who_fell() -> None:
-    """Catches a fall that is averaged in, a mean in the place of a median, and cells that run into each other."""
+    """Catches a fall that is averaged in, a mean in the place of a median, and cells that run
+    into each other."""
     head, *rows = condense(EPISODES, Kept(("pelvis_error_rms_rad",), ("median", "mean", "worst")))
     table = [dict(zip(map(str, head), map(str, row), strict=True)) for row in rows]
     cells = Cells(table)
     row = cells.row("input", "3 s", "soft")
-    assert (row["episodes"], row["failed"], in_table_unit(row, "pelvis_error_rms_rad")) == ("4", "1", 3.0)
+    assert (row["episodes"], row["failed"], in_table_unit(row, "pelvis_error_rms_rad")) == (
+        "4",
+        "1",
+        3.0,
+    )
     assert cells.row("input", "3 s", "soft", "mean")["pelvis_error_rms_rad"] == "0.004"
     assert cells.row("input", "3 s", "soft", "worst")["pelvis_error_rms_rad"] == "0.008"
     assert cells.row("zero", "3 s", "soft")["pelvis_error_rms_rad"] == ""
@@ -168,7 +241,8 @@ def test_a_cell_has_its_statistics_without_those_who_fell() -> None:
 
 
 def test_a_run_is_kept_by_the_name_of_its_comparison(tmp_path: Path) -> None:
-    """Catches a table under the name of a folder, and a run of something else that overwrites one."""
+    """Catches a table under the name of a folder, and a run of something else that overwrites
+    one."""
     with pytest.raises(ConfigurationError, match="holds no finished comparison"):
         keep(tmp_path, tmp_path)
     columns = ["policy", "reference", "scenario", "termination", *KEPT["testbed"].metrics]
@@ -178,5 +252,7 @@ def test_a_run_is_kept_by_the_name_of_its_comparison(tmp_path: Path) -> None:
     assert keep(tmp_path, tmp_path).name == "testbed.csv"
     assert read_rows(tmp_path / "testbed.csv")[0]["link_error_rms_rad"] == "0.0123"
     (tmp_path / "config.yaml").write_text("name: mine\n")
-    with pytest.raises(ConfigurationError, match=r"nothing is kept of the comparison 'mine'.*paper, walker"):
+    with pytest.raises(
+        ConfigurationError, match=r"nothing is kept of the comparison 'mine'.*paper, walker"
+    ):
         keep(tmp_path, tmp_path)

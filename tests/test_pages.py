@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PLAIN = ["README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
 """Pages that are held to plain English."""
-MOST_WORDS, LONGEST = 900, 25
+MOST_WORDS = 900
+LONGEST = 25
 """Words of the README, and words of a sentence."""
 
 
@@ -26,12 +27,17 @@ def test_the_readme_is_one_screen_and_shows_python_early() -> None:
     """Catches a README that grows again, and a console dump in it."""
     assert len(README.split()) <= MOST_WORDS  # as `wc -w` counts: code and tables included
     assert README[: README.index("```python")].count("\n") < 60
-    assert all(block.count("\n") <= 20 for block in re.findall(r"```.*?```", README, flags=re.DOTALL))
+    assert all(
+        block.count("\n") <= 20 for block in re.findall(r"```.*?```", README, flags=re.DOTALL)
+    )
 
 
 def test_the_python_of_the_readme_prints_what_it_says() -> None:
     """Catches a snippet that no longer runs, and figures beside it that are old."""
-    code, printed = (re.findall(rf"```{kind}\n(.*?)```", README, flags=re.DOTALL)[0] for kind in ("python", "text"))
+    code, printed = (
+        re.findall(rf"```{kind}\n(.*?)```", README, flags=re.DOTALL)[0]
+        for kind in ("python", "text")
+    )
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         exec(code, {})
@@ -74,9 +80,12 @@ def _resolved(name: str) -> object:
     return None
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))])
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+)
 def test_links_lead_somewhere(page: Path) -> None:
-    """Catches a page or a heading that was renamed; pages that the site generates are left to its own build."""
+    """Catches a page or a heading that was renamed; pages that the site generates are left to
+    its own build."""
     for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", page.read_text(encoding="utf-8")):
         path, _, heading = target.partition("#")
         file = (page.parent / path).resolve() if path else page
@@ -86,7 +95,9 @@ def test_links_lead_somewhere(page: Path) -> None:
         if heading:
             text = file.read_text(encoding="utf-8")
             titles = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
-            assert heading in {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}, target
+            assert heading in {
+                re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles
+            }, target
 
 
 def test_the_citation_agrees_with_the_package() -> None:

@@ -25,12 +25,16 @@ IDS = {"testbed": "elastic_env/Testbed-v0", "walker": "elastic_env/WalkInPlace-v
 def made(robot: str, worlds: int, scenario: str) -> Any:
     if worlds == 1:
         return gymnasium.make(IDS[robot], scenario=scenario)
-    return gymnasium.make_vec(IDS[robot], num_envs=worlds, vectorization_mode="vector_entry_point", scenario=scenario)
+    return gymnasium.make_vec(
+        IDS[robot], num_envs=worlds, vectorization_mode="vector_entry_point", scenario=scenario
+    )
 
 
 def settled(info: dict[str, Any]) -> dict[str, Any]:
     """A plain dictionary, also of what is computed when it is looked at."""
-    return {key: settled(value) if isinstance(value, dict) else value for key, value in info.items()}
+    return {
+        key: settled(value) if isinstance(value, dict) else value for key, value in info.items()
+    }
 
 
 @pytest.mark.parametrize("how", COPIES)
@@ -48,7 +52,8 @@ def settled(info: dict[str, Any]) -> dict[str, Any]:
 def test_a_copy_in_the_midst_of_an_episode_goes_on_bit_for_bit(
     how: str, robot: str, worlds: int, scenario: str
 ) -> None:
-    """Catches views that stay with the original's physics, lambdas, and a generator or a filter that is left out."""
+    """Catches views that stay with the original's physics, lambdas, and a generator or a filter
+    that is left out."""
     env = made(robot, worlds, scenario)
     env.reset(seed=3)
     generator = np.random.default_rng(0)

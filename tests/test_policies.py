@@ -1,4 +1,5 @@
-"""The named policies and `Compensated`: one contract on scalar and vector environments, with and without state."""
+"""The named policies and `Compensated`: one contract on scalar and vector environments, with and
+without state."""
 
 import dataclasses
 import json
@@ -49,9 +50,12 @@ def scalar(**arguments: Any) -> Any:
 def vector(num_envs: int, **arguments: Any) -> Any:
     """The vector environment."""
     return gymnasium.make_vec(
-        ID, num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=1,
+        ID,
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        num_threads=1,
         **{"reference": SHORT, "scenario": "nominal", **arguments},
-    )  # fmt: skip
+    )
 
 
 def column(env: Any, name: str) -> int:
@@ -59,16 +63,22 @@ def column(env: Any, name: str) -> int:
     return env.unwrapped.task.observation_table.names.index(name)
 
 
-def scalar_actions(variant: str, seed: int, steps: int, restart_at: int | None) -> tuple[list[Array], list[float]]:
+def scalar_actions(
+    variant: str, seed: int, steps: int, restart_at: int | None
+) -> tuple[list[Array], list[float]]:
     """Actions and rewards of one world that is reset where its episode ends, and once before."""
     env = scalar()
     name, options = VARIANTS[variant]
     policy = baselines.make(name, env, **options)
     observation, _ = env.reset(seed=seed)
-    state, start, actions, rewards = None, True, [], []
+    state = None
+    start = True
+    actions = []
+    rewards = []
     for step in range(steps):
         if step == restart_at:
-            observation, start = env.reset()[0], True
+            observation = env.reset()[0]
+            start = True
         action, state = policy.predict(observation, state, np.array(start))
         observation, reward, terminated, truncated, _ = env.step(action)
         actions.append(action)
@@ -81,14 +91,19 @@ def scalar_actions(variant: str, seed: int, steps: int, restart_at: int | None) 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
-    """Catches memory that leaks between worlds or episodes, and formulas that depend on the size of the batch."""
+    """Catches memory that leaks between worlds or episodes, and formulas that depend on the size
+    of the batch."""
     env = vector(2, autoreset_mode=AutoresetMode.SAME_STEP)
-    steps, restart_at = env.unwrapped.task.num_steps + 30, 270
+    steps = env.unwrapped.task.num_steps + 30
+    restart_at = 270
     name, options = VARIANTS[variant]
     policy = baselines.make(name, env, **options)
     observation, _ = env.reset(seed=11)
-    state, start = None, np.ones(2, dtype=np.bool_)
-    actions, rewards, starts = [], [], 0
+    state = None
+    start = np.ones(2, dtype=np.bool_)
+    actions = []
+    rewards = []
+    starts = 0
     for step in range(steps):
         if step == restart_at:  # only the second world
             start = np.array([False, True])
@@ -108,24 +123,33 @@ def test_vector_actions_are_the_scalar_ones_row_by_row(variant: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_evaluate_policy_of_sb3_gives_the_return_of_a_plain_loop(name: str) -> None:
-    """Catches a signature, a shape or a state that Stable-Baselines3 cannot use, and lost episode starts."""
+    """Catches a signature, a shape or a state that Stable-Baselines3 cannot use, and lost
+    episode starts."""
     env = scalar()
     worlds = DummyVecEnv([lambda: env])
     worlds.seed(3)
     returns, lengths = evaluate_policy(
-        baselines.make(name, env), worlds, n_eval_episodes=2, return_episode_rewards=True, warn=False
+        baselines.make(name, env),
+        worlds,
+        n_eval_episodes=2,
+        return_episode_rewards=True,
+        warn=False,
     )
     steps = env.unwrapped.task.num_steps
     _, rewards = scalar_actions(name, 3, 2 * steps, None)
-    expected = np.array(rewards, dtype=np.float32).astype(np.float64).reshape(2, steps).sum(axis=1)  # SB3's precision
+    expected = (
+        np.array(rewards, dtype=np.float32).astype(np.float64).reshape(2, steps).sum(axis=1)
+    )  # SB3's precision
     np.testing.assert_allclose(returns, expected, rtol=1e-12)
     assert lengths == [steps, steps]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_are_float32_of_the_shape_of_the_observations(name: str) -> None:
-    """Catches float64 actions, and a batch dimension that is lost or added; one row alone is the same."""
-    env, worlds = scalar(), vector(2)
+    """Catches float64 actions, and a batch dimension that is lost or added; one row alone is the
+    same."""
+    env = scalar()
+    worlds = vector(2)
     single, _ = env.reset(seed=4)
     rows, _ = worlds.reset(seed=4)
     action, _ = baselines.make(name, env, **at_once(name)).predict(single)
@@ -141,7 +165,9 @@ def test_actions_are_float32_of_the_shape_of_the_observations(name: str) -> None
 
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
-@pytest.mark.parametrize("make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"])
+@pytest.mark.parametrize(
+    "make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"]
+)
 def test_predict_without_state_in_mid_episode_is_an_error(name: str, make_env: Any) -> None:
     """Catches a policy that silently starts its ramp anew because the caller forgot the state."""
     env = make_env()
@@ -155,7 +181,8 @@ def test_predict_without_state_in_mid_episode_is_an_error(name: str, make_env: A
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
 def test_predict_without_state_is_an_error_where_no_episode_starts(name: str) -> None:
-    """Catches episode_start that is not believed: one world in the middle of an episode is enough."""
+    """Catches episode_start that is not believed: one world in the middle of an episode is
+    enough."""
     env = vector(2)
     observation, _ = env.reset(seed=0)
     with pytest.raises(ElasticError, match="without `state`"):
@@ -175,7 +202,8 @@ def test_state_of_another_number_of_worlds_is_an_error(name: str) -> None:
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
 def test_episode_start_clears_its_rows_and_no_others(name: str) -> None:
-    """Catches memory that survives a new episode, and a new episode that clears the memory of its neighbours."""
+    """Catches memory that survives a new episode, and a new episode that clears the memory of
+    its neighbours."""
     env = vector(2)
     policy = baselines.make(name, env)
     observation, _ = env.reset(seed=0)
@@ -202,7 +230,8 @@ def test_predict_changes_neither_state_nor_observation(name: str) -> None:
 
 
 def test_zero_and_uncompensated_play_the_reference_back() -> None:
-    """Catches an offset where there is no controller to add one: on the testbed both are nothing."""
+    """Catches an offset where there is no controller to add one: on the testbed both are
+    nothing."""
     env = vector(2)
     observation, _ = env.reset(seed=0)
     for name in ("zero", "uncompensated"):
@@ -212,13 +241,18 @@ def test_zero_and_uncompensated_play_the_reference_back() -> None:
 
 @pytest.mark.parametrize("name", ["zero", "uncompensated", "input", "dynamic"])
 def test_policies_other_than_the_oracle_get_along_without_the_truth(name: str) -> None:
-    """Catches a policy that reads the plant: it gets by with the assumed model and the names of its observations."""
+    """Catches a policy that reads the plant: it gets by with the assumed model and the names of
+    its observations."""
     env = vector(2, scenario="soft+payload")
     inside = env.unwrapped
     task = SimpleNamespace(observation_table=inside.task.observation_table)
-    blind = SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task))
+    blind = SimpleNamespace(
+        unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task)
+    )
     observation, _ = env.reset(seed=0)
-    actions = [baselines.make(name, e, **at_once(name)).predict(observation)[0] for e in (env, blind)]
+    actions = [
+        baselines.make(name, e, **at_once(name)).predict(observation)[0] for e in (env, blind)
+    ]
     np.testing.assert_array_equal(actions[0], actions[1])
 
 
@@ -252,7 +286,8 @@ def compensation(env: Any, **options: Any) -> tuple[float, float]:
 
 @pytest.mark.parametrize("scenario", ["nominal", "soft", "stiff", "payload", "backlash"])
 def test_input_knows_the_assumed_model_and_not_the_scenario(scenario: str) -> None:
-    """Catches a compensator that is told the true stiffness or mass: it takes 1001 N·m/rad and 60 N·m everywhere."""
+    """Catches a compensator that is told the true stiffness or mass: it takes 1001 N·m/rad and
+    60 N·m everywhere."""
     env = scalar(scenario=scenario)
     assert env.unwrapped.assumed_model.stiffness == pytest.approx([1001.0])
     action, q_ref = compensation(env)
@@ -270,9 +305,14 @@ def test_stiffness_can_be_a_number_a_list_or_an_identification(kind: str, tmp_pa
     path = tmp_path / "identification.json"
     path.write_text(json.dumps({"stiffness_nm_per_rad": 640.0, "points": 12}))
     given = {
-        "float": 640.0, "int": 640, "list": [640.0], "path": path, "text": str(path), "numpy": np.float32(640.0),
+        "float": 640.0,
+        "int": 640,
+        "list": [640.0],
+        "path": path,
+        "text": str(path),
+        "numpy": np.float32(640.0),
         "array": np.array([640]),
-    }[kind]  # fmt: skip
+    }[kind]
     action, q_ref = compensation(scalar(), stiffness=given)
     assert action == np.float32(60.0 * np.sin(q_ref) / 640.0)
 
@@ -292,16 +332,22 @@ def test_stiffness_that_is_no_number_is_an_error(value: object) -> None:
 
 @pytest.mark.parametrize("value", [-5.0, 0.0, np.nan, np.inf])
 def test_impossible_stiffness_says_which_unit_and_bound(value: float) -> None:
-    """Catches NaN that slips through, and messages that speak of Pydantic's unions instead of the stiffness."""
+    """Catches NaN that slips through, and messages that speak of Pydantic's unions instead of
+    the stiffness."""
     with pytest.raises(ConfigurationError) as caught:
         baselines.make("input", scalar(), stiffness=value)
-    assert re.fullmatch(r"[^\n]*stiffness must be a finite number > 0 \[N·m/rad\], got [^\n]*", str(caught.value))
+    assert re.fullmatch(
+        r"[^\n]*stiffness must be a finite number > 0 \[N·m/rad\], got [^\n]*", str(caught.value)
+    )
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(None, "no file"), ("{}", "is no identification"), ("K = 3", "is no identification")]
+    ("content", "message"),
+    [(None, "no file"), ("{}", "is no identification"), ("K = 3", "is no identification")],
 )
-def test_a_file_without_identification_is_an_error(content: str | None, message: str, tmp_path: Path) -> None:
+def test_a_file_without_identification_is_an_error(
+    content: str | None, message: str, tmp_path: Path
+) -> None:
     """Catches a bare KeyError or FileNotFoundError."""
     path = tmp_path / "other.json"
     if content is not None:
@@ -323,9 +369,15 @@ def test_unknown_policy_names_itself_and_the_choices() -> None:
 
 def test_the_table_of_make_has_every_policy_where_it_is() -> None:
     """Catches a policy that the docs leave out, or promise on a robot that does not have it."""
-    rows = [line.strip(" |").split(" | ") for line in (baselines.make.__doc__ or "").splitlines() if "| `" in line]
+    rows = [
+        line.strip(" |").split(" | ")
+        for line in (baselines.make.__doc__ or "").splitlines()
+        if "| `" in line
+    ]
     for column, known in ((1, ON_JOINTS), (2, ON_THE_WALKER)):
-        named = {name for row in rows for name in re.findall(r"`(\w+)`", row[0]) if row[column] != "–"}
+        named = {
+            name for row in rows for name in re.findall(r"`(\w+)`", row[0]) if row[column] != "–"
+        }
         assert named == set(known)
 
 
@@ -338,7 +390,9 @@ def test_unknown_option_names_itself_and_the_choices() -> None:
         baselines.make("input", scalar(), stifness=900.0)
 
 
-@pytest.mark.parametrize(("option", "choices"), [("output", ("taylor", "newton")), ("gravity", ("hinge", "tree"))])
+@pytest.mark.parametrize(
+    ("option", "choices"), [("output", ("taylor", "newton")), ("gravity", ("hinge", "tree"))]
+)
 def test_unknown_method_lists_the_choices(option: str, choices: tuple[str, ...]) -> None:
     """Catches a method that falls back to the default."""
     with pytest.raises(ConfigurationError) as caught:
@@ -348,13 +402,17 @@ def test_unknown_method_lists_the_choices(option: str, choices: tuple[str, ...])
 
 def test_ramp_must_be_positive() -> None:
     """Catches a division by zero in the ramp."""
-    with pytest.raises(ConfigurationError, match=r"ramp_s must be a finite number > 0 \[s\], got 0"):
+    with pytest.raises(
+        ConfigurationError, match=r"ramp_s must be a finite number > 0 \[s\], got 0"
+    ):
         baselines.make("input", scalar(), ramp_s=0.0)
 
 
 def test_oracle_takes_no_stiffness() -> None:
     """Catches an option of the oracle that would be ignored."""
-    with pytest.raises(ConfigurationError, match=r"does not use stiffness but knows the true one; .*: ramp_s$"):
+    with pytest.raises(
+        ConfigurationError, match=r"does not use stiffness but knows the true one; .*: ramp_s$"
+    ):
         baselines.make("oracle", scalar(), stiffness=np.array([900.0]))
 
 
@@ -364,15 +422,34 @@ FAST = WalkingGains(force_difference=1e-6)
 @pytest.mark.parametrize(
     ("name", "option", "message"),
     [
-        ("zero", {"stiffness": 5}, "'zero' of the testbed does not use stiffness; it has no options$"),
-        ("uncompensated", {"ramp_s": 1.0}, "'uncompensated' of the testbed does not use ramp_s; it has no options$"),
-        ("input", {"com_feedback": True}, "com_feedback; .*: stiffness, stiffness_scale, output, gravity, ramp_s$"),
-        ("dynamic", {"gains": FAST}, "gains; its options are: stiffness, stiffness_scale, output, gravity, ramp_s$"),
+        (
+            "zero",
+            {"stiffness": 5},
+            "'zero' of the testbed does not use stiffness; it has no options$",
+        ),
+        (
+            "uncompensated",
+            {"ramp_s": 1.0},
+            "'uncompensated' of the testbed does not use ramp_s; it has no options$",
+        ),
+        (
+            "input",
+            {"com_feedback": True},
+            "com_feedback; .*: stiffness, stiffness_scale, output, gravity, ramp_s$",
+        ),
+        (
+            "dynamic",
+            {"gains": FAST},
+            "gains; its options are: stiffness, stiffness_scale, output, gravity, ramp_s$",
+        ),
         ("oracle", {"output": "newton"}, "output; its options are: ramp_s$"),
     ],
 )
-def test_an_option_without_effect_is_an_error(name: str, option: dict[str, Any], message: str) -> None:
-    """Catches an option of the walker, or of a compensator that is not there, which changes nothing."""
+def test_an_option_without_effect_is_an_error(
+    name: str, option: dict[str, Any], message: str
+) -> None:
+    """Catches an option of the walker, or of a compensator that is not there, which changes
+    nothing."""
     with pytest.raises(ConfigurationError, match=message):
         baselines.make(name, scalar(), **option)
 
@@ -382,8 +459,11 @@ def test_an_option_that_is_none_is_not_given() -> None:
     assert isinstance(baselines.make("zero", scalar(), stiffness=None, output=None), Zero)
 
 
-def test_oracle_integrates_the_true_link_error_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an integrator of the wrong sign, in another unit of time, or without bound: 1 per s up to 50 mrad."""
+def test_oracle_integrates_the_true_link_error_up_to_its_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches an integrator of the wrong sign, in another unit of time, or without bound: 1 per
+    s up to 50 mrad."""
     env = scalar()
     policy = baselines.make("oracle", env, **AT_ONCE)
     observation, _ = env.reset(seed=0)
@@ -391,11 +471,14 @@ def test_oracle_integrates_the_true_link_error_up_to_its_limit(monkeypatch: pyte
     here = env.unwrapped.truth()
     truth = dataclasses.replace(here, q=np.array([[q_ref - 0.02]]))
     monkeypatch.setattr(env.unwrapped, "truth", lambda: truth)
-    state, actions = None, []
+    state = None
+    actions = []
     for _ in range(800):
         action, state = policy.predict(observation, state)
         actions.append(float(action[0]) - float(actions[0] if actions else 0.0))
-    np.testing.assert_allclose(actions[1:600:100], 0.02 * PERIOD_S * np.arange(1, 600, 100), rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(
+        actions[1:600:100], 0.02 * PERIOD_S * np.arange(1, 600, 100), rtol=0.0, atol=1e-7
+    )
     np.testing.assert_allclose(actions[700:], 0.05, rtol=0.0, atol=1e-7)
 
 
@@ -407,10 +490,19 @@ def test_foreign_environment_is_an_error_with_a_cure() -> None:
 
 def test_ramp_grows_to_the_full_offset_within_its_time() -> None:
     """Catches compensation that starts with a jump, overshoots, or ends below the full offset."""
-    env = scalar(reference={"kind": "sine", "amplitude": 0.005, "middle": 0.5, "duration_s": 0.1, "onset_s": 0.1})
+    env = scalar(
+        reference={
+            "kind": "sine",
+            "amplitude": 0.005,
+            "middle": 0.5,
+            "duration_s": 0.1,
+            "onset_s": 0.1,
+        }
+    )
     policy = baselines.make("input", env, ramp_s=0.2)
     observation, _ = env.reset(seed=0)
-    state, actions = None, []
+    state = None
+    actions = []
     for _ in range(60):
         action, state = policy.predict(observation, state)
         observation, *_ = env.step(action)
@@ -423,16 +515,22 @@ def test_ramp_grows_to_the_full_offset_within_its_time() -> None:
 
 
 class Proportional:
-    """A user's own controller: pushes the link it sees towards the reference, and counts its calls in its state."""
+    """A user's own controller: pushes the link it sees towards the reference, and counts its
+    calls in its state."""
 
     gain = 0.4
 
     def __init__(self, env: Any) -> None:
-        self._theta, self._q_ref = column(env, "encoder_angle"), column(env, "reference_angle")
+        self._theta = column(env, "encoder_angle")
+        self._q_ref = column(env, "reference_angle")
         self.seen: list[Array] = []
 
     def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Array, Any]:
         """An offset for every observation, and {"calls": number of calls so far}."""
         self.seen.append(observation.copy())
@@ -447,25 +545,32 @@ def compensated(env: Any, user: Proportional) -> baselines.Compensated:
     return baselines.Compensated(user, compensator, ramp_s=PERIOD_S)
 
 
-@pytest.mark.parametrize("make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"])
+@pytest.mark.parametrize(
+    "make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"]
+)
 def test_wrapped_policy_sees_the_link_where_the_observation_has_the_encoder(make_env: Any) -> None:
-    """Catches a wrapper that shows encoder angles, changes other columns, or hands rows to a policy of one world."""
+    """Catches a wrapper that shows encoder angles, changes other columns, or hands rows to a
+    policy of one world."""
     env = make_env(scenario="ideal")
     user = Proportional(env)
     observation, _ = env.reset(seed=0)
     compensated(env, user).predict(observation)
-    theta, rate = column(env, "encoder_angle"), column(env, "encoder_rate")
+    theta = column(env, "encoder_angle")
+    rate = column(env, "encoder_rate")
     seen = user.seen[0]
     assert seen.shape == observation.shape
     q = env.unwrapped.truth().q.reshape(seen[..., theta].shape)
-    np.testing.assert_allclose(seen[..., theta], q, rtol=0.0, atol=1e-12)  # the plant starts at rest
+    np.testing.assert_allclose(
+        seen[..., theta], q, rtol=0.0, atol=1e-12
+    )  # the plant starts at rest
     assert np.all(np.abs(observation[..., theta] - q) > 0.01)
     others = [i for i in range(seen.shape[-1]) if i not in (theta, rate)]
     np.testing.assert_array_equal(seen[..., others], observation[..., others])
 
 
 def test_wrapped_policy_sees_the_rate_of_the_link() -> None:
-    """Catches an encoder rate handed on as the link's: while gravity helps the motion the link is faster or slower."""
+    """Catches an encoder rate handed on as the link's: while gravity helps the motion the link
+    is faster or slower."""
     env = scalar(scenario="ideal", stiffness=300.0)
     user = Proportional(env)
     observation, _ = env.reset(seed=0)
@@ -478,7 +583,8 @@ def test_wrapped_policy_sees_the_rate_of_the_link() -> None:
 
 
 def test_compensation_is_that_of_the_link_angle_that_the_policy_wants() -> None:
-    """Catches Eq. 9 taken at the reference alone, and a user action that gets lost: a + 60/K sin(q_ref + a)."""
+    """Catches Eq. 9 taken at the reference alone, and a user action that gets lost: a + 60/K
+    sin(q_ref + a)."""
     env = vector(2, scenario="nominal")
     user = Proportional(env)
     observation, _ = env.reset(seed=0)
@@ -507,9 +613,14 @@ def test_state_of_the_wrapped_policy_travels_inside() -> None:
     [("input", {"output": "newton"}, 1e-12), ("input", {}, 2e-4), ("oracle", {}, 0.0)],
     ids=["newton", "taylor", "oracle"],
 )
-@pytest.mark.parametrize("make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"])
-def test_link_estimate_at_rest_is_the_link_angle(name: str, options: Any, tolerance: float, make_env: Any) -> None:
-    """Catches an estimate of the wrong sign or shape: the ideal plant starts at rest, where Eq. 10 is exact."""
+@pytest.mark.parametrize(
+    "make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"]
+)
+def test_link_estimate_at_rest_is_the_link_angle(
+    name: str, options: Any, tolerance: float, make_env: Any
+) -> None:
+    """Catches an estimate of the wrong sign or shape: the ideal plant starts at rest, where Eq.
+    10 is exact."""
     env = make_env(scenario="ideal")
     policy = baselines.make(name, env, **options)
     observation, _ = env.reset(seed=0)
@@ -582,16 +693,22 @@ def of_ones_own(env: Any, first_command: float) -> tuple[Any, Array]:
     observation = observation.copy()
     observation[..., column(env, "last_command")] = first_command
     task = SimpleNamespace(observation_table=inside.task.observation_table, name="my arm")
-    return SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task)), observation
+    return (
+        SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task)),
+        observation,
+    )
 
 
 @pytest.mark.parametrize("name", ["input", "dynamic"])
 def test_an_environment_of_ones_own_begins_with_no_command(name: str) -> None:
-    """Catches a first observation that is taken for the middle of an episode for want of a clock."""
+    """Catches a first observation that is taken for the middle of an episode for want of a
+    clock."""
     own, observation = of_ones_own(scalar(), first_command=0.0)
     baselines.make(name, own).predict(observation)
     own, observation = of_ones_own(scalar(), first_command=0.3)
-    with pytest.raises(ElasticError, match=r"known by a reference at rest, and no command yet.*episode_start=True"):
+    with pytest.raises(
+        ElasticError, match=r"known by a reference at rest, and no command yet.*episode_start=True"
+    ):
         baselines.make(name, own).predict(observation)
     baselines.make(name, own).predict(observation, None, np.array([True]))
 
@@ -599,7 +716,9 @@ def test_an_environment_of_ones_own_begins_with_no_command(name: str) -> None:
 def test_the_oracle_says_what_an_environment_of_ones_own_lacks() -> None:
     """Catches an error that speaks of mixtures to somebody who has none."""
     own, _ = of_ones_own(scalar(), first_command=0.0)
-    with pytest.raises(ConfigurationError, match=r"by a method truth\(\) of the environment, which SimpleNamespace"):
+    with pytest.raises(
+        ConfigurationError, match=r"by a method truth\(\) of the environment, which SimpleNamespace"
+    ):
         baselines.make("oracle", own)
 
 
@@ -612,7 +731,8 @@ class Half(GravityCompensator):
 
 
 class Counting:
-    """A compensator of a user that derives from nothing: it leads by a microradian per control step."""
+    """A compensator of a user that derives from nothing: it leads by a microradian per control
+    step."""
 
     modelled = 1.0
 
@@ -638,9 +758,12 @@ class Counting:
         return theta_dot
 
 
-@pytest.mark.parametrize("make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"])
+@pytest.mark.parametrize(
+    "make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"]
+)
 def test_compensators_of_users_work(make_env: Any) -> None:
-    """Catches an interface that asks more of a compensator than the docs do, and memory that does not come back."""
+    """Catches an interface that asks more of a compensator than the docs do, and memory that
+    does not come back."""
     env = make_env()
     model = env.unwrapped.assumed_model
     zero = baselines.make("zero", env)
@@ -648,7 +771,8 @@ def test_compensators_of_users_work(make_env: Any) -> None:
     whole, _ = baselines.make("input", env, **AT_ONCE).predict(observation)
     half, _ = baselines.Compensated(zero, Half(model), **AT_ONCE).predict(observation)
     np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-6)
-    counting, state = baselines.Compensated(zero, Counting(model), **AT_ONCE), None
+    counting = baselines.Compensated(zero, Counting(model), **AT_ONCE)
+    state = None
     for step in range(1, 4):
         action, state = counting.predict(observation, state)
         np.testing.assert_allclose(action, 1e-6 * step, rtol=1e-6)
@@ -658,10 +782,17 @@ def test_compensators_of_users_work(make_env: Any) -> None:
 
 def test_a_policy_of_a_user_is_told_how_it_was_called() -> None:
     """Catches a flag that gets lost on the way, and an episode start of another world."""
-    env, calls = vector(2), []
+    env = vector(2)
+    calls = []
 
     class Listening:
-        def predict(self, rows: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True) -> Any:
+        def predict(
+            self,
+            rows: Array,
+            state: Any = None,
+            episode_start: Any = None,
+            deterministic: bool = True,
+        ) -> Any:
             calls.append((state, np.array(episode_start).tolist(), deterministic))
             return np.zeros((len(rows), 1)), len(calls)
 
@@ -670,4 +801,8 @@ def test_a_policy_of_a_user_is_told_how_it_was_called() -> None:
     _, state = policy.predict(observation, deterministic=False)
     _, state = policy.predict(observation, state)
     policy.predict(observation, state, np.array([False, True]))
-    assert calls == [(None, [True, True], False), (1, [False, False], True), (2, [False, True], True)]
+    assert calls == [
+        (None, [True, True], False),
+        (1, [False, False], True),
+        (2, [False, True], True),
+    ]

@@ -1,4 +1,5 @@
-"""Inputs of base policies: zero is the base, signs and sizes by what they do to the robot in MuJoCo, and the mirror."""
+"""Inputs of base policies: zero is the base, signs and sizes by what they do to the robot in
+MuJoCo, and the mirror."""
 
 import json
 import re
@@ -45,9 +46,12 @@ def model_of(env: Any) -> WalkerModel:
     return env.unwrapped.assumed_model
 
 
-@pytest.mark.parametrize("name", [*(f"walker/{name}" for name in ON_THE_WALKER), *(f"testbed/{n}" for n in ON_JOINTS)])
+@pytest.mark.parametrize(
+    "name", [*(f"walker/{name}" for name in ON_THE_WALKER), *(f"testbed/{n}" for n in ON_JOINTS)]
+)
 def test_zero_is_the_base_to_the_last_bit_for_every_base_and_input(name: str) -> None:
-    """Catches an input that rounds where nothing acts, and one that a wrapper loses or takes twice."""
+    """Catches an input that rounds where nothing acts, and one that a wrapper loses or takes
+    twice."""
     robot, base = name.split("/")
     needed = {"sensors": sensors_needed(base)} if sensors_needed(base) else {}
     env: Any = walker(**needed) if robot == "walker" else gymnasium.make(TESTBED, **SINE, **needed)
@@ -71,25 +75,36 @@ TURNS = {"leg_length.difference": 2e-3, "hip.roll": 5e-3, "hip.pitch": 5e-3}
 
 @cache
 def walked(base: str, period_s: float, num_steps: int) -> dict[str, Array]:
-    """ZMP, center of mass, roll and pitch of a walk under each input alone, less the base's, means over the steps."""
+    """ZMP, center of mass, roll and pitch of a walk under each input alone, less the base's,
+    means over the steps."""
     handles = SHIFTS if base == "adaptive_posture" else TURNS
     n = 1 + len(handles)
     env: Any = gymnasium.make_vec(
-        WALKER, n, vectorization_mode="vector_entry_point", scenario="ideal", step_period=period_s, num_steps=num_steps
+        WALKER,
+        n,
+        vectorization_mode="vector_entry_point",
+        scenario="ideal",
+        step_period=period_s,
+        num_steps=num_steps,
     )
-    corrected = Corrected(baselines.make(base, env), model_of(env), ResidualSettings(acts_on=ACTED, cutoff_hz=1.0))
+    corrected = Corrected(
+        baselines.make(base, env), model_of(env), ResidualSettings(acts_on=ACTED, cutoff_hz=1.0)
+    )
     residual = np.zeros((n, corrected.num_residuals))
     names = [signal.name for signal in corrected.channels.signals]
     for world, (name, size) in enumerate(handles.items(), start=1):
         residual[world, names.index(name)] = size / ACTED[name.split(".")[0]]
     observation, _ = env.reset(seed=[0] * n)
-    state, seen = None, []
+    state = None
+    seen = []
     pelvis = env.unwrapped.simulation.model.body("pelvis").id
     length = env.unwrapped.task.num_steps
     for step in range(length - 1):
         action, state = corrected.act(observation, residual, state)
         observation, *_, info = env.step(action)
-        if 500 <= step < length - 250:  # when the ramp and the low-pass are over, as long as it steps
+        if (
+            500 <= step < length - 250
+        ):  # when the ramp and the low-pass are over, as long as it steps
             com = env.unwrapped.simulation.bind("subtree_com")[:, pelvis, :2]
             signals = [info[name] for name in ("zmp_x", "zmp_y", "pelvis_roll", "pelvis_pitch")]
             seen.append(np.column_stack([*signals[:2], com, *signals[2:]]))
@@ -99,10 +114,11 @@ def walked(base: str, period_s: float, num_steps: int) -> dict[str, Array]:
 
 @pytest.mark.parametrize("name", ["zmp", "com"])
 def test_zmp_and_center_of_mass_go_where_they_are_told(name: str) -> None:
-    """5 mm come as 5 mm, in MuJoCo, of both: means of ZMP and COM differ by Δċ/ω² over the time alone.
+    """5 mm come as 5 mm, in MuJoCo, of both: means of ZMP and COM differ by Δċ/ω² over the time
+    alone.
 
-    Catches a sign, a pelvis that moves by as much as the center of mass should (4 mm), a feedback that fights the
-    shift, and springs that are wound for contact forces where they were.
+    Catches a sign, a pelvis that moves by as much as the center of mass should (4 mm), a feedback
+    that fights the shift, and springs that are wound for contact forces where they were.
     """
     for axis in range(2):
         found = walked("adaptive_posture", 3.0, 1)[f"{name}.{'xy'[axis]}"]
@@ -111,16 +127,20 @@ def test_zmp_and_center_of_mass_go_where_they_are_told(name: str) -> None:
 
 
 def test_a_pelvis_that_moves_leaves_the_feet_where_they_were() -> None:
-    """By forward kinematics, over the whole plan. Catches a leg that is not level, and a shift beyond the reach."""
+    """By forward kinematics, over the whole plan. Catches a leg that is not level, and a shift
+    beyond the reach."""
     model = model_of(walker())
-    stances, shift = Stances.of(model), np.array([0.012, -0.02])
+    stances = Stances.of(model)
+    shift = np.array([0.012, -0.02])
     offset = np.zeros(model.plan.q.shape)
     steps = np.arange(len(offset))
     move_pelvis(stances.legs, stances.rows, steps, np.tile(shift, (len(offset), 1)), offset)
     legs = (model.plan.q + offset).reshape(-1, 2, 6)
     ankle, R = foot_pose(model.biped.leg, legs)
     pelvis = model.plan.pelvis + np.append(shift, 0.0)
-    np.testing.assert_allclose(pelvis[:, None] + model.biped.hips + ankle, model.plan.ankles, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        pelvis[:, None] + model.biped.hips + ankle, model.plan.ankles, rtol=0.0, atol=1e-9
+    )
     np.testing.assert_allclose(R, np.broadcast_to(np.eye(3), R.shape), rtol=0.0, atol=1e-9)
     far = np.zeros((1, 12))
     move_pelvis(stances.legs, stances.rows, steps[:1], np.array([[0.5, 0.0]]), far)
@@ -129,7 +149,8 @@ def test_a_pelvis_that_moves_leaves_the_feet_where_they_were() -> None:
 
 
 def test_a_longer_left_leg_lifts_the_left_side() -> None:
-    """Roll is positive to the right: the left hip rises. It cannot tilt further than both feet on the ground do."""
+    """Roll is positive to the right: the left hip rises. It cannot tilt further than both feet
+    on the ground do."""
     roll, pitch = walked("input_output", 1.6, 2)["leg_length.difference"][4:]
     spacing = model_of(walker()).biped.foot_spacing
     assert 0.02 * 2e-3 / spacing < roll < 2e-3 / spacing
@@ -145,7 +166,8 @@ def test_a_turn_of_the_hips_turns_the_pelvis_the_other_way() -> None:
 
 
 def test_gains_change_by_the_share_that_they_are_told() -> None:
-    """Catches a gain that is set and not multiplied, and one of another feedback: closed form on a first step."""
+    """Catches a gain that is set and not multiplied, and one of another feedback: closed form on
+    a first step."""
     env = walker()
     observation, _ = env.reset(seed=0)
     table = model_of(env).observation_table
@@ -175,33 +197,48 @@ def _switched_off(base: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_a_shift_of_the_center_of_mass_is_the_bounded_one() -> None:
-    """c − c̈/ω² = p with the exact derivatives of an exponential, from rest; and nothing else stays bounded."""
-    omega, period, p = 3.7, 0.004, np.array([0.01, -0.02])
-    c, path = np.zeros(2), [np.zeros(2)]
+    """c − c̈/ω² = p with the exact derivatives of an exponential, from rest; and nothing else
+    stays bounded."""
+    omega = 3.7
+    period = 0.004
+    p = np.array([0.01, -0.02])
+    c = np.zeros(2)
+    path = [np.zeros(2)]
     for _ in range(200):
         c = follow_zmp.py_func(c, p, following_share(omega, period))
         path.append(c)
     time = period * np.arange(201)[:, None]
     np.testing.assert_allclose(path, p * (1.0 - np.exp(-omega * time)), atol=1e-15)
     acceleration = -(omega**2) * p * np.exp(-omega * time)
-    np.testing.assert_allclose(np.array(path) - acceleration / omega**2, np.broadcast_to(p, (201, 2)))
+    np.testing.assert_allclose(
+        np.array(path) - acceleration / omega**2, np.broadcast_to(p, (201, 2))
+    )
 
 
 def test_two_feet_share_a_shifted_zmp_by_the_lever() -> None:
-    """In the middle of double support as statics have it; not in single support, where one foot stands."""
-    share, spacing, p = np.array([0.0, 0.5, 1.0]), 0.2, 0.01
-    left, right = 0.5 * spacing, -0.5 * spacing
+    """In the middle of double support as statics have it; not in single support, where one foot
+    stands."""
+    share = np.array([0.0, 0.5, 1.0])
+    spacing = 0.2
+    p = 0.01
+    left = 0.5 * spacing
+    right = -0.5 * spacing
     before = (1.0 - share) * left + share * right
     moved = np.array([shifted_share(planned, p, spacing) for planned in share])
-    np.testing.assert_allclose((1.0 - moved) * left + moved * right - before, [0.0, p, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        (1.0 - moved) * left + moved * right - before, [0.0, p, 0.0], atol=1e-15
+    )
     assert shifted_share(0.01, 0.05, spacing) >= 0.0
 
 
 def test_the_force_difference_control_wants_the_shifted_loads() -> None:
-    """A ZMP p to the left loads the left foot by 2 p/w of the weight more; a step integrates that to a leg length."""
+    """A ZMP p to the left loads the left foot by 2 p/w of the weight more; a step integrates
+    that to a leg length."""
     env = walker()
     observation, _ = env.reset(seed=0)
-    biped, gain, shift = model_of(env).biped, 8e-4, 0.005
+    biped = model_of(env).biped
+    gain = 8e-4
+    shift = 0.005
 
     def action(force_difference: float, **values: Array) -> Array:
         gains = {"force_difference": force_difference, "dcm": 0.0}
@@ -217,16 +254,24 @@ def test_the_force_difference_control_wants_the_shifted_loads() -> None:
 
 
 SIGNS = {
-    "command.l_hip_roll": ("command.r_hip_roll", -1), "command.l_knee": ("command.r_knee", 1),
-    "deflection.l_hip_roll": ("deflection.r_hip_roll", 1), "zmp.x": ("zmp.x", 1), "zmp.y": ("zmp.y", -1),
-    "com.x": ("com.x", 1), "com.y": ("com.y", -1), "leg_length.difference": ("leg_length.difference", -1),
-    "hip.roll": ("hip.roll", -1), "hip.pitch": ("hip.pitch", 1), "posture_gain.all": ("posture_gain.all", 1),
+    "command.l_hip_roll": ("command.r_hip_roll", -1),
+    "command.l_knee": ("command.r_knee", 1),
+    "deflection.l_hip_roll": ("deflection.r_hip_roll", 1),
+    "zmp.x": ("zmp.x", 1),
+    "zmp.y": ("zmp.y", -1),
+    "com.x": ("com.x", 1),
+    "com.y": ("com.y", -1),
+    "leg_length.difference": ("leg_length.difference", -1),
+    "hip.roll": ("hip.roll", -1),
+    "hip.pitch": ("hip.pitch", 1),
+    "posture_gain.all": ("posture_gain.all", 1),
     "balance_gain.all": ("balance_gain.all", 1),
-}  # fmt: skip
+}
 
 
 def test_what_is_decided_in_the_mirror_is_turned_back() -> None:
-    """Catches a sign or a side, by a list written down; and a turn while the left foot is that of the step."""
+    """Catches a sign or a side, by a list written down; and a turn while the left foot is that
+    of the step."""
     env = walker()
     policy = baselines.make("adaptive_posture", env)
     corrected = Corrected(policy, model_of(env), ResidualSettings(acts_on=ALL, mirror=True))
@@ -246,25 +291,39 @@ def test_what_is_decided_in_the_mirror_is_turned_back() -> None:
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_a_mirrored_robot_under_a_mirrored_input_acts_in_the_mirror(name: str) -> None:
-    """Catches an input that the mirror gives another sign than its effect has; a standing plan is its own image."""
+    """Catches an input that the mirror gives another sign than its effect has; a standing plan
+    is its own image."""
     env = walker(scenario="spread")
-    model, generator = model_of(env), np.random.default_rng(0)
+    model = model_of(env)
+    generator = np.random.default_rng(0)
     table = model.observation_table
-    of_input, of_rows = Mirror(input_signals(name, model)), Mirror(table.signals)
+    of_input = Mirror(input_signals(name, model))
+    of_rows = Mirror(table.signals)
     of_action = Mirror(table.signals_of("last_command"))
     corrected = [
-        Corrected(baselines.make("adaptive_posture", env), model, ResidualSettings(acts_on={name: None}, cutoff_hz=50))
+        Corrected(
+            baselines.make("adaptive_posture", env),
+            model,
+            ResidualSettings(acts_on={name: None}, cutoff_hz=50),
+        )
         for _ in range(4)
     ]
     residual = generator.uniform(-1.0, 1.0, (1, corrected[0].num_residuals))
     zero = np.zeros_like(residual)
     observation, _ = env.reset(seed=2)
     states: list[Any] = [None] * 4
-    differences, pushed = [], np.zeros(len(table))
-    pushed[table.group("imu_attitude")], pushed[table.columns("wrench.l_fz")] = [0.01, 0.005], 40.0
+    differences = []
+    pushed = np.zeros(len(table))
+    pushed[table.group("imu_attitude")] = [0.01, 0.005]
+    pushed[table.columns("wrench.l_fz")] = 40.0
     for step in range(40):
         seen = (observation + pushed)[None]
-        calls = ((seen, residual), (seen, zero), (of_rows(seen), of_input(residual)), (of_rows(seen), zero))
+        calls = (
+            (seen, residual),
+            (seen, zero),
+            (of_rows(seen), of_input(residual)),
+            (of_rows(seen), zero),
+        )
         actions = []
         for i, (rows, decided) in enumerate(calls):
             action, states[i] = corrected[i].act(rows, decided, states[i], step == 0)
@@ -278,20 +337,29 @@ def test_a_mirrored_robot_under_a_mirrored_input_acts_in_the_mirror(name: str) -
 
 
 def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
-    """Catches a residual that is turned back in one of them alone, or by the foot of another moment."""
+    """Catches a residual that is turned back in one of them alone, or by the foot of another
+    moment."""
     settings: dict[str, Any] = {
-        "acts_on": {"zmp": 0.02, "hip": 0.02, "deflection": 0.3}, "mirror": True, "observe": ("clock", "encoder_angle"),
-    }  # fmt: skip
-    wrapped = ResidualVectorWrapper(vector("walker", 2, num_steps=2), "posture", decision_period=25, **settings)
+        "acts_on": {"zmp": 0.02, "hip": 0.02, "deflection": 0.3},
+        "mirror": True,
+        "observe": ("clock", "encoder_angle"),
+    }
+    wrapped = ResidualVectorWrapper(
+        vector("walker", 2, num_steps=2), "posture", decision_period=25, **settings
+    )
     env = vector("walker", 2, num_steps=2)
     corrected = Corrected(
-        baselines.make("posture", env), env.unwrapped.assumed_model, ResidualSettings(decision_period=25, **settings)
+        baselines.make("posture", env),
+        env.unwrapped.assumed_model,
+        ResidualSettings(decision_period=25, **settings),
     )
     network = random_network(corrected, 0.3)
     features, _ = wrapped.reset(seed=4)
     observation, _ = env.reset(seed=4)
-    policy, state = ResidualPolicy(corrected, network), None
-    support, sides = env.unwrapped.task.observation_table.columns("clock.support"), set()
+    policy = ResidualPolicy(corrected, network)
+    state = None
+    support = env.unwrapped.task.observation_table.columns("clock.support")
+    sides = set()
     for _ in range(26):
         features, *_ = wrapped.step(network(features))
         for _ in range(25):
@@ -306,10 +374,22 @@ def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
     ("base", "settings", "message"),
     [
         ("zero", {}, r"acts on deflection, which Zero does not have.*it has: command$"),
-        ("uncompensated", {"acts_on": {"posture_gain": 0.5}}, r"posture_gain.*has: command, zmp, com, leg_length"),
-        ("thormang", {"acts_on": {"zmp": 0.01, "com": 0.01}}, r"acts on zmp, com, which StanceRoll"),
+        (
+            "uncompensated",
+            {"acts_on": {"posture_gain": 0.5}},
+            r"posture_gain.*has: command, zmp, com, leg_length",
+        ),
+        (
+            "thormang",
+            {"acts_on": {"zmp": 0.01, "com": 0.01}},
+            r"acts on zmp, com, which StanceRoll",
+        ),
         ("input", {"acts_on": {"zpm": 0.01}}, r"unknown input 'zpm'.*zmp"),
-        ("input", {"acts_on": {"balance_gain": 1.0}}, r"balance_gain must be positive and below 1, got 1.0"),
+        (
+            "input",
+            {"acts_on": {"balance_gain": 1.0}},
+            r"balance_gain must be positive and below 1, got 1.0",
+        ),
         ("input", {"acts_on": {"zmp": {"x": 0.0}}}, r"bound of zmp must be positive"),
         ("input", {"acts_on": {"hip": {}}}, r"bound of hip must be positive"),
         ("input", {"acts_on": {}}, r"at least 1"),
@@ -318,36 +398,53 @@ def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
         ("input", {"space": "model", "acts_on": {"zmp": 0.01}}, r"leave these two out"),
     ],
 )
-def test_what_cannot_be_acted_on_says_what_can(base: str, settings: dict[str, Any], message: str) -> None:
-    """Catches an input that is dropped in silence, and a bound beyond which a gain changes its sign."""
+def test_what_cannot_be_acted_on_says_what_can(
+    base: str, settings: dict[str, Any], message: str
+) -> None:
+    """Catches an input that is dropped in silence, and a bound beyond which a gain changes its
+    sign."""
     env = walker()
     with pytest.raises(ConfigurationError, match=message):
         Corrected(baselines.make(base, env), model_of(env), ResidualSettings(**settings))
 
 
 def test_folders_of_before_read_as_what_they_meant() -> None:
-    """Catches an old key that is read as another input, and a shipped residual that no longer loads."""
+    """Catches an old key that is read as another input, and a shipped residual that no longer
+    loads."""
     assert ResidualSettings(space="joint", scale=0.04).acts_on == {"command": 0.04}
     assert ResidualSettings(space="model").bounds == {"deflection": 0.6}
     assert ResidualSettings(scale={"knee": 0.2}).acts_on == {"deflection": {"knee": 0.2}}
     for name in shipped():
         description = read_description(Path(name))
-        raw = json.loads((ROOT / "baselines" / "trained" / name / "residual.json").read_text())["settings"]
+        raw = json.loads((ROOT / "baselines" / "trained" / name / "residual.json").read_text())[
+            "settings"
+        ]
         old = {"model": ["deflection"], "joint": ["command"]}
-        assert list(description.settings.acts_on) == (old[raw["space"]] if "space" in raw else list(raw["acts_on"]))
+        assert list(description.settings.acts_on) == (
+            old[raw["space"]] if "space" in raw else list(raw["acts_on"])
+        )
     again = ResidualSettings(acts_on={"zmp": {"x": 0.01}, "hip": None})
     assert ResidualSettings(**again.model_dump()) == again
 
 
 def test_every_input_is_documented() -> None:
-    """Catches a table in docs/training.md that lacks an input, or says another unit, bound or axis."""
+    """Catches a table in docs/training.md that lacks an input, or says another unit, bound or
+    axis."""
     text = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|", text, re.MULTILINE)
+    rows = re.findall(
+        r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|", text, re.MULTILINE
+    )
     found = {name: tuple(cell.strip() for cell in cells) for name, *cells in rows if name in INPUTS}
     expected = {
         name: (
             kind.unit,
-            "joints" if kind.axes is None else ", ".join(kind.axes) if len(kind.axes) > 1 else "one",
+            (
+                "joints"
+                if kind.axes is None
+                else ", ".join(kind.axes)
+                if len(kind.axes) > 1
+                else "one"
+            ),
             f"{kind.default:g}",
             "any" if kind.limit > 100.0 else f"below {kind.limit:g}",
         )

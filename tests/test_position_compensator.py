@@ -1,4 +1,5 @@
-"""The compensator of live robots: its torque against MuJoCo, its commands in a simulation, and what it refuses."""
+"""The compensator of live robots: its torque against MuJoCo, its commands in a simulation, and
+what it refuses."""
 
 import math
 import re
@@ -24,7 +25,8 @@ from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from tests.trees import ORDER, TREE, tree
 
-# Three hinges and a gripper that slides; a spring in the shoulder, and gravity compensation on two bodies.
+# Three hinges and a gripper that slides; a spring in the shoulder, and gravity compensation on two
+# bodies.
 ARM = """<mujoco>
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.002" integrator="implicitfast"/>
@@ -83,12 +85,17 @@ def arm(**options: Any) -> PositionCompensator:
     return PositionCompensator.from_model(model(), STIFFNESS, **{"joints": JOINTS, **options})
 
 
-def needed(compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array, joints: Sequence[str] = JOINTS) -> Array:
-    """Torque on joints by MuJoCo's inverse dynamics, with its springs and its gravity compensation, (n,) [N·m]."""
+def needed(
+    compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array, joints: Sequence[str] = JOINTS
+) -> Array:
+    """Torque on joints by MuJoCo's inverse dynamics, with its springs and its gravity
+    compensation, (n,) [N·m]."""
     data = mujoco.MjData(compiled)
     data.qpos[:] = compiled.key_qpos[0]
     at = JointAddresses.of(compiled, joints)
-    data.qpos[at.q], data.qvel[at.q_dot], data.qacc[at.q_dot] = q, q_dot, q_ddot
+    data.qpos[at.q] = q
+    data.qvel[at.q_dot] = q_dot
+    data.qacc[at.q_dot] = q_ddot
     compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mujoco.mj_inverse(compiled, data)
     return data.qfrc_inverse[at.q_dot].copy()
@@ -96,18 +103,26 @@ def needed(compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array, join
 
 @given(seed=st.integers(0, 10_000))
 def test_the_torque_is_that_of_mujoco(seed: int) -> None:
-    """Catches an ignored spring or gravcomp, a held joint at the wrong place, and joints in the order of the model."""
+    """Catches an ignored spring or gravcomp, a held joint at the wrong place, and joints in the
+    order of the model."""
     q, q_dot, q_ddot = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, 3))
     compensator = arm()
     expected = needed(model(), q, q_dot, q_ddot)
     np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(compensator.torque(q), needed(model(), q, np.zeros(3), np.zeros(3)), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        compensator.torque(q), needed(model(), q, np.zeros(3), np.zeros(3)), rtol=0, atol=1e-9
+    )
 
 
 @given(seed=st.integers(0, 10_000), elbow=st.floats(-2.0, 2.0))
-def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(seed: int, elbow: float) -> None:
-    """Catches a turn about the origin of the body in the place of the hinge's anchor, and a forgotten reference."""
-    held = mujoco.MjModel.from_xml_string(ARM.replace('qpos="0 0 0.2 0.05"', f'qpos="0 0 {elbow} 0.05"'))
+def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(
+    seed: int, elbow: float
+) -> None:
+    """Catches a turn about the origin of the body in the place of the hinge's anchor, and a
+    forgotten reference."""
+    held = mujoco.MjModel.from_xml_string(
+        ARM.replace('qpos="0 0 0.2 0.05"', f'qpos="0 0 {elbow} 0.05"')
+    )
     joints = ["shoulder", "turn"]
     q, q_dot, q_ddot = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, 2))
     compensator = PositionCompensator.from_model(held, STIFFNESS, joints=joints)
@@ -117,7 +132,8 @@ def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(seed: int
 
 @given(seed=st.integers(0, 10_000), mass=st.floats(0.0, 5.0))
 def test_a_payload_is_a_mass_at_its_place(seed: int, mass: float) -> None:
-    """Catches a place in the frame of the wrong body, and a payload that is added to the last one."""
+    """Catches a place in the frame of the wrong body, and a payload that is added to the last
+    one."""
     spec = mujoco.MjSpec.from_string(ARM)
     place = [0.1, -0.05, 0.2]
     spec.body("finger").add_body(
@@ -132,11 +148,16 @@ def test_a_payload_is_a_mass_at_its_place(seed: int, mass: float) -> None:
 
 
 def test_a_payload_at_a_site_is_in_the_frame_of_the_site() -> None:
-    """Catches a place in the frame of the body, a turn to the wrong side, and a site that is taken for a body."""
-    spec, at = mujoco.MjSpec.from_string(ARM), [0.1, -0.05, 0.2]
-    spec.body("finger").add_site(name="flange", pos=[0.02, 0.03, -0.1], quat=[0.8, 0.3, -0.4, 0.33166248])
+    """Catches a place in the frame of the body, a turn to the wrong side, and a site that is
+    taken for a body."""
+    spec = mujoco.MjSpec.from_string(ARM)
+    at = [0.1, -0.05, 0.2]
+    spec.body("finger").add_site(
+        name="flange", pos=[0.02, 0.03, -0.1], quat=[0.8, 0.3, -0.4, 0.33166248]
+    )
     model = spec.compile()
-    data, q = mujoco.MjData(model), np.array([0.3, -0.7, 1.1])
+    data = mujoco.MjData(model)
+    q = np.array([0.3, -0.7, 1.1])
     data.qpos[: len(q)] = q
     mujoco.mj_forward(model, data)
     finger = data.body("finger")
@@ -152,22 +173,32 @@ def test_a_payload_at_a_site_is_in_the_frame_of_the_site() -> None:
 
 def test_it_agrees_with_the_policies() -> None:
     """Catches another formula than Eqs. 9 and 10 of the compensators, and another order."""
-    robot, q = tree(), np.array([0.3, -0.5, 0.9, 0.2, -1.1, 0.4])
+    robot = tree()
+    q = np.array([0.3, -0.5, 0.9, 0.2, -1.1, 0.4])
     gravity = make_gravity(robot)
-    compensator = PositionCompensator.from_model(mujoco.MjModel.from_xml_string(TREE), 1000.0, joints=ORDER)
+    compensator = PositionCompensator.from_model(
+        mujoco.MjModel.from_xml_string(TREE), 1000.0, joints=ORDER
+    )
     np.testing.assert_allclose(
         compensator.command(q) - q, input_offset(q, robot.stiffness, gravity), rtol=0, atol=1e-12
     )
     expected = newton_link_angle(q, robot.stiffness, gravity)
     np.testing.assert_allclose(compensator.link_angle(q), expected, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(compensator.link_angle(compensator.command(q)), q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        compensator.link_angle(compensator.command(q)), q, rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("integral_gain", [0.0, 4000.0], ids=["gives way", "holds"])
 def test_links_of_a_simulated_arm_come_to_rest_where_they_should_be(integral_gain: float) -> None:
-    """Catches a servo's own sag with the wrong sign or gain, and a spring or gravcomp that is counted the wrong way."""
+    """Catches a servo's own sag with the wrong sign or gain, and a spring or gravcomp that is
+    counted the wrong way."""
     servo = Servo(
-        position_gain=800.0, velocity_gain=40.0, integral_gain=integral_gain, torque_limit=200.0, speed_limit=10.0
+        position_gain=800.0,
+        velocity_gain=40.0,
+        integral_gain=integral_gain,
+        torque_limit=200.0,
+        speed_limit=10.0,
     )
     stiffness = {"elbow": 400.0, "turn": 400.0, "shoulder": 900.0}
     elastic = make_elastic(
@@ -179,10 +210,13 @@ def test_links_of_a_simulated_arm_come_to_rest_where_they_should_be(integral_gai
     )
     for joint in elastic.joints:
         if joint.name == "slide":
-            joint.stiffness, joint.damping, joint.springref = np.array([1e5, 0, 0]), np.array([500.0, 0, 0]), 0.05
+            joint.stiffness = np.array([1e5, 0, 0])
+            joint.damping = np.array([500.0, 0, 0])
+            joint.springref = 0.05
     compiled = elastic.compile()
     compensator = arm(position_gain=None if integral_gain else 800.0)
-    q, at = np.array([0.4, 0.3, -0.2]), JointAddresses.of(compiled, JOINTS)
+    q = np.array([0.4, 0.3, -0.2])
+    at = JointAddresses.of(compiled, JOINTS)
     errors = []
     for command in (q, compensator.command(q)):
         data = mujoco.MjData(compiled)
@@ -194,13 +228,16 @@ def test_links_of_a_simulated_arm_come_to_rest_where_they_should_be(integral_gai
         assert np.abs(data.qvel).max() < 1e-6
         errors.append(np.abs(data.qpos[at.q] - q).max())
         if integral_gain:  # servos that hold show the command
-            np.testing.assert_allclose(compensator.link_angle(data.qpos[at.theta]), data.qpos[at.q], atol=1e-5)
+            np.testing.assert_allclose(
+                compensator.link_angle(data.qpos[at.theta]), data.qpos[at.q], atol=1e-5
+            )
     assert errors[0] > 2e-3
     assert errors[1] < 0.01 * errors[0]
 
 
 def test_a_urdf_needs_no_meshes(tmp_path: Path) -> None:
-    """Catches a model that is refused for its pictures, and a tool that is merged into its link. Closed form."""
+    """Catches a model that is refused for its pictures, and a tool that is merged into its link.
+    Closed form."""
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
     compensator = PositionCompensator.from_model(path, {"shoulder": 500.0, "elbow": math.inf})
@@ -211,11 +248,14 @@ def test_a_urdf_needs_no_meshes(tmp_path: Path) -> None:
     elbow = -g * (1.0 * 0.1 + 0.5 * 0.3) * np.cos(q.sum())
     shoulder = elbow - g * (2.0 * 0.2 + 1.5 * 0.4) * np.cos(q[0])
     np.testing.assert_allclose(compensator.torque(q), [shoulder, elbow], rtol=1e-9)
-    np.testing.assert_allclose(compensator.command(q), q + np.array([shoulder / 500.0, 0.0]), rtol=1e-9)
+    np.testing.assert_allclose(
+        compensator.command(q), q + np.array([shoulder / 500.0, 0.0]), rtol=1e-9
+    )
 
 
 def test_offsets_grow_with_the_ramp_and_stay_within_their_limits() -> None:
-    """Catches a jump at the start or under a new payload, offsets beyond their bound, commands beyond the range."""
+    """Catches a jump at the start or under a new payload, offsets beyond their bound, commands
+    beyond the range."""
     q = np.array([0.2, 0.1, 0.4])
     full = arm().command(q) - q
     gentle = arm(ramp_s=0.1, period_s=0.01)
@@ -226,7 +266,8 @@ def test_offsets_grow_with_the_ramp_and_stay_within_their_limits() -> None:
     gentle.set_payload(2.0)
     loaded = arm()
     loaded.set_payload(2.0)
-    target, offsets = loaded.command(q)[2], [gentle.command(q)[2] for _ in range(10)]
+    target = loaded.command(q)[2]
+    offsets = [gentle.command(q)[2] for _ in range(10)]
     steps = np.diff([q[2] + full[2], *offsets])
     np.testing.assert_allclose(steps, (target - q[2] - full[2]) / 10, rtol=1e-6)
     assert offsets[-1] == pytest.approx(target, abs=1e-12)
@@ -241,7 +282,10 @@ def test_offsets_grow_with_the_ramp_and_stay_within_their_limits() -> None:
 @pytest.mark.parametrize(
     ("q", "message"),
     [
-        ([0.0, 0.0], r"q_desired must be 3 numbers \[rad\], of elbow, turn, shoulder; got \[0.0, 0.0\]"),
+        (
+            [0.0, 0.0],
+            r"q_desired must be 3 numbers \[rad\], of elbow, turn, shoulder; got \[0.0, 0.0\]",
+        ),
         ([0.0, np.nan, 0.0], "q_desired must be finite.*see turn"),
         ([0.0, 0.0, np.inf], "see shoulder"),
         ("now", "q_desired must be 3 numbers"),
@@ -251,16 +295,20 @@ def test_offsets_grow_with_the_ramp_and_stay_within_their_limits() -> None:
 )
 def test_what_is_no_angle_is_refused_and_changes_nothing(q: Any, message: str) -> None:
     """Catches nan in a servo, and a ramp that goes on without a command."""
-    compensator, other = arm(ramp_s=0.1), arm(ramp_s=0.1)
+    compensator = arm(ramp_s=0.1)
+    other = arm(ramp_s=0.1)
     with pytest.raises(ActionError, match=message):
         compensator.command(q)
     np.testing.assert_array_equal(compensator.command(np.zeros(3)), other.command(np.zeros(3)))
 
 
-CRANK = ARM.replace("<keyframe>", '<equality><joint joint1="elbow" joint2="turn"/></equality><keyframe>')
+CRANK = ARM.replace(
+    "<keyframe>", '<equality><joint joint1="elbow" joint2="turn"/></equality><keyframe>'
+)
 GRIPPER = ARM.replace("<keyframe>", '<equality><joint joint1="slide"/></equality><keyframe>')
 TENDON = ARM.replace(
-    "<keyframe>", '<tendon><fixed stiffness="5"><joint joint="turn" coef="1"/></fixed></tendon><keyframe>'
+    "<keyframe>",
+    '<tendon><fixed stiffness="5"><joint joint="turn" coef="1"/></fixed></tendon><keyframe>',
 )
 FREE = """<mujoco><worldbody><body><freejoint name="root"/><geom size="0.1"/>
   <body><joint name="a"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
@@ -270,7 +318,12 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
 @pytest.mark.parametrize(
     ("xml", "stiffness", "options", "message"),
     [
-        (ARM, {"shoulder": 900.0}, {}, "stiffness of joint 'turn' is missing; give 'turn' or a pattern"),
+        (
+            ARM,
+            {"shoulder": 900.0},
+            {},
+            "stiffness of joint 'turn' is missing; give 'turn' or a pattern",
+        ),
         (
             ARM,
             {"*": 900.0, "sholder": 1.0},
@@ -280,7 +333,12 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
         (ARM, 0.0, {}, r"stiffness of turn must be > 0 \[N·m/rad\], got 0"),
         (ARM, -5, {}, "must be > 0"),
         (ARM, math.nan, {}, "must be > 0"),
-        (ARM, "1000", {}, r"stiffness must be numbers .*, got '1000'; give a number for all joints"),
+        (
+            ARM,
+            "1000",
+            {},
+            r"stiffness must be numbers .*, got '1000'; give a number for all joints",
+        ),
         (ARM, None, {}, "stiffness is missing; give a number for all joints"),
         (
             ARM,
@@ -297,11 +355,21 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
         (ARM, 900.0, {"limit_rad": 0.0}, "limit_rad must be finite and > 0"),
         (ARM, 900.0, {"ramp_s": -1.0}, "ramp_s must be finite and >= 0"),
         (CRANK, 900.0, {}, "equality constraint of elbow and turn"),
-        (ARM.replace('"12"', '"12 3"'), 900.0, {}, "joint 'shoulder' has a spring whose torque is not linear"),
+        (
+            ARM.replace('"12"', '"12 3"'),
+            900.0,
+            {},
+            "joint 'shoulder' has a spring whose torque is not linear",
+        ),
         (TENDON, 900.0, {}, "tendons with stiffness"),
         (FREE, 900.0, {}, "'root' is free or a ball joint"),
         (FIXED, 900.0, {}, "no hinge"),
-        (FIXED.replace("<geom", "<joint/><geom"), 900.0, {}, "a hinge of the model has no name; give each one"),
+        (
+            FIXED.replace("<geom", "<joint/><geom"),
+            900.0,
+            {},
+            "a hinge of the model has no name; give each one",
+        ),
     ],
 )
 def test_models_and_values_that_cannot_be_used_are_refused(
@@ -314,7 +382,9 @@ def test_models_and_values_that_cannot_be_used_are_refused(
 
 def test_a_gripper_with_constraints_of_its_own_is_held() -> None:
     """Catches a refusal for what no commanded joint feels."""
-    compensator = baselines.PositionCompensator.from_model(mujoco.MjModel.from_xml_string(GRIPPER), 900.0)
+    compensator = baselines.PositionCompensator.from_model(
+        mujoco.MjModel.from_xml_string(GRIPPER), 900.0
+    )
     assert compensator.joints == ("turn", "shoulder", "elbow")
 
 
@@ -326,18 +396,32 @@ LINK = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass va
 
 
 def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
-    """Catches a traceback of MuJoCo or of an XML parser, and a message that does not say what to do."""
+    """Catches a traceback of MuJoCo or of an XML parser, and a message that does not say what to
+    do."""
     (tmp_path / "there.dae").write_text("<COLLADA/>")
-    with pytest.raises(ConfigurationError, match=r"a model must be a file of MJCF .*mujoco.MjModel, got None"):
+    with pytest.raises(
+        ConfigurationError, match=r"a model must be a file of MJCF .*mujoco.MjModel, got None"
+    ):
         PositionCompensator.from_model(None, 900.0)  # type: ignore[arg-type]
     for text, message in (
-        (None, "no model at"), ("{", "is no XML"), ("<mujoco><bdy/></mujoco>", "MuJoCo cannot read"),
-        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "cannot compile.*needs a mass"),
-        (MESH.format("lost.stl"), "cannot compile.*lost.stl.*; put the mesh where the model names it"),
-        (MESH.format("there.dae"), "cannot compile.*there.dae.*; MuJoCo reads meshes of STL, OBJ and MSH"),
+        (None, "no model at"),
+        ("{", "is no XML"),
+        ("<mujoco><bdy/></mujoco>", "MuJoCo cannot read"),
+        (
+            "<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>",
+            "cannot compile.*needs a mass",
+        ),
+        (
+            MESH.format("lost.stl"),
+            "cannot compile.*lost.stl.*; put the mesh where the model names it",
+        ),
+        (
+            MESH.format("there.dae"),
+            "cannot compile.*there.dae.*; MuJoCo reads meshes of STL, OBJ and MSH",
+        ),
         (LINK.format("0"), "cannot compile.*; every link that moves needs a mass"),
         (LINK.format("heavy"), "cannot read.*mass.*; it must be a number"),
-    ):  # fmt: skip
+    ):
         path = tmp_path / "m.xml"
         if text is not None:
             path.write_text(text)
@@ -346,9 +430,12 @@ def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
 
 
 def test_soft_springs_are_solved_where_one_equilibrium_exists() -> None:
-    """Catches link angles that are refused, or are no solution of Eq. 10, where m·g·l/K is far beyond 1."""
+    """Catches link angles that are refused, or are no solution of Eq. 10, where m·g·l/K is far
+    beyond 1."""
     without_spring = mujoco.MjModel.from_xml_string(ARM.replace('stiffness="12"', ""))
-    weak = PositionCompensator.from_model(without_spring, {"*": 400.0, "shoulder": 1.5}, joints=JOINTS)
+    weak = PositionCompensator.from_model(
+        without_spring, {"*": 400.0, "shoulder": 1.5}, joints=JOINTS
+    )
     weak.set_payload(5.0)
     K = np.array([400.0, 400.0, 1.5])
     for theta in np.array([[0.0, 0.0, 0.0], [0.9, 0.3, 0.5], [-0.4, -1.0, 0.9]]):
@@ -363,15 +450,21 @@ UPRIGHT = """<mujoco><compiler angle="radian"/><worldbody><body>
 </body></worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize(("theta", "words"), [(0.0, "the link tips over"), (0.1, "bistable: the link can rest at")])
+@pytest.mark.parametrize(
+    ("theta", "words"), [(0.0, "the link tips over"), (0.1, "bistable: the link can rest at")]
+)
 def test_a_load_that_overcomes_a_spring_is_said(theta: float, words: str) -> None:
     """Catches an unstable pose, and one of two stable ones, that are given as where the link is."""
     upright = mujoco.MjModel.from_xml_string(UPRIGHT.format(-2, 2))  # 2.1 kg at 0.3 m: 6.2 N·m/rad
     weak = PositionCompensator.from_model(upright, {"shoulder": 4.5, "wrist": math.inf})
-    with pytest.raises(ElasticError, match=re.escape("stiffness of shoulder (4.5 N·m/rad) too low") + f".*{words}"):
+    with pytest.raises(
+        ElasticError, match=re.escape("stiffness of shoulder (4.5 N·m/rad) too low") + f".*{words}"
+    ):
         weak.link_angle([theta, 0.3])
     assert weak.link_angle([1.9, 0.3])[0] > 1.9
-    fenced = mujoco.MjModel.from_xml_string(UPRIGHT.format(-0.1, 2))  # the other pose is out of its range
+    fenced = mujoco.MjModel.from_xml_string(
+        UPRIGHT.format(-0.1, 2)
+    )  # the other pose is out of its range
     assert PositionCompensator.from_model(fenced, [4.5, math.inf]).link_angle([0.1, 0.0])[0] > 0.5
     firm = PositionCompensator.from_model(upright, {"shoulder": 6.5, "wrist": math.inf})
     q = firm.link_angle([theta, 0.3])
@@ -379,11 +472,17 @@ def test_a_load_that_overcomes_a_spring_is_said(theta: float, words: str) -> Non
 
 
 def test_servos_of_the_model_that_give_way_are_named() -> None:
-    """Catches a sag that stays because nobody said k_p; an infinite one says that the servo holds its angle."""
-    actuators = '<actuator><position joint="elbow" kp="40" gear="2"/><motor joint="turn"/></actuator>'
+    """Catches a sag that stays because nobody said k_p; an infinite one says that the servo
+    holds its angle."""
+    actuators = (
+        '<actuator><position joint="elbow" kp="40" gear="2"/><motor joint="turn"/></actuator>'
+    )
     model = ARM.replace("</mujoco>", f"{actuators}</mujoco>")
     spec = mujoco.MjSpec.from_string(model)
-    with pytest.warns(UserWarning, match=re.escape("position_gain={elbow: 160} [N·m/rad], or position_gain=math.inf")):
+    with pytest.warns(
+        UserWarning,
+        match=re.escape("position_gain={elbow: 160} [N·m/rad], or position_gain=math.inf"),
+    ):
         alone = PositionCompensator.from_model(spec, 500.0)
     held = PositionCompensator.from_model(spec, 500.0, position_gain=math.inf)
     np.testing.assert_array_equal(alone.command([0.3, 0.2, 0.1]), held.command([0.3, 0.2, 0.1]))
@@ -404,7 +503,8 @@ def said_by(compensator: Any) -> list[str]:
 
 
 def test_a_limit_that_the_weight_exceeds_is_said_once_with_what_is_enough() -> None:
-    """Catches a link that ends 16 degrees short without a word. The need is 9.81/20 rad, in closed form."""
+    """Catches a link that ends 16 degrees short without a word. The need is 9.81/20 rad, in
+    closed form."""
     pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
     found = []
 
@@ -423,7 +523,8 @@ def test_a_limit_that_the_weight_exceeds_is_said_once_with_what_is_enough() -> N
 
 
 def test_a_limit_that_a_payload_or_a_motion_exceeds_is_said_when_it_is_met() -> None:
-    """Catches a clip that only the payload or an acceleration brings, in silence; and one that is said at each call."""
+    """Catches a clip that only the payload or an acceleration brings, in silence; and one that
+    is said at each call."""
     pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
 
     def play() -> None:
@@ -451,7 +552,8 @@ def test_a_joint_range_that_a_command_would_leave_is_said_once() -> None:
 
 
 def test_a_payload_that_jumps_is_said_once_with_a_ramp() -> None:
-    """Catches a jump of the command without a word. 9.81 N/kg at 0.25 m over 400 N·m/rad are 6.1 mrad a kg."""
+    """Catches a jump of the command without a word. 9.81 N/kg at 0.25 m over 400 N·m/rad are 6.1
+    mrad a kg."""
     pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
 
     def play(**options: Any) -> None:
@@ -464,7 +566,10 @@ def test_a_payload_that_jumps_is_said_once_with_a_ramp() -> None:
 
     said = said_by(play)
     assert len(said) == 1
-    assert re.search(r"payload moves the command of joint 'j' by 19 mrad at once; ramp_s=1 takes it over", said[0])
+    assert re.search(
+        r"payload moves the command of joint 'j' by 19 mrad at once; ramp_s=1 takes it over",
+        said[0],
+    )
     assert said_by(lambda: play(ramp_s=1.0)) == []
 
     def elsewhere() -> None:

@@ -1,4 +1,5 @@
-"""Posture feedback: signs by kinematics, its response in closed form, and what it does to a walk."""
+"""Posture feedback: signs by kinematics, its response in closed form, and what it does to a
+walk."""
 
 from typing import Any
 
@@ -21,11 +22,13 @@ def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = G
     """Offsets under a constant attitude and rate of the IMU, (steps, 12)."""
     env = scalar()
     model = env.unwrapped.assumed_model
-    table, observation = model.observation_table, first(env)
+    table = model.observation_table
+    observation = first(env)
     policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
     observation[table.group("imu_attitude")] = attitude
     observation[table.columns("imu_rate.x", "imu_rate.y")] = rate
-    state, actions = None, []
+    state = None
+    actions = []
     for step in range(round(seconds / PERIOD_S)):
         action, state = policy.predict(observation, state, step == 0)
         actions.append(action)
@@ -33,7 +36,8 @@ def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = G
 
 
 def test_a_tilted_pelvis_is_turned_back() -> None:
-    """Catches a wrong sign or joint: on feet that stay where they are the pelvis turns against its tilt."""
+    """Catches a wrong sign or joint: on feet that stay where they are the pelvis turns against
+    its tilt."""
     env = scalar()
     model = env.unwrapped.assumed_model
     turn = turned(np.array([0.01, 0.02]), np.zeros(2), 0.4)[-1]
@@ -42,64 +46,87 @@ def test_a_tilted_pelvis_is_turned_back() -> None:
         _, before = foot_pose(model.biped.leg, planned)
         _, after = foot_pose(model.biped.leg, planned + turn.reshape(2, 6)[leg])
         pelvis = before @ after.T  # orientation of the pelvis over a foot that keeps its own
-        roll, pitch = np.arctan2(pelvis[2, 1], pelvis[2, 2]), -np.arcsin(pelvis[2, 0])
+        roll = np.arctan2(pelvis[2, 1], pelvis[2, 2])
+        pitch = -np.arcsin(pelvis[2, 0])
         assert roll < -0.01
         assert pitch < -0.02
 
 
 def test_the_response_is_that_of_the_equation() -> None:
-    """A constant tilt: k_p φ + k_i φ T (1 − exp(−t/T)) once the filter has settled; a rate adds k_d ω."""
+    """A constant tilt: k_p φ + k_i φ T (1 − exp(−t/T)) once the filter has settled; a rate adds
+    k_d ω."""
     gains = GAINS.replace(filter_s=1e-4)
-    seconds, tilt = 0.6, 0.01
+    seconds = 0.6
+    tilt = 0.01
     found = turned(np.array([tilt, 0.0]), np.zeros(2), seconds, gains)[-1].reshape(2, 6)
     integral = tilt * gains.leak_s * (1.0 - np.exp(-seconds / gains.leak_s))
     expected = gains.proportional * tilt + gains.integral * integral
     np.testing.assert_allclose(found[:, 1], expected, rtol=0.01)
     assert not found[:, [0, 2, 3, 4, 5]].any()
-    with_rate = turned(np.array([tilt, 0.0]), np.array([0.05, 0.0]), seconds, gains)[-1].reshape(2, 6)
+    with_rate = turned(np.array([tilt, 0.0]), np.array([0.05, 0.0]), seconds, gains)[-1].reshape(
+        2, 6
+    )
     np.testing.assert_allclose(with_rate[:, 1] - found[:, 1], gains.derivative * 0.05, rtol=1e-4)
 
 
 def test_nothing_exceeds_the_limit() -> None:
     """Catches an integral that winds up behind the bound: it lets go within a leak's time."""
     gains = GAINS.replace(limit_rad=0.03)
-    assert np.abs(turned(np.array([0.5, -0.5]), np.zeros(2), 0.4, gains)).max() == pytest.approx(0.03)
+    assert np.abs(turned(np.array([0.5, -0.5]), np.zeros(2), 0.4, gains)).max() == pytest.approx(
+        0.03
+    )
 
 
 def test_a_leg_in_the_air_keeps_its_pitch_and_follows_slowly() -> None:
-    """Catches a swing foot that is moved forth and back: n steps after lift-off (1 − Δt/T)ⁿ of the way is left."""
+    """Catches a swing foot that is moved forth and back: n steps after lift-off (1 − Δt/T)ⁿ of
+    the way is left."""
     gains = GAINS.replace(integral=0.0, derivative=0.0, filter_s=1e-4, swing_s=0.5)
     env = scalar()
     model = env.unwrapped.assumed_model
-    table, observation = model.observation_table, first(env)
+    table = model.observation_table
+    observation = first(env)
     policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
-    attitude, share = table.group("imu_attitude"), table.group("load_share")
+    attitude = table.group("imu_attitude")
+    share = table.group("load_share")
     observation[table.columns("imu_rate.x", "imu_rate.y")] = 0.0
-    state, action, tilt, later = None, None, np.array([0.01, 0.02]), np.array([0.03, -0.01])
+    state = None
+    action = None
+    tilt = np.array([0.01, 0.02])
+    later = np.array([0.03, -0.01])
 
     def played(seconds: float, imu: Array, share_right: float) -> Array:
         nonlocal state, action
-        observation[attitude], observation[share] = imu, share_right
+        observation[attitude] = imu
+        observation[share] = share_right
         for _ in range(round(seconds / PERIOD_S)):
             action, state = policy.predict(observation, state, state is None)
         return np.asarray(action, dtype=np.float64).reshape(2, 6)
 
     standing = played(0.1, tilt, 0.5)
-    np.testing.assert_allclose(standing[:, 1:3], gains.proportional * np.tile(tilt, (2, 1)), rtol=1e-5)
+    np.testing.assert_allclose(
+        standing[:, 1:3], gains.proportional * np.tile(tilt, (2, 1)), rtol=1e-5
+    )
     swing = played(0.3, later, 0.0)  # the left foot stands alone
-    now, lifted = gains.proportional * later, gains.proportional * tilt
+    now = gains.proportional * later
+    lifted = gains.proportional * tilt
     np.testing.assert_allclose(swing[0, 1:3], now, rtol=1e-5)
     left = (1.0 - PERIOD_S / gains.swing_s) ** (round(0.3 / PERIOD_S) - 1)
-    np.testing.assert_allclose(swing[1, 1:3], [now[0], now[1] + (lifted[1] - now[1]) * left], rtol=1e-4)
+    np.testing.assert_allclose(
+        swing[1, 1:3], [now[0], now[1] + (lifted[1] - now[1]) * left], rtol=1e-4
+    )
     landed = played(PERIOD_S, later, 0.5)
     np.testing.assert_allclose(landed[:, 1:3], np.tile(now, (2, 1)), rtol=1e-5)
 
 
 def pelvis_error(name: str, scenario: str, **options: Any) -> float:
     """Pelvis error rms of a walk of two fast steps [rad]."""
-    env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=2, scenario=scenario)
+    env = gymnasium.make(
+        "elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=2, scenario=scenario
+    )
     policy = baselines.make(name, env, **options)
-    (observation, info), state, over = env.reset(seed=0), None, False
+    observation, info = env.reset(seed=0)
+    state = None
+    over = False
     while not over:
         action, state = policy.predict(observation, state)
         observation, _, terminated, truncated, info = env.step(action)
@@ -110,8 +137,10 @@ def pelvis_error(name: str, scenario: str, **options: Any) -> float:
 
 def test_posture_and_adaptation_lower_the_pelvis_error_on_soft_joints() -> None:
     """Catches either of them without effect, or with the wrong sign."""
-    plain, adaptive = pelvis_error("input_output", "ideal+soft"), pelvis_error("adaptive", "ideal+soft")
-    posture, both = pelvis_error("posture", "ideal+soft"), pelvis_error("adaptive_posture", "ideal+soft")
+    plain = pelvis_error("input_output", "ideal+soft")
+    adaptive = pelvis_error("adaptive", "ideal+soft")
+    posture = pelvis_error("posture", "ideal+soft")
+    both = pelvis_error("adaptive_posture", "ideal+soft")
     assert adaptive < 0.6 * plain
     assert posture < 0.5 * plain
     assert both < 0.35 * plain

@@ -27,9 +27,11 @@ def test_cart_table_is_the_exact_solution_under_constant_jerk() -> None:
 
 
 def test_closed_loop_follows_a_walking_reference_within_a_millimetre() -> None:
-    """Catches a preview that is shifted by a sample or has the wrong sign (issue: below 1 mm rms)."""
+    """Catches a preview that is shifted by a sample or has the wrong sign (issue: below 1 mm
+    rms)."""
     reference = np.stack(
-        [smooth_step(2500, 500, 775, 0.105) - smooth_step(2500, 975, 1525, 0.21), np.zeros(2500)], axis=1
+        [smooth_step(2500, 500, 775, 0.105) - smooth_step(2500, 975, 1525, 0.21), np.zeros(2500)],
+        axis=1,
     )
     motion = follow_zmp(CONFIG, reference, np.zeros(2))
     assert np.sqrt(np.mean((motion.zmp - reference) ** 2, axis=0)).max() < 1e-3
@@ -41,13 +43,20 @@ def test_motion_is_consistent_with_its_own_derivatives() -> None:
     """Catches columns of position, velocity and acceleration that are swapped."""
     motion = follow_zmp(CONFIG, smooth_step(1500, 500, 775, 0.1)[:, None], np.zeros(1))
     T = CONFIG.period_s
-    np.testing.assert_allclose(np.gradient(motion.com[:, 0], T)[1:-1], motion.com_dot[1:-1, 0], atol=2e-5)
-    np.testing.assert_allclose(np.gradient(motion.com_dot[:, 0], T)[1:-1], motion.com_ddot[1:-1, 0], atol=2e-4)
-    np.testing.assert_allclose(motion.zmp, motion.com - 0.73 / 9.81 * motion.com_ddot, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.gradient(motion.com[:, 0], T)[1:-1], motion.com_dot[1:-1, 0], atol=2e-5
+    )
+    np.testing.assert_allclose(
+        np.gradient(motion.com_dot[:, 0], T)[1:-1], motion.com_ddot[1:-1, 0], atol=2e-4
+    )
+    np.testing.assert_allclose(
+        motion.zmp, motion.com - 0.73 / 9.81 * motion.com_ddot, rtol=0.0, atol=1e-15
+    )
 
 
 def test_gains_are_the_optimum_of_the_cost() -> None:
-    """Catches a Riccati equation of another system: no other jerk sequence has a lower cost over a long horizon."""
+    """Catches a Riccati equation of another system: no other jerk sequence has a lower cost over
+    a long horizon."""
     config = PreviewConfig(com_height_m=0.73, period_s=0.04, preview_s=3.2)
     reference = smooth_step(160, 40, 60, 0.1)[:, None]
     A, b, c = cart_table(config)
@@ -55,15 +64,19 @@ def test_gains_are_the_optimum_of_the_cost() -> None:
     jerk = np.diff(motion.com_ddot[:, 0]) / config.period_s
 
     def residuals(u: np.ndarray) -> np.ndarray:
-        state, errors = np.zeros(3), np.empty(len(u))
+        state = np.zeros(3)
+        errors = np.empty(len(u))
         for k, value in enumerate(u):
             state = A @ state + b * value
             errors[k] = c @ state - reference[k + 1, 0]
         increments = np.diff(np.concatenate([[0.0], u]))
         return np.concatenate([errors, np.sqrt(config.jerk_weight) * increments])
 
-    optimum = optimize.least_squares(residuals, np.zeros(len(jerk)), method="lm", xtol=1e-14, ftol=1e-14)
-    # the servo sees 3.2 s ahead and plans for ever, the optimum knows all and ends: they may differ a little
+    optimum = optimize.least_squares(
+        residuals, np.zeros(len(jerk)), method="lm", xtol=1e-14, ftol=1e-14
+    )
+    # the servo sees 3.2 s ahead and plans for ever, the optimum knows all and ends: they may differ
+    # a little
     assert np.sum(residuals(jerk) ** 2) <= 1.001 * 2.0 * optimum.cost
 
 

@@ -1,4 +1,5 @@
-"""What other teams published for their walkers: hip roll in single support, balance by the feet, hip roll by torque."""
+"""What other teams published for their walkers: hip roll in single support, balance by the feet,
+hip roll by torque."""
 
 from typing import Any
 
@@ -28,27 +29,36 @@ def made(**arguments: Any) -> Any:
 
 
 def rolls(policy: Any, env: Any) -> Array:
-    """True roll of the pelvis in the middle of single support, positive to the swing side, (T,) [rad]."""
-    (observation, _), state, found = env.reset(seed=0), None, []
+    """True roll of the pelvis in the middle of single support, positive to the swing side, (T,)
+    [rad]."""
+    observation, _ = env.reset(seed=0)
+    state = None
+    found = []
     for step in range(env.unwrapped.task.num_steps):
         action, state = policy.predict(observation, state, np.array([step == 0]))
         observation, _, _, _, info = env.step(action)
         found.append(info["pelvis_roll"][0])
     timing = env.unwrapped.assumed_model.plan.timing
-    side = np.where(timing.support == 0, 1.0, -1.0)[1:]  # where left stands the right side falls: positive about x
+    side = np.where(timing.support == 0, 1.0, -1.0)[
+        1:
+    ]  # where left stands the right side falls: positive about x
     return (side * np.array(found))[np.abs(timing.swing[1:] - 0.5) < 0.2]
 
 
 def test_the_stance_hip_turns_outwards_and_the_swing_hip_the_other_way() -> None:
-    """Catches a leg, a sign or a share: +φ left where left stands, −φ right where right stands, −0.35 of it beside."""
-    offsets = stance_roll(np.array([0.5, 0.5]), np.array([0.0, 1.0]), StanceRollGains(angle_rad=0.02))
+    """Catches a leg, a sign or a share: +φ left where left stands, −φ right where right stands,
+    −0.35 of it beside."""
+    offsets = stance_roll(
+        np.array([0.5, 0.5]), np.array([0.0, 1.0]), StanceRollGains(angle_rad=0.02)
+    )
     np.testing.assert_allclose(offsets[0, ROLLS], [0.02, -0.35 * 0.02])
     np.testing.assert_allclose(offsets[1, ROLLS], [0.35 * 0.02, -0.02])
     assert np.count_nonzero(offsets) == 4
 
 
 def test_the_stance_hip_starts_and_ends_at_rest() -> None:
-    """Catches an offset in double support, and a kink: s(1/2) = 1/2 at a quarter of the swing, no rate at its ends."""
+    """Catches an offset in double support, and a kink: s(1/2) = 1/2 at a quarter of the swing,
+    no rate at its ends."""
     swing = np.array([0.0, 1e-3, 0.25, 0.5, 0.75, 1.0 - 1e-3, 1.0])
     angle = stance_roll(swing, np.zeros(7), StanceRollGains(angle_rad=1e-1))[:, 1]
     np.testing.assert_allclose(
@@ -57,9 +67,11 @@ def test_the_stance_hip_starts_and_ends_at_rest() -> None:
 
 
 def test_the_feedforward_lifts_the_swing_side() -> None:
-    """Catches the wrong sign at the robot: the pelvis, which falls to the swing side, rolls less in single support."""
+    """Catches the wrong sign at the robot: the pelvis, which falls to the swing side, rolls less
+    in single support."""
     env = made(step_period=[0.4, 0.6, 0.4])
-    controller, model = baselines.make("uncompensated", env), env.unwrapped.assumed_model
+    controller = baselines.make("uncompensated", env)
+    model = env.unwrapped.assumed_model
     without = rolls(controller, env)
     lifted = rolls(StanceRoll(controller, model, StanceRollGains(angle_rad=0.02)), env)
     assert without.mean() > 0.02
@@ -68,7 +80,9 @@ def test_the_feedforward_lifts_the_swing_side() -> None:
 
 def balance(**gains: float) -> tuple[FootBalance, Any]:
     """A balance with these gains alone, all there from the first step, and the model."""
-    zero = dict.fromkeys(("gyro_s", "attitude", "force_horizontal", "force_vertical", "moment"), 0.0)
+    zero = dict.fromkeys(
+        ("gyro_s", "attitude", "force_horizontal", "force_vertical", "moment"), 0.0
+    )
     high = {"imu_cutoff_hz": 1e9, "wrench_cutoff_hz": 1e9}
     env = made()
     model = env.unwrapped.assumed_model
@@ -76,7 +90,8 @@ def balance(**gains: float) -> tuple[FootBalance, Any]:
 
 
 def feet(env: Any, q: Array) -> tuple[Array, Array]:
-    """Middles of the soles, (2, 3) [m], and orientations, (2, 3, 3), in a frame with the axes of the pelvis."""
+    """Middles of the soles, (2, 3) [m], and orientations, (2, 3, 3), in a frame with the axes of
+    the pelvis."""
     biped = env.unwrapped.assumed_model.biped
     position, R = foot_pose(biped.leg, q.reshape(2, 6))
     hips = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]) * biped.footholds[0, 1]
@@ -84,7 +99,8 @@ def feet(env: Any, q: Array) -> tuple[Array, Array]:
 
 
 def moved(policy: Any, env: Any, **columns: float) -> tuple[Array, Array]:
-    """How soles move and turn for an observation with these values, forces and moments else as wanted."""
+    """How soles move and turn for an observation with these values, forces and moments else as
+    wanted."""
     table = env.unwrapped.task.observation_table
     row, _ = env.reset(seed=0)
     for name in table.names:
@@ -95,17 +111,21 @@ def moved(policy: Any, env: Any, **columns: float) -> tuple[Array, Array]:
         row[:, table.names.index(name.replace("__", "."))] += value
     action, _ = policy.predict(row, None, np.array([True]))
     q_ref = row[0, table.group("reference_angle")]
-    (before, R_before), (after, R_after) = feet(env, q_ref), feet(env, q_ref + action[0])
+    before, R_before = feet(env, q_ref)
+    after, R_after = feet(env, q_ref + action[0])
     return after - before, R_after @ R_before.swapaxes(-1, -2)
 
 
 def test_feet_turn_with_the_tilt_of_the_pelvis_about_their_middle() -> None:
-    """Catches the sign and the frame: a pelvis that rolls by φ is turned back by feet that turn by φ as one body."""
+    """Catches the sign and the frame: a pelvis that rolls by φ is turned back by feet that turn
+    by φ as one body."""
     policy, env = balance(attitude=1.0)
     shift, turn = moved(policy, env, imu_attitude__roll=0.02)
     half = env.unwrapped.assumed_model.biped.footholds[0, 1]
     np.testing.assert_allclose(turn, np.tile(rotation_x(np.array(0.02)), (2, 1, 1)), atol=1e-6)
-    np.testing.assert_allclose(shift, [[0, 0, half * np.sin(0.02)], [0, 0, -half * np.sin(0.02)]], atol=1e-6)
+    np.testing.assert_allclose(
+        shift, [[0, 0, half * np.sin(0.02)], [0, 0, -half * np.sin(0.02)]], atol=1e-6
+    )
     policy, env = balance(gyro_s=0.05)
     _, turn = moved(policy, env, imu_rate__x=0.4)
     np.testing.assert_allclose(turn[0], rotation_x(np.array(0.02)), atol=1e-6)
@@ -120,8 +140,11 @@ def test_feet_turn_with_the_tilt_of_the_pelvis_about_their_middle() -> None:
         ({"moment": 1e-3}, {"wrench__l_mx": 10.0}, [[0, 0, 0], [0, 0, 0]], 0.01),
     ],
 )
-def test_feet_give_way_to_what_the_ground_does(gains: Any, columns: Any, shift: Any, roll: float) -> None:
-    """Catches a foot that pushes back, the other foot, and a turn about the ankle instead of the sole."""
+def test_feet_give_way_to_what_the_ground_does(
+    gains: Any, columns: Any, shift: Any, roll: float
+) -> None:
+    """Catches a foot that pushes back, the other foot, and a turn about the ankle instead of the
+    sole."""
     policy, env = balance(**gains)
     moves, turn = moved(policy, env, **columns)
     np.testing.assert_allclose(moves, shift, atol=1e-6)
@@ -132,7 +155,8 @@ def test_forces_wanted_are_those_of_the_plan() -> None:
     """Catches a share of the wrong foot and a missing acceleration: in sum they are m (g + a)."""
     policy, env = balance()
     model = env.unwrapped.assumed_model
-    total, mass = policy._wanted.sum(axis=1), model.biped.weight / model.biped.gravity
+    total = policy._wanted.sum(axis=1)
+    mass = model.biped.weight / model.biped.gravity
     np.testing.assert_allclose(total[:, 2], model.biped.weight)
     pendulum = model.plan.omega**2 * (model.plan.com - model.plan.zmp)
     np.testing.assert_allclose(total[5:-5, 1] / mass, pendulum[5:-5, 1], atol=0.15)
@@ -148,8 +172,10 @@ def test_a_foot_out_of_reach_comes_as_near_as_the_leg_allows() -> None:
 
 
 def test_the_low_pass_is_first_order() -> None:
-    """Catches a cut-off in rad/s and a period left out: after 1/(2π f) a step has reached 1 − 1/e."""
-    value, steps = np.zeros(1), round(1.0 / (2.0 * np.pi * 1.0 * PERIOD_S))
+    """Catches a cut-off in rad/s and a period left out: after 1/(2π f) a step has reached 1 −
+    1/e."""
+    value = np.zeros(1)
+    steps = round(1.0 / (2.0 * np.pi * 1.0 * PERIOD_S))
     for _ in range(steps):
         value = low_pass(value, np.ones(1), 1.0, PERIOD_S)
     assert value[0] == pytest.approx(1.0 - np.exp(-2.0 * np.pi * PERIOD_S * steps), rel=1e-12)
@@ -159,7 +185,9 @@ def test_the_low_pass_is_first_order() -> None:
 def test_the_rate_limit_is_of_the_offset() -> None:
     """Catches a limit per step instead of per time, and one that holds in one direction alone."""
     values = np.array([0.01, -0.01, 5e-6])
-    np.testing.assert_allclose(limit_rate(np.zeros(3), values, 0.003, PERIOD_S), [12e-6, -12e-6, 5e-6])
+    np.testing.assert_allclose(
+        limit_rate(np.zeros(3), values, 0.003, PERIOD_S), [12e-6, -12e-6, 5e-6]
+    )
 
 
 class Still:
@@ -187,17 +215,21 @@ def torques(gains: HipTorqueGains, torque: float, swing: float, steps: int) -> A
 
 
 def test_the_hip_leads_by_its_filtered_torque_over_k() -> None:
-    """Catches a sign, another K, another joint: τ/K (1 − e^{−2π f t}) without bound and rate limit."""
+    """Catches a sign, another K, another joint: τ/K (1 − e^{−2π f t}) without bound and rate
+    limit."""
     gains = HipTorqueGains(limit_rad=1.0, rate_rad_s=100.0)
     offsets = torques(gains, 20.0, 0.5, 100)
     time = PERIOD_S * np.arange(1, 101)
-    np.testing.assert_allclose(offsets[:, 1], 20.0 / 1001.0 * (1.0 - np.exp(-2.0 * np.pi * time)), rtol=1e-5)
+    np.testing.assert_allclose(
+        offsets[:, 1], 20.0 / 1001.0 * (1.0 - np.exp(-2.0 * np.pi * time)), rtol=1e-5
+    )
     np.testing.assert_array_equal(offsets[:, 7], -offsets[:, 1])
     assert np.count_nonzero(np.delete(offsets, ROLLS, axis=1)) == 0
 
 
 def test_the_hip_is_bounded_and_limit_rate() -> None:
-    """Catches a bound before the division, and a limit that is left out: 0.003 rad/s up to 0.01 rad."""
+    """Catches a bound before the division, and a limit that is left out: 0.003 rad/s up to 0.01
+    rad."""
     quick = torques(HipTorqueGains(cutoff_hz=1e3), 60.0, 0.5, 1000)[:, 1]
     time = PERIOD_S * np.arange(1, 1001)
     np.testing.assert_allclose(quick, np.minimum(0.003 * time, 0.01), rtol=1e-5)
@@ -211,13 +243,12 @@ def test_the_hip_waits_for_single_support() -> None:
 
 
 def test_the_hip_rises_at_the_robot() -> None:
-    """Catches a torque sensor of the other sign: with wide limits the pelvis rolls less than uncompensated."""
+    """Catches a torque sensor of the other sign: with wide limits the pelvis rolls less than
+    uncompensated."""
     env = made(step_period=[0.4, 0.6, 0.4], sensors=["joint_torque"])
     quick = HipTorqueGains(cutoff_hz=5.0, limit_rad=0.03, rate_rad_s=0.3)
-    without, led = (
-        rolls(baselines.make("uncompensated", env), env),
-        rolls(baselines.make("talos", env, hip_torque=quick), env),
-    )
+    without = rolls(baselines.make("uncompensated", env), env)
+    led = rolls(baselines.make("talos", env, hip_torque=quick), env)
     assert without.mean() > 0.02
     assert led.mean() < 0.8 * without.mean()
 
@@ -234,16 +265,27 @@ def test_tracks_and_sensors_are_said() -> None:
 def test_worlds_are_apart_and_episodes_begin_anew(name: str) -> None:
     """Catches memory that leaks from world to world or from one episode to the next."""
     sensors = list(sensors_needed(name))
-    arguments: dict[str, Any] = {"step_period": SHORT, "num_steps": 1, "sensors": sensors, "scenario": "nominal"}
-    env = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="vector_entry_point", num_threads=1, **arguments)
-    policy, recorded, state = baselines.make(name, env), [], None
+    arguments: dict[str, Any] = {
+        "step_period": SHORT,
+        "num_steps": 1,
+        "sensors": sensors,
+        "scenario": "nominal",
+    }
+    env = gymnasium.make_vec(
+        ID, num_envs=2, vectorization_mode="vector_entry_point", num_threads=1, **arguments
+    )
+    policy = baselines.make(name, env)
+    recorded = []
+    state = None
     observation, _ = env.reset(seed=5)
     for step in range(300):
         action, state = policy.predict(observation, state, np.full(2, step == 0))
         recorded.append((observation, action))
         observation, *_ = env.step(action)
     state = None
-    for step, (observation, action) in enumerate(recorded):  # one world alone, started anew in the state of another
+    for step, (observation, action) in enumerate(
+        recorded
+    ):  # one world alone, started anew in the state of another
         alone, state = policy.predict(observation[1], state, step == 0)
         np.testing.assert_array_equal(alone, action[1])
     again, _ = policy.predict(recorded[0][0][1], state, True)

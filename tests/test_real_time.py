@@ -37,13 +37,21 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(("env", "policy"), [("walker", "adaptive_posture"), ("testbed", "input")])
-def test_a_policy_plays_against_the_clock(env: str, policy: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches cycles that are left out or played faster than the clock, and figures that are not of one run."""
+def test_a_policy_plays_against_the_clock(
+    env: str, policy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches cycles that are left out or played faster than the clock, and figures that are not
+    of one run."""
     begin = time.monotonic()
     main(["speed", "--real-time", "--env", env, "--seconds", "0.5", "--output", "result"])
     assert time.monotonic() - begin > 0.5
     found = json.loads(Path("result/real_time.json").read_text())
-    assert (found["env"], found["policy"], found["period_us"], found["cycles"]) == (env, policy, 4000.0, 125)
+    assert (found["env"], found["policy"], found["period_us"], found["cycles"]) == (
+        env,
+        policy,
+        4000.0,
+        125,
+    )
     assert 0 <= found["late"] <= 125
     assert found["late_share"] == found["late"] / 125
     for title in ("latency", "policy"):
@@ -58,7 +66,8 @@ def test_a_policy_plays_against_the_clock(env: str, policy: str, capsys: pytest.
 
 
 def test_a_policy_that_takes_longer_than_a_period_is_late_in_every_cycle() -> None:
-    """Catches lateness by the time in the policy alone, which does not add up, and cycles that wait for the clock.
+    """Catches lateness by the time in the policy alone, which does not add up, and cycles that wait
+    for the clock.
 
     And a loop that is said to have real-time scheduling and has not, or keeps it.
     """
@@ -68,16 +77,24 @@ def test_a_policy_that_takes_longer_than_a_period_is_late_in_every_cycle() -> No
     found = json.loads(Path("result/real_time.json").read_text())
     assert (found["cycles"], found["late_share"]) == (50, 1.0)
     assert found["policy_median_us"] >= 6000.0
-    assert found["latency_max_us"] >= 50 * 6000.0 - 49 * 4000.0  # the last one, behind by half a period of each
+    assert (
+        found["latency_max_us"] >= 50 * 6000.0 - 49 * 4000.0
+    )  # the last one, behind by half a period of each
     assert found["is_real_time"] == (Path("scheduled").read_text() == str(os.SCHED_FIFO))
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
 
 
 def test_late_cycles_and_percentiles_are_those_of_the_samples() -> None:
-    """Catches a cycle at the very end of its period that counts as late, and percentiles in another unit."""
+    """Catches a cycle at the very end of its period that counts as late, and percentiles in
+    another unit."""
     latency_s = 1e-6 * np.arange(1.0, 1002.0)
     found = summary("testbed", "input", 1000e-6, latency_s, 0.5 * latency_s, is_real_time=False)
     assert (found.cycles, found.late) == (1001, 1)
-    figures = found.latency_median_us, found.latency_p99_us, found.latency_p999_us, found.latency_max_us
+    figures = (
+        found.latency_median_us,
+        found.latency_p99_us,
+        found.latency_p999_us,
+        found.latency_max_us,
+    )
     assert figures == pytest.approx((501.0, 991.0, 1000.0, 1001.0))
     assert found.policy_p99_us == pytest.approx(495.5)

@@ -1,4 +1,5 @@
-"""Reference trajectories: derivatives against finite differences, bounds over many seeds, the paper's positions."""
+"""Reference trajectories: derivatives against finite differences, bounds over many seeds, the
+paper's positions."""
 
 from typing import Any
 
@@ -9,19 +10,35 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.motion.references import REFERENCES, Hold, Multisine, Reference, Sine, Steps, make_reference
+from elastic_env.motion.references import (
+    REFERENCES,
+    Hold,
+    Multisine,
+    Reference,
+    Sine,
+    Steps,
+    make_reference,
+)
 from elastic_env.motion.trajectory import STAND_S, Plan, quintic
 
 PERIOD_S = 0.004
 ALL = {
     "hold": Hold(),
     "hold, few and quick": Hold(
-        positions=3, rate=0.5, lower=-0.2, upper=0.9, settle_s=0.0, measure_s=0.1, shortest_move_s=0.2
+        positions=3,
+        rate=0.5,
+        lower=-0.2,
+        upper=0.9,
+        settle_s=0.0,
+        measure_s=0.1,
+        shortest_move_s=0.2,
     ),
     "sine": Sine(middle=-0.3),
     "sine, fast": Sine(frequency_hz=1.5, amplitude=0.1, duration_s=3.0, onset_s=0.4),
     "multisine": Multisine(),
-    "multisine, raised": Multisine(middle=0.5, components=9, highest_hz=3.0, duration_s=4.0, onset_s=0.3),
+    "multisine, raised": Multisine(
+        middle=0.5, components=9, highest_hz=3.0, duration_s=4.0, onset_s=0.3
+    ),
     "steps": Steps(),
     "steps, raised": Steps(middle=-0.4, move_s=0.3, rest_s=0.0, moves=9),
 }
@@ -42,18 +59,24 @@ def central(values: Array, period_s: float) -> Array:
 def test_rate_and_acceleration_are_the_derivatives_of_the_angle(name: str, period_s: float) -> None:
     """Catches a chain rule that lost a factor or the derivatives of the envelope.
 
-    What a central difference may miss follows from how much the acceleration changes within a period.
+    What a central difference may miss follows from how much the acceleration changes within a
+    period.
     """
     plan = plan_of(ALL[name], seed=3, period_s=period_s)
     change = np.abs(np.diff(plan.q_ddot)).max()
     assert change < 0.2 * np.abs(plan.q_ddot).max()
-    np.testing.assert_allclose(central(plan.q_dot, period_s), plan.q_ddot[1:-1], rtol=0.0, atol=0.6 * change)
-    np.testing.assert_allclose(central(plan.q, period_s), plan.q_dot[1:-1], rtol=0.0, atol=0.2 * change * period_s)
+    np.testing.assert_allclose(
+        central(plan.q_dot, period_s), plan.q_ddot[1:-1], rtol=0.0, atol=0.6 * change
+    )
+    np.testing.assert_allclose(
+        central(plan.q, period_s), plan.q_dot[1:-1], rtol=0.0, atol=0.2 * change * period_s
+    )
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_extents_are_bounds_over_all_seeds_and_no_loose_ones(name: str) -> None:
-    """Catches a bound that a plan breaks, so that the servo could saturate, and one that forbids what is possible."""
+    """Catches a bound that a plan breaks, so that the servo could saturate, and one that forbids
+    what is possible."""
     extent = ALL[name].extent()
     reached = np.full(4, -np.inf)
     for seed in range(100 if "hold" not in name and name != "sine" else 1):
@@ -79,12 +102,20 @@ def test_extents_are_bounds_over_all_seeds_and_no_loose_ones(name: str) -> None:
 def test_extent_of_hold_is_a_bound_for_any_sweep(
     positions: int, rate: float, overrun: float, shortest_move_s: float, bounds: tuple[float, float]
 ) -> None:
-    """Catches the shortest move being taken from the positions alone: the first and the last are the overrun."""
+    """Catches the shortest move being taken from the positions alone: the first and the last are
+    the overrun."""
     hold = Hold(
-        positions=positions, rate=rate, overrun=overrun, shortest_move_s=shortest_move_s, lower=bounds[0],
-        upper=bounds[1], settle_s=0.05, measure_s=0.01,
-    )  # fmt: skip
-    plan, extent = plan_of(hold), hold.extent()
+        positions=positions,
+        rate=rate,
+        overrun=overrun,
+        shortest_move_s=shortest_move_s,
+        lower=bounds[0],
+        upper=bounds[1],
+        settle_s=0.05,
+        measure_s=0.01,
+    )
+    plan = plan_of(hold)
+    extent = hold.extent()
     assert extent.lowest - 1e-9 <= plan.q.min() <= plan.q.max() <= extent.highest + 1e-9
     assert np.abs(plan.q_dot).max() <= extent.q_dot * (1 + 1e-9)
     assert np.abs(plan.q_ddot).max() <= extent.q_ddot * (1 + 1e-9)
@@ -103,15 +134,25 @@ def test_extents_of_oscillations_and_steps_are_bounds_for_any_parameters(
 ) -> None:
     """Catches bounds that forget the onset: there amplitude, rate and acceleration add up."""
     references = [
-        Sine(amplitude=amplitude, middle=middle, onset_s=onset_s, frequency_hz=hz[1], duration_s=1.0),
+        Sine(
+            amplitude=amplitude, middle=middle, onset_s=onset_s, frequency_hz=hz[1], duration_s=1.0
+        ),
         Multisine(
-            amplitude=amplitude, middle=middle, onset_s=onset_s, lowest_hz=hz[0], highest_hz=hz[1], duration_s=2.0
+            amplitude=amplitude,
+            middle=middle,
+            onset_s=onset_s,
+            lowest_hz=hz[0],
+            highest_hz=hz[1],
+            duration_s=2.0,
         ),
         Steps(amplitude=amplitude, middle=middle, move_s=onset_s, rest_s=0.1),
     ]
     for reference in references:
-        plan, extent = plan_of(reference, seed), reference.extent()
-        assert extent.lowest - 1e-9 <= plan.q.min() <= plan.q.max() <= extent.highest + 1e-9, reference
+        plan = plan_of(reference, seed)
+        extent = reference.extent()
+        assert extent.lowest - 1e-9 <= plan.q.min() <= plan.q.max() <= extent.highest + 1e-9, (
+            reference
+        )
         assert np.abs(plan.q_dot).max() <= extent.q_dot * (1 + 1e-9), reference
         assert np.abs(plan.q_ddot).max() <= extent.q_ddot * (1 + 1e-9), reference
 
@@ -133,19 +174,25 @@ def test_every_plan_stands_first_and_starts_and_moves_smoothly(name: str) -> Non
 
 
 def test_quintic_is_the_minimum_jerk_polynomial() -> None:
-    """Catches a wrong coefficient: its six boundary conditions determine it, and outside [0, 1] it rests."""
+    """Catches a wrong coefficient: its six boundary conditions determine it, and outside [0, 1]
+    it rests."""
     s = np.array([0.0, 1.0])
     for value, expected in zip(quintic(s), ([0, 1], [0, 0], [0, 0]), strict=True):
         np.testing.assert_allclose(value, expected, rtol=0.0, atol=1e-14)
     inside = np.linspace(0.0, 1.0, 11)
     polynomial = np.polynomial.Polynomial.fit(inside, quintic(inside)[0], 5)
     np.testing.assert_allclose(polynomial.deriv()(inside), quintic(inside)[1], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(polynomial.deriv(2)(inside), quintic(inside)[2], rtol=0.0, atol=1e-10)
-    np.testing.assert_array_equal(np.array(quintic(np.array([-1.0, 2.0]))), [[0, 1], [0, 0], [0, 0]])
+    np.testing.assert_allclose(
+        polynomial.deriv(2)(inside), quintic(inside)[2], rtol=0.0, atol=1e-10
+    )
+    np.testing.assert_array_equal(
+        np.array(quintic(np.array([-1.0, 2.0]))), [[0, 1], [0, 0], [0, 0]]
+    )
 
 
 def uncompensated_rest(hold: Hold, theta: Array) -> Array:
-    """Link angles at which the paper's pendulum hangs behind its spring when the motor stands at theta."""
+    """Link angles at which the paper's pendulum hangs behind its spring when the motor stands at
+    theta."""
     q = theta.copy()
     for _ in range(200):
         q = theta - hold.sag * np.sin(q)
@@ -153,7 +200,8 @@ def uncompensated_rest(hold: Hold, theta: Array) -> Array:
 
 
 def test_static_positions_are_evenly_spaced_in_torque_as_the_paper_has_them() -> None:
-    """Catches positions even in angle, and a range that is not −52.5 to +34.6 N·m for the link of the paper."""
+    """Catches positions even in angle, and a range that is not −52.5 to +34.6 N·m for the link
+    of the paper."""
     hold = Hold()
     angles, directions = hold.visits
     torque = 60.0 * np.sin(uncompensated_rest(hold, angles))
@@ -166,12 +214,15 @@ def test_static_positions_are_evenly_spaced_in_torque_as_the_paper_has_them() ->
 def test_without_sag_the_references_themselves_are_evenly_spaced_in_torque() -> None:
     """Catches a sag that is added twice, or to a compensated link's reference as well."""
     torque = 60.0 * np.sin(Hold(sag=0.0).angles)
-    np.testing.assert_allclose(torque, np.linspace(-52.5, 34.6, Hold().positions), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        torque, np.linspace(-52.5, 34.6, Hold().positions), rtol=0.0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ["hold", "hold, few and quick"])
 def test_every_position_is_held_and_approached_from_one_side(name: str) -> None:
-    """Catches an approach that overshoots or turns back, which would spoil the hysteresis that is to be measured."""
+    """Catches an approach that overshoots or turns back, which would spoil the hysteresis that
+    is to be measured."""
     hold = ALL[name]
     assert isinstance(hold, Hold)
     plan = plan_of(hold)
@@ -195,7 +246,8 @@ def test_every_position_is_held_and_approached_from_one_side(name: str) -> None:
 
 def test_the_sweep_starts_and_turns_beyond_its_positions() -> None:
     """Catches a first position that is not approached at all."""
-    plan, angles = plan_of(Hold()), Hold().angles
+    plan = plan_of(Hold())
+    angles = Hold().angles
     assert plan.q[0] == pytest.approx(angles[0] - Hold().overrun)
     assert plan.q.max() == pytest.approx(angles[-1] + Hold().overrun)
 
@@ -224,8 +276,11 @@ def test_sine_is_the_sine_of_its_parameters() -> None:
 
 
 def test_multisine_has_its_power_at_its_frequencies() -> None:
-    """Catches components outside the band; over whole periods the spectrum must be five equal lines."""
-    multisine = Multisine(amplitude=0.5, lowest_hz=0.2, highest_hz=1.0, components=5, duration_s=10.0)
+    """Catches components outside the band; over whole periods the spectrum must be five equal
+    lines."""
+    multisine = Multisine(
+        amplitude=0.5, lowest_hz=0.2, highest_hz=1.0, components=5, duration_s=10.0
+    )
     plan = plan_of(multisine, seed=4)
     x = plan.q[plan.scored]
     assert len(x) == 2500
@@ -237,7 +292,8 @@ def test_multisine_has_its_power_at_its_frequencies() -> None:
 
 
 def test_steps_rest_at_their_levels() -> None:
-    """Catches levels beyond the amplitude, moves of the wrong duration and a rest that is cut short."""
+    """Catches levels beyond the amplitude, moves of the wrong duration and a rest that is cut
+    short."""
     steps = Steps(amplitude=0.3, middle=0.2, move_s=0.4, rest_s=0.6, moves=4)
     plan = plan_of(steps, seed=2)
     t = np.arange(len(plan.q)) * PERIOD_S - STAND_S
@@ -265,14 +321,29 @@ def test_make_reference_takes_names_mappings_and_models() -> None:
         ("circle", r"unknown reference 'circle'; choose one of: hold, sine, multisine, steps"),
         ({}, r"unknown reference None; choose one of: hold"),
         ({"kind": ["sine"]}, r"unknown reference \['sine'\]; choose one of: hold"),
-        ({"kind": "hold", "lower": 0.5, "upper": 0.1}, r"upper must exceed lower, got lower 0\.5 and upper 0\.1"),
+        (
+            {"kind": "hold", "lower": 0.5, "upper": 0.1},
+            r"upper must exceed lower, got lower 0\.5 and upper 0\.1",
+        ),
         ({"kind": "hold", "lower": -1.0}, r"Hold\.lower must be .*> -1.* < 1, got -1"),
         ({"kind": "hold", "positions": 1}, r"Hold\.positions must be .*>= 2 and <= 1000, got 1"),
-        ({"kind": "multisine", "lowest_hz": 2.0}, r"highest_hz must exceed lowest_hz, got 2\.0 to 1\.0 Hz"),
-        ({"kind": "sine", "frequency_hz": float("nan")}, r"Sine\.frequency_hz must be .*> 0 \[Hz\], got nan"),
+        (
+            {"kind": "multisine", "lowest_hz": 2.0},
+            r"highest_hz must exceed lowest_hz, got 2\.0 to 1\.0 Hz",
+        ),
+        (
+            {"kind": "sine", "frequency_hz": float("nan")},
+            r"Sine\.frequency_hz must be .*> 0 \[Hz\], got nan",
+        ),
         ({"kind": "sine", "onset_s": 0.0}, r"Sine\.onset_s must be .*> 0 and <= 3600 \[s\], got 0"),
-        ({"kind": "steps", "move_s": -0.1}, r"Steps\.move_s must be .*> 0 and <= 3600 \[s\], got -0\.1"),
-        ({"kind": "steps", "move": 1}, r"unknown parameter of Steps 'move'; choose one of: .*move_s"),
+        (
+            {"kind": "steps", "move_s": -0.1},
+            r"Steps\.move_s must be .*> 0 and <= 3600 \[s\], got -0\.1",
+        ),
+        (
+            {"kind": "steps", "move": 1},
+            r"unknown parameter of Steps 'move'; choose one of: .*move_s",
+        ),
     ],
 )
 def test_a_wrong_reference_names_itself_and_what_exists(reference: Any, message: str) -> None:

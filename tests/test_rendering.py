@@ -25,7 +25,9 @@ CAPTION_ROWS = 60
 """Rows at the top, which hold clock and numbers."""
 
 
-def signals(reference: float = 0.3, link_error: float = 0.0, deflection: float = 0.0, time_s: float = 1.0) -> Signals:
+def signals(
+    reference: float = 0.3, link_error: float = 0.0, deflection: float = 0.0, time_s: float = 1.0
+) -> Signals:
     """What a picture is drawn from."""
     return {
         "time_s": np.array([time_s]),
@@ -61,7 +63,12 @@ def centre(image: Array, rgb: tuple[float, float, float]) -> Array:
 
 @pytest.mark.parametrize(
     ("angle", "reference", "factor", "drawn"),
-    [(0.31, 0.3, 8.0, 0.38), (0.29, 0.3, 8.0, 0.22), (0.3, 0.3, 8.0, 0.3), (-0.02, 0.0, 3.0, -0.06)],
+    [
+        (0.31, 0.3, 8.0, 0.38),
+        (0.29, 0.3, 8.0, 0.22),
+        (0.3, 0.3, 8.0, 0.3),
+        (-0.02, 0.0, 3.0, -0.06),
+    ],
 )
 def test_deviations_from_the_reference_are_enlarged(
     angle: float, reference: float, factor: float, drawn: float
@@ -79,7 +86,13 @@ def test_default_factor_is_the_one_that_the_caption_shows(picture: TestbedPictur
 
 def test_environment_returns_rgb_pictures_that_change_with_the_motion() -> None:
     """Catches another shape or type, an empty picture, and one that stands still."""
-    reference = {"kind": "sine", "amplitude": 0.2, "frequency_hz": 0.5, "duration_s": 0.5, "onset_s": 0.5}
+    reference = {
+        "kind": "sine",
+        "amplitude": 0.2,
+        "frequency_hz": 0.5,
+        "duration_s": 0.5,
+        "onset_s": 0.5,
+    }
     env = gymnasium.make(ID, render_mode="rgb_array", reference=reference)
     env.reset(seed=0)
     pictures: list[Any] = []
@@ -96,7 +109,9 @@ def test_environment_returns_rgb_pictures_that_change_with_the_motion() -> None:
     assert np.any(pictures[-1][CAPTION_ROWS:] != pictures[0][CAPTION_ROWS:])
 
 
-@pytest.mark.parametrize(("environment", "arguments"), [(ID, {"reference": "sine"}), (WALKER_ID, {})])
+@pytest.mark.parametrize(
+    ("environment", "arguments"), [(ID, {"reference": "sine"}), (WALKER_ID, {})]
+)
 def test_rendering_does_not_change_the_rollout(environment: str, arguments: dict[str, Any]) -> None:
     """Catches a picture that steps or moves the physics."""
     results = []
@@ -147,45 +162,55 @@ def test_unknown_render_mode_lists_the_choices() -> None:
 
 
 def test_deflection_moves_the_rotor_and_not_the_link(picture: TestbedPicture) -> None:
-    """Catches a deflection that one cannot see, or a rotor drawn behind the link instead of ahead of it."""
-    rest, bent = scene(picture), scene(picture, deflection=0.03)
+    """Catches a deflection that one cannot see, or a rotor drawn behind the link instead of
+    ahead of it."""
+    rest = scene(picture)
+    bent = scene(picture, deflection=0.03)
     assert np.any(rest != bent)
-    blue, orange = (38.0, 102.0, 217.0), (217.0, 115.0, 38.0)
+    blue = (38.0, 102.0, 217.0)
+    orange = (217.0, 115.0, 38.0)
     moved = centre(bent, blue) - centre(rest, blue)
     assert moved[1] > 3.0  # a motor that leads stands further towards +x, to the right
     np.testing.assert_allclose(centre(bent, orange), centre(rest, orange), atol=0.5)
 
 
 def test_link_error_moves_the_link_away_from_its_reference(picture: TestbedPicture) -> None:
-    """Catches a link that lags drawn ahead: q = q_ref − error hangs further to the left, eight times as far."""
+    """Catches a link that lags drawn ahead: q = q_ref − error hangs further to the left, eight
+    times as far."""
     orange = (217.0, 115.0, 38.0)
-    rest, late = scene(picture), scene(picture, link_error=0.02)
+    rest = scene(picture)
+    late = scene(picture, link_error=0.02)
     assert centre(late, orange)[1] < centre(rest, orange)[1] - 20.0
 
 
 def test_positive_angles_are_on_the_right(picture: TestbedPicture) -> None:
     """Catches a mirrored camera: q grows towards +x, which the front view shows on the right."""
     orange = (217.0, 115.0, 38.0)
-    left, right = scene(picture, reference=-0.5), scene(picture, reference=0.5)
+    left = scene(picture, reference=-0.5)
+    right = scene(picture, reference=0.5)
     assert centre(left, orange)[1] < 320.0 < centre(right, orange)[1]
 
 
 def test_caption_shows_time_deflection_and_link_error(picture: TestbedPicture) -> None:
-    """Catches numbers that are not those of this step: each of them changes the caption and nothing else does."""
+    """Catches numbers that are not those of this step: each of them changes the caption and
+    nothing else does."""
 
     def caption(**values: float) -> Array:
         return picture.rgb(signals(**values))[:CAPTION_ROWS]
 
-    same, again = caption(), caption()
+    same = caption()
+    again = caption()
     np.testing.assert_array_equal(same, again)
     for change in ({"time_s": 2.0}, {"deflection": 0.001}, {"link_error": 0.001}):
         assert np.any(caption(**change) != same)
 
 
 def test_drawing_model_hangs_like_the_testbed(picture: TestbedPicture) -> None:
-    """Catches a picture whose pendulum has another length or turns the other way than the simulated one."""
+    """Catches a picture whose pendulum has another length or turns the other way than the
+    simulated one."""
     picture.rgb(signals(reference=0.6))
-    model, data = picture._model, picture._data
+    model = picture._model
+    data = picture._data
     bob = data.geom("link_bob").xpos
     reach = Pendulum().com_distance
     np.testing.assert_allclose(bob[[0, 2]], [reach * np.sin(0.6), -reach * np.cos(0.6)], atol=1e-9)
@@ -218,32 +243,49 @@ class Walker:
         )
         self.picture = WalkerPicture(task)
 
-    def posture(self, roll: float = 0.0, pitch: float = 0.0, shift: float = 0.0, feet: float = 0.0) -> Posture:
-        """The planned posture with a tilt [rad] and a shift to the left [m] of the pelvis, and one of the feet [m]."""
+    def posture(
+        self, roll: float = 0.0, pitch: float = 0.0, shift: float = 0.0, feet: float = 0.0
+    ) -> Posture:
+        """The planned posture with a tilt [rad] and a shift to the left [m] of the pelvis, and
+        one of the feet [m]."""
         left = np.array([0.0, 1.0, 0.0])
         tilt = rotation_x(np.array(roll)) @ rotation_y(np.array(pitch))
         planned = self.planned
-        return Posture(planned.pelvis + shift * left, tilt, planned.ankles + feet * left, planned.feet_R)
+        return Posture(
+            planned.pelvis + shift * left, tilt, planned.ankles + feet * left, planned.feet_R
+        )
 
     def stand(self, fell: bool = False, **deviations: float) -> Posture:
         """Let the robot have a posture."""
         true = self.posture(**deviations)
         self.fell = fell
         self.truth = SimpleNamespace(
-            pelvis=true.pelvis[None], pelvis_R=true.R[None], ankles=true.ankles[None],
-            q=true.joint_angles(self.robot)[None], model=self.walk.truth().model,
-        )  # fmt: skip
+            pelvis=true.pelvis[None],
+            pelvis_R=true.R[None],
+            ankles=true.ankles[None],
+            q=true.joint_angles(self.robot)[None],
+            model=self.walk.truth().model,
+        )
         return true
 
-    def signals(self, zmp: tuple[float, float] = (0.3, 0.0), reference: tuple[float, float] = (0.0, 0.105)) -> Signals:
+    def signals(
+        self, zmp: tuple[float, float] = (0.3, 0.0), reference: tuple[float, float] = (0.0, 0.105)
+    ) -> Signals:
         """Signals of the task that go with it, so far as they are drawn."""
         deviation = float(np.hypot(zmp[0] - reference[0], zmp[1] - reference[1]))
         timing = self.walk.plan.timing
         values = {
-            "time_s": timing.time[ROW], "single_support": timing.single[ROW], "support": timing.support[ROW],
-            "pelvis_roll": 0.01, "pelvis_pitch": -0.02, "zmp_deviation": deviation, "zmp_x": zmp[0], "zmp_y": zmp[1],
-            "zmp_reference_x": reference[0], "zmp_reference_y": reference[1],
-        }  # fmt: skip
+            "time_s": timing.time[ROW],
+            "single_support": timing.single[ROW],
+            "support": timing.support[ROW],
+            "pelvis_roll": 0.01,
+            "pelvis_pitch": -0.02,
+            "zmp_deviation": deviation,
+            "zmp_x": zmp[0],
+            "zmp_y": zmp[1],
+            "zmp_reference_x": reference[0],
+            "zmp_reference_y": reference[1],
+        }
         return {name: np.array([value]) for name, value in values.items()}
 
     def scene(self, **points: tuple[float, float]) -> Array:
@@ -258,10 +300,13 @@ class Walker:
 
     def pixel(self, point: tuple[float, float, float]) -> Array:
         """Row and column at which a point is seen."""
-        model, data = self.picture._model, self.picture._data
-        eye, R = data.cam("front").xpos, data.cam("front").xmat.reshape(3, 3)
+        model = self.picture._model
+        data = self.picture._data
+        eye = data.cam("front").xpos
+        R = data.cam("front").xmat.reshape(3, 3)
         right, up, back = (np.array(point) - eye) @ R
-        height, width = model.vis.global_.offheight, model.vis.global_.offwidth
+        height = model.vis.global_.offheight
+        width = model.vis.global_.offwidth
         focus = 0.5 * height / np.tan(0.5 * np.radians(model.cam_fovy[0]))
         return np.array([0.5 * height + focus * up / back, 0.5 * width - focus * right / back])
 
@@ -281,12 +326,16 @@ def magenta(image: Array) -> Array:
 
 
 def test_tilt_and_shift_of_the_pelvis_are_enlarged_and_the_feet_stay(walker: Walker) -> None:
-    """Catches a deviation drawn as it is, a pelvis enlarged about the wrong point, and feet that leave the floor."""
-    true, planned = walker.posture(roll=0.02, shift=0.01), walker.planned
+    """Catches a deviation drawn as it is, a pelvis enlarged about the wrong point, and feet that
+    leave the floor."""
+    true = walker.posture(roll=0.02, shift=0.01)
+    planned = walker.planned
     drawn, factor = enlarged(true, planned, 0.0, walker.robot, largest=4.0)
     assert factor == 4.0
     np.testing.assert_allclose(drawn.R, rotation_x(np.array(0.08)), atol=1e-12)
-    np.testing.assert_allclose(drawn.pelvis, planned.pelvis + np.array([0.0, 0.04, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(
+        drawn.pelvis, planned.pelvis + np.array([0.0, 0.04, 0.0]), atol=1e-12
+    )
     np.testing.assert_array_equal(drawn.ankles, true.ankles)
 
 
@@ -299,7 +348,8 @@ def test_robot_that_stands_elsewhere_is_not_tilted(walker: Walker) -> None:
 
 
 def test_factor_is_as_large_as_the_legs_allow(walker: Walker) -> None:
-    """Catches a fall drawn with legs that are too short: the factor ends at one, which is the truth."""
+    """Catches a fall drawn with legs that are too short: the factor ends at one, which is the
+    truth."""
     tilts = np.linspace(0.0, 0.4, 9)
     postures = [walker.posture(roll=-tilt, shift=0.6 * tilt) for tilt in tilts]
     factors = [enlarged(true, walker.planned, 0.0, walker.robot)[1] for true in postures]
@@ -308,16 +358,23 @@ def test_factor_is_as_large_as_the_legs_allow(walker: Walker) -> None:
     assert factors[-1] < 2.0
 
 
-@pytest.mark.parametrize("deviations", [{}, {"roll": 0.03, "pitch": -0.02, "shift": 0.01, "feet": 0.005}])
-def test_drawn_feet_are_where_the_true_ones_are(walker: Walker, deviations: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "deviations", [{}, {"roll": 0.03, "pitch": -0.02, "shift": 0.01, "feet": 0.005}]
+)
+def test_drawn_feet_are_where_the_true_ones_are(
+    walker: Walker, deviations: dict[str, float]
+) -> None:
     """Catches joint angles that do not belong to the posture, by MuJoCo's own kinematics."""
     true = walker.stand(**deviations)
     walker.picture._update(walker.signals(), 0)
     data = walker.picture._data
     for side, ankle in zip("lr", true.ankles, strict=True):
         np.testing.assert_allclose(data.body(f"{side}_foot").xpos, ankle, atol=1e-9)
-        np.testing.assert_allclose(data.body(f"{side}_foot").xmat.reshape(3, 3), np.eye(3), atol=1e-9)
-    roll, pitch = deviations.get("roll", 0.0), deviations.get("pitch", 0.0)
+        np.testing.assert_allclose(
+            data.body(f"{side}_foot").xmat.reshape(3, 3), np.eye(3), atol=1e-9
+        )
+    roll = deviations.get("roll", 0.0)
+    pitch = deviations.get("pitch", 0.0)
     drawn = data.body("upper_body").xmat.reshape(3, 3)
     assert drawn[2, 1] == pytest.approx(LARGEST_FACTOR * roll, rel=0.02)
     assert -drawn[2, 0] == pytest.approx(LARGEST_FACTOR * pitch, rel=0.02)
@@ -328,13 +385,17 @@ def test_translucent_robot_is_the_plan(walker: Walker) -> None:
     walker.stand(roll=0.05)
     walker.picture._update(walker.signals(), 0)
     rigid = walker.robot.rigid
-    data, plan = mujoco.MjData(rigid), walker.walk.plan
-    data.qpos[:3], data.qpos[3:7] = plan.pelvis[ROW], [1.0, 0.0, 0.0, 0.0]
+    data = mujoco.MjData(rigid)
+    plan = walker.walk.plan
+    data.qpos[:3] = plan.pelvis[ROW]
+    data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
     for joint, angle in zip(walker.robot.joint_names, plan.q[ROW], strict=True):
         data.joint(joint).qpos = angle
     mujoco.mj_kinematics(rigid, data)
     for body in ("upper_body", "l_foot", "r_shank", "r_foot"):
-        np.testing.assert_allclose(walker.picture._data.body(f"plan_{body}").xpos, data.body(body).xpos, atol=1e-9)
+        np.testing.assert_allclose(
+            walker.picture._data.body(f"plan_{body}").xpos, data.body(body).xpos, atol=1e-9
+        )
 
 
 def edges(image: Array) -> Array:
@@ -356,7 +417,8 @@ def test_walker_that_leans_to_its_right_is_seen_to_lean_to_the_left(walker: Walk
 
 
 def test_marker_of_the_zmp_is_where_the_zmp_is(walker: Walker) -> None:
-    """Catches a marker of something else, swapped axes, and one that is enlarged like the pelvis."""
+    """Catches a marker of something else, swapped axes, and one that is enlarged like the
+    pelvis."""
     walker.stand(roll=0.02)
     for zmp in ((0.3, 0.0), (0.2, 0.3)):
         seen = magenta(walker.scene(zmp=zmp))
@@ -385,11 +447,23 @@ def test_without_ground_contact_there_is_no_zmp(walker: Walker) -> None:
 
 
 def test_caption_of_the_walker_says_what_is_drawn(walker: Walker) -> None:
-    """Catches another phase, number or factor than that of the picture, and a fall that nobody mentions."""
+    """Catches another phase, number or factor than that of the picture, and a fall that nobody
+    mentions."""
     walker.stand()
     first, second, third = walker.caption(zmp=(0.0, 0.095))
     assert first.split() == ["t", "=", "2.40", "s", "left", "support"]
-    assert second.split() == ["roll", "+10.0", "mrad", "pitch", "-20.0", "mrad", "ZMP", "deviation", "10.0", "mm"]
+    assert second.split() == [
+        "roll",
+        "+10.0",
+        "mrad",
+        "pitch",
+        "-20.0",
+        "mrad",
+        "ZMP",
+        "deviation",
+        "10.0",
+        "mm",
+    ]
     assert f"x {LARGEST_FACTOR:g} " in third
     true = walker.stand(fell=True, roll=-0.1, shift=0.05)
     first, _, third = walker.caption()

@@ -8,7 +8,18 @@ import pytest
 
 from tests.test_leaderboard import GROUPS, played
 from train.evaluate.changes import changes
-from train.figures.colours import COLOURS, FRAME, GRID, INK, LINE, NIGHT, REFERENCE, SHADE, STRONG, VERDICTS
+from train.figures.colours import (
+    COLOURS,
+    FRAME,
+    GRID,
+    INK,
+    LINE,
+    NIGHT,
+    REFERENCE,
+    SHADE,
+    STRONG,
+    VERDICTS,
+)
 from train.report import Results, write_report
 from train.runs.folders import run_folder
 
@@ -30,22 +41,31 @@ def contrast(one: str, other: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-@pytest.mark.parametrize("colour", sorted({*COLOURS.values(), *STRONG, *VERDICTS.values(), INK, REFERENCE}))
+@pytest.mark.parametrize(
+    "colour", sorted({*COLOURS.values(), *STRONG, *VERDICTS.values(), INK, REFERENCE})
+)
 def test_every_colour_is_seen_on_dark_paper(colour: str) -> None:
     """Catches words and curves that are dark on dark; WCAG asks for 3 to 1 of parts of a chart."""
     assert contrast(NIGHT.get(colour, colour), PAPER) >= 3.0
 
 
-def test_words_and_lines_of_a_chart_have_a_colour_of_the_night(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_and_lines_of_a_chart_have_a_colour_of_the_night(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a colour that is new to the charts and stays dark in the dark."""
     monkeypatch.chdir(tmp_path)
-    found, colours = played(), dict(NIGHT)
+    found = played()
+    colours = dict(NIGHT)
     with run_folder("x", {}, 0) as folder:
         write_report(Results("x", found, changes(found, GROUPS), folder))
     page = (folder / "report.html").read_text(encoding="utf-8")
-    specs = re.findall(r'<script type="application/json" id="c\d+-spec">(.*?)</script>', page, flags=re.DOTALL)
+    specs = re.findall(
+        r'<script type="application/json" id="c\d+-spec">(.*?)</script>', page, flags=re.DOTALL
+    )
     assert len(specs) >= 3
-    seen: set[str] = set(re.findall(r"#[0-9a-f]{6}", "".join(json.dumps(json.loads(spec)) for spec in specs)))
+    seen: set[str] = set(
+        re.findall(r"#[0-9a-f]{6}", "".join(json.dumps(json.loads(spec)) for spec in specs))
+    )
     assert {INK, GRID} <= seen
     assert {c for c in seen - SOFT if contrast(colours.get(c, c), PAPER) < 3.0} == set()
     assert all(1.05 < contrast(NIGHT[colour], PAPER) < 3.0 for colour in SOFT)

@@ -1,4 +1,5 @@
-"""Residuals: zero against the base to the last bit, scalar against vector, SB3 against NumPy, the checkers of both."""
+"""Residuals: zero against the base to the last bit, scalar against vector, SB3 against NumPy,
+the checkers of both."""
 
 import json
 import math
@@ -45,7 +46,8 @@ from train.learn.export import network_of
 from train.learn.sb3_env import SB3VecEnv
 
 ROOT = Path(__file__).parents[1]
-WALKER, TESTBED = "elastic_env/WalkInPlace-v0", "elastic_env/Testbed-v0"
+WALKER = "elastic_env/WalkInPlace-v0"
+TESTBED = "elastic_env/Testbed-v0"
 QUICK = {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
 SINE = {"reference": {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}}
 BASES = [
@@ -67,7 +69,9 @@ def scalar(robot: str, **options: Any) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(name, **{**short, **options})
 
 
-def vector(robot: str, n: int, mode: AutoresetMode = AutoresetMode.SAME_STEP, **options: Any) -> Any:
+def vector(
+    robot: str, n: int, mode: AutoresetMode = AutoresetMode.SAME_STEP, **options: Any
+) -> Any:
     """Short episodes of many worlds."""
     name, short = (WALKER, QUICK) if robot == "walker" else (TESTBED, SINE)
     kind = {"vectorization_mode": "vector_entry_point", "num_envs": n, "autoreset_mode": mode}
@@ -77,7 +81,8 @@ def vector(robot: str, n: int, mode: AutoresetMode = AutoresetMode.SAME_STEP, **
 def played(env: gymnasium.Env[Any, Any], policy: Any, steps: int) -> list[Array]:
     """Observations of a policy's control steps."""
     observation, _ = env.reset(seed=3)
-    seen, state = [observation], None
+    seen = [observation]
+    state = None
     for _ in range(steps):
         action, state = policy.predict(observation, state)
         observation, _, terminated, truncated, _ = env.step(action)
@@ -91,7 +96,9 @@ class Deciding:
     """A residual policy whose residuals are given, by corrected joint and decision."""
 
     def __init__(self, corrected: Corrected, residuals: Array) -> None:
-        self.corrected, self.residuals, self.steps = corrected, residuals, 0
+        self.corrected = corrected
+        self.residuals = residuals
+        self.steps = 0
 
     def predict(self, observation: Array, state: Any = None) -> tuple[Any, Any]:
         """The correction of the present decision."""
@@ -103,12 +110,15 @@ class Deciding:
 
 def around(env: Any, base: str, **settings: Any) -> Corrected:
     """A base under a residual."""
-    return Corrected(baselines.make(base, env), env.unwrapped.assumed_model, ResidualSettings(**settings))
+    return Corrected(
+        baselines.make(base, env), env.unwrapped.assumed_model, ResidualSettings(**settings)
+    )
 
 
 @pytest.mark.parametrize(("robot", "base", "space"), BASES)
 def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, space: Any) -> None:
-    """Catches a correction that rounds, a filter that starts elsewhere, and a base that sees it normalised."""
+    """Catches a correction that rounds, a filter that starts elsewhere, and a base that sees it
+    normalised."""
     env = scalar(robot)
     expected = played(env, baselines.make(base, env), 250)
     corrected = around(env, base, space=space)
@@ -128,42 +138,60 @@ def nothing(corrected: Corrected) -> Network:
 
 def random_network(corrected: Corrected, size: float, seed: int = 0) -> Network:
     """A network of random weights."""
-    features, generator = Features(corrected).width, np.random.default_rng(seed)
+    features = Features(corrected).width
+    generator = np.random.default_rng(seed)
     widths = [features, 8, corrected.num_residuals]
-    tensors = {"mean": generator.normal(size=features), "std": generator.uniform(0.5, 2.0, features)}
+    tensors = {
+        "mean": generator.normal(size=features),
+        "std": generator.uniform(0.5, 2.0, features),
+    }
     for i in range(2):
         tensors |= {
             f"weight{i}": size * generator.normal(size=(widths[i + 1], widths[i])),
             f"bias{i}": np.zeros(widths[i + 1]),
         }
-    return Network(ResidualDescription(robot="walker", base="", settings=corrected.settings), tensors)
+    return Network(
+        ResidualDescription(robot="walker", base="", settings=corrected.settings), tensors
+    )
 
 
 def test_model_space_compensates_another_deflection() -> None:
-    """Catches a correction of the command alone: after the low-pass, r means K / (1 + r) in Eq. 9 and in Eq. 12."""
-    env, r = scalar("walker"), 0.25
+    """Catches a correction of the command alone: after the low-pass, r means K / (1 + r) in Eq.
+    9 and in Eq. 12."""
+    env = scalar("walker")
+    r = 0.25
     corrected = around(env, "input_output", space="model", scale=1.0, cutoff_hz=1e6)
     softer = baselines.make("input_output", env, stiffness_scale=1.0 / (1.0 + r))
     observation, _ = env.reset(seed=1)
     wanted, state = corrected.act(observation, np.full((1, 12), r))
     action, softer_state = softer.predict(observation)
-    ramp = 3.0 * np.abs(action).max() + 1e-6  # the first step of the ramp: the controller's own K differs
+    ramp = (
+        3.0 * np.abs(action).max() + 1e-6
+    )  # the first step of the ramp: the controller's own K differs
     np.testing.assert_allclose(wanted, action, rtol=0.0, atol=ramp)
     plain = baselines.make("input_output", env)
     _, plain_state = plain.predict(observation)
-    theta, q = observation[:12], plain.link_estimate(observation, plain_state)  # type: ignore[attr-defined]
-    np.testing.assert_allclose(corrected.link_estimate(observation, state), theta - (1.0 + r) * (theta - q), atol=1e-15)
+    # type: ignore[attr-defined]
+    theta = observation[:12]
+    q = plain.link_estimate(observation, plain_state)
+    np.testing.assert_allclose(
+        corrected.link_estimate(observation, state), theta - (1.0 + r) * (theta - q), atol=1e-15
+    )
     exact = softer.link_estimate(observation, softer_state)  # type: ignore[attr-defined]
-    np.testing.assert_allclose(corrected.link_estimate(observation, state), exact, rtol=0.0, atol=2e-3)
+    np.testing.assert_allclose(
+        corrected.link_estimate(observation, state), exact, rtol=0.0, atol=2e-3
+    )
     assert np.abs(theta - q).max() > 0.01
 
 
 def test_the_correction_passes_a_first_order_low_pass() -> None:
-    """Catches a cut-off in rad/s, a filter that runs once per decision, and a scale of the wrong joint."""
+    """Catches a cut-off in rad/s, a filter that runs once per decision, and a scale of the wrong
+    joint."""
     env = scalar("testbed")
     corrected = around(env, "zero", space="joint", scale=0.05, cutoff_hz=3.0)
     observation, _ = env.reset(seed=0)
-    state, found = None, []
+    state = None
+    found = []
     for _ in range(100):
         action, state = corrected.act(observation, np.ones((1, 1)), state)
         found.append(action[0] if action.ndim == 1 else action[0, 0])
@@ -172,24 +200,38 @@ def test_the_correction_passes_a_first_order_low_pass() -> None:
 
 
 def test_joints_and_bounds_are_chosen_by_name() -> None:
-    """Catches an order of joints that is not the robot's, and a bound that goes to another joint or axis."""
+    """Catches an order of joints that is not the robot's, and a bound that goes to another joint
+    or axis."""
     model = scalar("walker").unwrapped.assumed_model  # type: ignore[attr-defined]
     bounds = {"ankle_roll": 0.01, "knee": 0.03}
 
     def acting(**settings: Any) -> dict[str, float]:
         channels = Channels(model, ResidualSettings(**settings))
-        all_of_it = channels.approach(np.zeros((1, len(channels.bounds))), np.ones((1, len(channels.signals))), 1.0)
+        all_of_it = channels.approach(
+            np.zeros((1, len(channels.bounds))), np.ones((1, len(channels.signals))), 1.0
+        )
         assert all_of_it.tolist() == [channels.bounds.tolist()]
-        columns = [signal.name for name in settings["acts_on"] for signal in input_signals(name, model)]
-        return {name: bound for name, bound in zip(columns, channels.bounds.tolist(), strict=True) if bound}
+        columns = [
+            signal.name for name in settings["acts_on"] for signal in input_signals(name, model)
+        ]
+        return {
+            name: bound
+            for name, bound in zip(columns, channels.bounds.tolist(), strict=True)
+            if bound
+        }
 
     joints = ("ankle_roll", "l_knee")
     assert acting(acts_on={"command": bounds}, joints=joints) == {
-        "command.l_knee": 0.03, "command.l_ankle_roll": 0.01, "command.r_ankle_roll": 0.01,
-    }  # fmt: skip
+        "command.l_knee": 0.03,
+        "command.l_ankle_roll": 0.01,
+        "command.r_ankle_roll": 0.01,
+    }
     assert acting(acts_on={"deflection": {"r_knee": 0.5}, "zmp": {"y": 0.01}, "hip": None}) == {
-        "deflection.r_knee": 0.5, "zmp.y": 0.01, "hip.roll": 0.02, "hip.pitch": 0.02,
-    }  # fmt: skip
+        "deflection.r_knee": 0.5,
+        "zmp.y": 0.01,
+        "hip.roll": 0.02,
+        "hip.pitch": 0.02,
+    }
     with pytest.raises(ConfigurationError, match=r"'elbow'.*l_hip_yaw"):
         acting(acts_on={"deflection": None}, joints=("elbow",))
     with pytest.raises(ConfigurationError, match=r"every joint of `joints`.*l_ankle_roll"):
@@ -207,10 +249,14 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
         (*BASES[6], AutoresetMode.NEXT_STEP),
     ],
 )
-def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: Any, mode: AutoresetMode) -> None:
-    """Catches rewards that go on after an end, worlds that begin inside a decision, and memories that are mixed up."""
+def test_a_vector_of_worlds_is_the_scalar_wrapper(
+    robot: str, base: str, space: Any, mode: AutoresetMode
+) -> None:
+    """Catches rewards that go on after an end, worlds that begin inside a decision, and memories
+    that are mixed up."""
     further = {"history": 2, "observe": ["observation", "base_action"], "decision_period": 20}
-    n, generator = 3, np.random.default_rng(0)
+    n = 3
+    generator = np.random.default_rng(0)
     many = ResidualVectorWrapper(vector(robot, n, mode), base, space=space, **further)
     ones = [ResidualWrapper(scalar(robot), base, space=space, **further) for _ in range(n)]
     observation, _ = many.reset(seed=5)
@@ -247,14 +293,16 @@ def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: 
 
 
 def test_restarts_in_a_row_lose_nothing() -> None:
-    """Catches a second restart that forgets the first, and one that moves the history of worlds that go on."""
+    """Catches a second restart that forgets the first, and one that moves the history of worlds
+    that go on."""
 
     def made() -> ResidualVectorWrapper:
         env = ResidualVectorWrapper(vector("testbed", 3), "input", history=2)
         env.reset(seed=3)
         return env
 
-    env, generator = made(), np.random.default_rng(4)
+    env = made()
+    generator = np.random.default_rng(4)
     for _ in range(12):
         before, *_ = env.step(generator.uniform(-1.0, 1.0, (3, 1)))
     for world in (0, 1):
@@ -262,21 +310,26 @@ def test_restarts_in_a_row_lose_nothing() -> None:
         seeds[world] = 3 + world  # type: ignore[call-overload]
         after, _ = env.reset(seed=seeds, options={"reset_mask": np.arange(3) == world})
     np.testing.assert_array_equal(after[2], before[2])
-    anew, residual = made(), np.zeros((3, 1))
-    later, fresh = env.step(residual)[0], anew.step(residual)[0]
+    anew = made()
+    residual = np.zeros((3, 1))
+    later = env.step(residual)[0]
+    fresh = anew.step(residual)[0]
     np.testing.assert_array_equal(later[:2], fresh[:2])
-    # six columns of the observation, then encoder and its rate at the last decision and at the one before
+    # six columns of the observation, then encoder and its rate at the last decision and at the one
+    # before
     np.testing.assert_array_equal(later[2, 6:], [*before[2, :2], *before[2, 6:8]])
     for _ in range(12):
         residual = generator.uniform(-1.0, 1.0, (3, 1))
-        one, other = env.step(residual)[0], anew.step(residual)[0]
+        one = env.step(residual)[0]
+        other = anew.step(residual)[0]
         np.testing.assert_array_equal(one[:2], other[:2])
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("robot", ["walker", "testbed"])
 def test_checkers_of_gymnasium_and_sb3_pass(robot: str) -> None:
-    """Catches an observation outside its space, a reset that does not seed, and an info that is no dictionary."""
+    """Catches an observation outside its space, a reset that does not seed, and an info that is
+    no dictionary."""
     base = "input_output" if robot == "walker" else "input"
     check_env(ResidualWrapper(scalar(robot), base, history=1), skip_render_check=True)
     check_env_of_sb3(ResidualWrapper(scalar(robot), base))
@@ -294,14 +347,17 @@ def test_residuals_that_are_no_residuals_are_refused() -> None:
 
 
 def test_sb3_gets_ends_as_it_reads_them() -> None:
-    """Catches a time limit that looks like a fall, a terminal observation of the next episode, and wrong returns."""
+    """Catches a time limit that looks like a fall, a terminal observation of the next episode,
+    and wrong returns."""
     venv = SB3VecEnv(ResidualVectorWrapper(vector("testbed", 2), "input"))
     venv.seed(3)
     venv.reset()
-    total, length = np.zeros(2), 0
+    total = np.zeros(2)
+    length = 0
     while True:
         observation, reward, done, infos = venv.step(np.zeros((2, 1)))
-        total, length = total + reward, length + 1
+        total = total + reward
+        length = length + 1
         if done.any():
             break
         assert infos == [{}, {}]
@@ -319,17 +375,23 @@ def trained(algorithm: Any, **options: Any) -> tuple[Any, VecNormalize, Residual
     torch.set_num_threads(1)
     env = ResidualVectorWrapper(vector("testbed", 4), "input", history=1)
     venv = VecNormalize(SB3VecEnv(env))
-    model = algorithm("MlpPolicy", venv, device="cpu", seed=0, policy_kwargs={"net_arch": [16, 16]}, **options)
+    model = algorithm(
+        "MlpPolicy", venv, device="cpu", seed=0, policy_kwargs={"net_arch": [16, 16]}, **options
+    )
     model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
     model.learn(64)
     return model, venv, env
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "options"), [(PPO, {"n_steps": 8, "batch_size": 16}), (SAC, {"learning_starts": 8})]
+    ("algorithm", "options"),
+    [(PPO, {"n_steps": 8, "batch_size": 16}), (SAC, {"learning_starts": 8})],
 )
-def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str, Any], tmp_path: Path) -> None:
-    """Catches a layer, an activation, a normalisation or a squashing that is not the one that was trained."""
+def test_the_numpy_forward_pass_is_that_of_sb3(
+    algorithm: Any, options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Catches a layer, an activation, a normalisation or a squashing that is not the one that
+    was trained."""
     model, venv, env = trained(algorithm, **options)
     tensors, activation, output = network_of(model, venv)
     description = ResidualDescription(
@@ -339,7 +401,8 @@ def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str
     read, network = load_residual(tmp_path / "r")
     assert read.replace(weights_sha256=None) == description
     features = (
-        np.random.default_rng(1).normal(size=(100, network.num_features)) * tensors["std"] * 3.0 + tensors["mean"]
+        np.random.default_rng(1).normal(size=(100, network.num_features)) * tensors["std"] * 3.0
+        + tensors["mean"]
     )
     expected, _ = model.predict(venv.normalize_obs(features), deterministic=True)
     np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
@@ -350,7 +413,8 @@ def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str
 def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches code that is run unasked, and an export that loses the normalisation or the settings."""
+    """Catches code that is run unasked, and an export that loses the normalisation or the
+    settings."""
     monkeypatch.chdir(tmp_path)
     model, venv, env = trained(PPO, n_steps=8, batch_size=16)
     model.save("mine.zip")
@@ -359,7 +423,9 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     Path("c.yaml").write_text(json.dumps(given))
     arguments = ["export", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
     loaded = []
-    monkeypatch.setattr("train.learn.export.algorithm_class", lambda name: loaded.append(name) or PPO)
+    monkeypatch.setattr(
+        "train.learn.export.algorithm_class", lambda name: loaded.append(name) or PPO
+    )
     with pytest.raises(SystemExit):
         main(arguments)
     assert "--trust-pickle" in capsys.readouterr().err
@@ -371,11 +437,14 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     features = np.random.default_rng(1).normal(size=(20, network.num_features))
     expected, _ = model.predict(venv.normalize_obs(features), deterministic=True)
     np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
-    Path("c.yaml").write_text(json.dumps({**given, "settings": {**given["settings"], "history": 3}}))
+    Path("c.yaml").write_text(
+        json.dumps({**given, "settings": {**given["settings"], "history": 3}})
+    )
     with pytest.raises(SystemExit):
         main([*arguments, "--trust-pickle", "--output", "runs/other"])
     assert re.search(
-        r"takes \d+ features and gives 1 residuals, a residual on input of the testbed", capsys.readouterr().err
+        r"takes \d+ features and gives 1 residuals, a residual on input of the testbed",
+        capsys.readouterr().err,
     )
     Path("no.zip").write_bytes(b"nothing")
     with pytest.raises(SystemExit):
@@ -385,9 +454,12 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
 
 def test_the_error_of_links_with_encoders_is_that_of_the_simulation() -> None:
     """Catches a sign, and an encoder of the motor in the place of the link's."""
-    env: Any = gymnasium.make("elastic_env/Robot-v0", scenario="ideal+soft", sensors=["link_encoder"])
+    env: Any = gymnasium.make(
+        "elastic_env/Robot-v0", scenario="ideal+soft", sensors=["link_encoder"]
+    )
     corrected = around(env, "input", observe=("link_error",), decision_period=1)
-    features, none = Features(corrected), np.zeros(env.action_space.shape, dtype=np.float32)
+    features = Features(corrected)
+    none = np.zeros(env.action_space.shape, dtype=np.float32)
     observation, info = env.reset(seed=0)
     for _ in range(100):
         observation, _, _, _, info = env.step(none)
@@ -401,43 +473,66 @@ def test_the_error_of_links_with_encoders_is_that_of_the_simulation() -> None:
 
 
 def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
-    """Catches a sign, a frame, the weight of the feet left out, and the wrong foot: held against the true ZMP."""
+    """Catches a sign, a frame, the weight of the feet left out, and the wrong foot: held against
+    the true ZMP."""
     env: Any = vector("walker", 2, scenario="ideal")
     seen_by = ("observation", "encoder_error", "contact_error")
     corrected = around(env, "input_output", observe=seen_by, decision_period=1)
-    base, state = baselines.make("input_output", env), None
-    table, features = env.unwrapped.assumed_model.observation_table, Features(corrected)
+    base = baselines.make("input_output", env)
+    state = None
+    table = env.unwrapped.assumed_model.observation_table
+    features = Features(corrected)
     observation, info = env.reset(seed=0)
-    seen, true, share, memory, fresh = [], [], [], None, np.ones(2, dtype=np.bool_)
+    seen = []
+    true = []
+    share = []
+    memory = None
+    fresh = np.ones(2, dtype=np.bool_)
     for step in range(450):
         values, memory = features.at(observation, memory, fresh, None, None)
-        errors, fresh = values[:, len(table) :], np.zeros(2, dtype=np.bool_)
+        errors = values[:, len(table) :]
+        fresh = np.zeros(2, dtype=np.bool_)
         np.testing.assert_array_equal(
             errors[:, :12],
-            observation[:, table.group("encoder_angle")] - observation[:, table.group("reference_angle")],
+            observation[:, table.group("encoder_angle")]
+            - observation[:, table.group("reference_angle")],
         )
         if step > 0:
             seen.append(errors[:, 12:14])
             share.append(errors[:, 14])
-            true.append(np.stack([info[f"zmp_{axis}"] - info[f"zmp_reference_{axis}"] for axis in "xy"], axis=1))
+            true.append(
+                np.stack(
+                    [info[f"zmp_{axis}"] - info[f"zmp_reference_{axis}"] for axis in "xy"], axis=1
+                )
+            )
         action, state = base.predict(observation, state, np.full(2, step == 0))
         observation, _, _, _, info = env.step(action)
     assert np.sqrt(np.mean(np.square(share))) < 0.1  # half of the weight and more on the wrong foot
     difference = np.array(seen) - np.array(true)
     assert np.sqrt(np.mean(np.square(true))) > 2e-3
     # the ground's tilt is known to 2 mrad, on which the center of mass stands 0.66 m high
-    np.testing.assert_allclose(np.sqrt(np.mean(np.square(difference), axis=(0, 1))), 0.0, atol=1.4e-3)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(np.square(difference), axis=(0, 1))), 0.0, atol=1.4e-3
+    )
 
 
 def test_residuals_see_what_they_are_told_to() -> None:
     """Catches another order, and a history of what is no measurement or of another group."""
     env: Any = vector("walker", 2)
-    table, generator = env.unwrapped.assumed_model.observation_table, np.random.default_rng(0)
+    table = env.unwrapped.assumed_model.observation_table
+    generator = np.random.default_rng(0)
     features = Features(
-        around(env, "input_output", observe=("imu_rate", "clock.swing", "load_share", "bending"), history=2)
+        around(
+            env,
+            "input_output",
+            observe=("imu_rate", "clock.swing", "load_share", "bending"),
+            history=2,
+        )
     )
     rates = np.arange(len(table))[table.group("imu_rate")]
-    rows, memory, seen = generator.normal(size=(5, 2, len(table))), None, np.zeros((2, 0))
+    rows = generator.normal(size=(5, 2, len(table)))
+    memory = None
+    seen = np.zeros((2, 0))
     for decision in range(5):
         fresh = np.array([decision in (0, 3), decision == 0])
         seen, memory = features.at(rows[decision], memory, fresh, None, None)
@@ -445,8 +540,12 @@ def test_residuals_see_what_they_are_told_to() -> None:
     np.testing.assert_array_equal(seen[:, :3], rows[4][:, rates])
     np.testing.assert_array_equal(seen[:, [3]], rows[4][:, table.group("clock.swing")])
     np.testing.assert_array_equal(seen[:, [4]], rows[4][:, table.group("load_share")])
-    np.testing.assert_array_equal(seen[1, -6:], np.concatenate([rows[3][1, rates], rows[2][1, rates]]))
-    np.testing.assert_array_equal(seen[0, -6:], np.concatenate([rows[3][0, rates], rows[3][0, rates]]))
+    np.testing.assert_array_equal(
+        seen[1, -6:], np.concatenate([rows[3][1, rates], rows[2][1, rates]])
+    )
+    np.testing.assert_array_equal(
+        seen[0, -6:], np.concatenate([rows[3][0, rates], rows[3][0, rates]])
+    )
 
 
 def test_the_base_action_is_enough_to_see() -> None:
@@ -467,7 +566,9 @@ def test_the_base_action_is_enough_to_see() -> None:
         ("walker", (), "observe"),
     ],
 )
-def test_features_that_do_not_exist_are_refused(robot: str, observe: tuple[str, ...], message: str) -> None:
+def test_features_that_do_not_exist_are_refused(
+    robot: str, observe: tuple[str, ...], message: str
+) -> None:
     """Catches a name that is ignored, and a message that does not help."""
     base = "input" if robot == "testbed" else "input_output"
     with pytest.raises(ConfigurationError, match=message):
@@ -478,7 +579,8 @@ def test_features_that_do_not_exist_are_refused(robot: str, observe: tuple[str, 
 def test_residuals_that_come_with_the_package_are_found_by_name(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches a name that only works in the source tree, and a folder that was damaged or left out."""
+    """Catches a name that only works in the source tree, and a folder that was damaged or left
+    out."""
     monkeypatch.chdir(tmp_path)
     robot = read_description(Path(name)).robot
     arm = partial(gymnasium.make, "elastic_env/Robot-v0", sensors=["link_encoder"])
@@ -487,13 +589,18 @@ def test_residuals_that_come_with_the_package_are_found_by_name(
 
 
 def test_a_residual_of_a_folder_plays_what_the_wrapper_decided(tmp_path: Path) -> None:
-    """Catches a policy that decides at other steps, on other features, or around another base than in training."""
+    """Catches a policy that decides at other steps, on other features, or around another base
+    than in training."""
     env = scalar("walker")
     settings: Any = {"history": 2, "observe": ("observation", "base_action"), "decision_period": 10}
     corrected = around(env, "input_output", **settings)
     network = random_network(corrected, 0.3)
     wrapper = ResidualWrapper(
-        scalar("walker"), "input_output", history=2, observe=("observation", "base_action"), decision_period=10
+        scalar("walker"),
+        "input_output",
+        history=2,
+        observe=("observation", "base_action"),
+        decision_period=10,
     )
     features, _ = wrapper.reset(seed=3)
     seen = played(env, ResidualPolicy(corrected, network), 60)
@@ -509,9 +616,13 @@ def folder(path: Path) -> Path:
     corrected = around(env, "input")
     width = Features(corrected).width
     tensors = {
-        "mean": np.zeros(width), "std": np.ones(width), "weight0": np.zeros((4, width)), "bias0": np.zeros(4),
-        "weight1": np.zeros((1, 4)), "bias1": np.zeros(1),
-    }  # fmt: skip
+        "mean": np.zeros(width),
+        "std": np.ones(width),
+        "weight0": np.zeros((4, width)),
+        "bias0": np.zeros(4),
+        "weight1": np.zeros((1, 4)),
+        "bias1": np.zeros(1),
+    }
     save_residual(path, ResidualDescription(robot="testbed", base="input"), tensors)
     return path
 
@@ -520,7 +631,8 @@ def test_make_reads_a_residual_and_runs_it_on_many_worlds(tmp_path: Path) -> Non
     """Catches a residual that only its training can use."""
     path = folder(tmp_path / "r")
     envs = vector("testbed", 3, AutoresetMode.NEXT_STEP)
-    policy, base = baselines.make(f"residual:{path}", envs), baselines.make("input", envs)
+    policy = baselines.make(f"residual:{path}", envs)
+    base = baselines.make("input", envs)
     observation, _ = envs.reset(seed=0)
     np.testing.assert_array_equal(policy.predict(observation)[0], base.predict(observation)[0])
     with pytest.raises(ConfigurationError, match="for the testbed, the environment is the walker"):
@@ -534,7 +646,10 @@ def test_make_reads_a_residual_and_runs_it_on_many_worlds(tmp_path: Path) -> Non
 def damaged(path: Path, **changes: Any) -> None:
     """Change tensors of a residual, and leave out their digest; None leaves one out."""
     tensors = load_file(path / "weights.safetensors") | changes
-    save_file({name: value for name, value in tensors.items() if value is not None}, path / "weights.safetensors")
+    save_file(
+        {name: value for name, value in tensors.items() if value is not None},
+        path / "weights.safetensors",
+    )
     description = ResidualDescription(**json.loads((path / "residual.json").read_text()))
     (path / "residual.json").write_text(description.replace(weights_sha256=None).model_dump_json())
 
@@ -546,10 +661,15 @@ def damaged(path: Path, **changes: Any) -> None:
         ({"bias1": np.array([np.nan])}, "finite"),
         ({"std": np.zeros(6)}, "positive"),
         ({"weight0": np.zeros((4, 5))}, r"shape \(4, 6\), got \(4, 5\)"),
-        ({"mean": np.zeros(7), "std": np.ones(7), "weight0": np.zeros((4, 7))}, "must take 6 features.*it has 7"),
+        (
+            {"mean": np.zeros(7), "std": np.ones(7), "weight0": np.zeros((4, 7))},
+            "must take 6 features.*it has 7",
+        ),
     ],
 )
-def test_a_damaged_residual_says_what_is_wrong(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_a_damaged_residual_says_what_is_wrong(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     """Catches weights that run although they belong to something else."""
     path = folder(tmp_path / "r")
     damaged(path, **changes)
@@ -560,15 +680,24 @@ def test_a_damaged_residual_says_what_is_wrong(changes: dict[str, Any], message:
 def test_weights_that_were_changed_are_refused(tmp_path: Path) -> None:
     """Catches weights of another training beside the description of this one."""
     path = folder(tmp_path / "r")
-    save_file(load_file(path / "weights.safetensors") | {"bias1": np.ones(1)}, path / "weights.safetensors")
-    with pytest.raises(ConfigurationError, match=r"weights\.safetensors was changed: residual\.json names the SHA-256"):
+    save_file(
+        load_file(path / "weights.safetensors") | {"bias1": np.ones(1)},
+        path / "weights.safetensors",
+    )
+    with pytest.raises(
+        ConfigurationError,
+        match=r"weights\.safetensors was changed: residual\.json names the SHA-256",
+    ):
         baselines.make(f"residual:{path}", scalar("testbed"))
 
 
 @pytest.mark.parametrize("file", ["residual.json", "weights.safetensors"])
 @pytest.mark.parametrize("kind", ["pipe", "huge", "device", "link", "folder"])
-def test_a_residual_consists_of_plain_files_of_its_own(kind: str, file: str, tmp_path: Path) -> None:
-    """Catches 3 GB that are read to be refused, a pipe that is waited for, and a file of somebody else's."""
+def test_a_residual_consists_of_plain_files_of_its_own(
+    kind: str, file: str, tmp_path: Path
+) -> None:
+    """Catches 3 GB that are read to be refused, a pipe that is waited for, and a file of
+    somebody else's."""
     path = folder(tmp_path / "r")
     (path / file).rename(tmp_path / "elsewhere")
     {
@@ -579,7 +708,9 @@ def test_a_residual_consists_of_plain_files_of_its_own(kind: str, file: str, tmp
         "folder": lambda: (path / file).mkdir(),
     }[kind]()
     said = {"pipe": "must be a plain file", "huge": "must have at most", "folder": "Is a directory"}
-    with pytest.raises(ConfigurationError, match=said.get(kind, "is a link out of its folder; copy the file there")):
+    with pytest.raises(
+        ConfigurationError, match=said.get(kind, "is a link out of its folder; copy the file there")
+    ):
         load_residual(path)
 
 
@@ -592,35 +723,50 @@ def test_a_residual_may_lie_behind_a_link(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", shipped())
 def test_residuals_of_the_package_are_those_that_a_commit_of_the_history_trained(name: str) -> None:
-    """Catches weights that were changed after training, or that code trained which nobody can look up."""
+    """Catches weights that were changed after training, or that code trained which nobody can
+    look up."""
     description, _ = load_residual(Path(name))
     assert description.weights_sha256 is not None
     assert description.origin.commit is not None
-    assert re.fullmatch("[0-9a-f]{40}", description.origin.commit), "trained by changes that were not committed"
+    assert re.fullmatch("[0-9a-f]{40}", description.origin.commit), (
+        "trained by changes that were not committed"
+    )
     if (ROOT / ".git").exists() and git("rev-parse", "--is-shallow-repository") == "false":
         git("merge-base", "--is-ancestor", description.origin.commit, "HEAD")
 
 
 def git(*arguments: str) -> str:
     """Output of git in this checkout; it must succeed."""
-    done = subprocess.run(["git", "-C", str(ROOT), *arguments], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), *arguments], check=True, capture_output=True, text=True
+    )
     return done.stdout.strip()
 
 
 def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> None:
-    """Catches a traceback for a path that is wrong, text that is no JSON, and a description of something else."""
+    """Catches a traceback for a path that is wrong, text that is no JSON, and a description of
+    something else."""
     env = scalar("testbed")
     with pytest.raises(ConfigurationError, match=r"no residual at .*residual\.json"):
         baselines.make(f"residual:{tmp_path}", env)
     path = folder(tmp_path / "r")
-    (best, last), name = [folder(tmp_path / "seed" / name) for name in ("best", "last")], "seed"
-    with pytest.raises(ConfigurationError, match=rf"give one of them: {last}, {best}$"):  # the best one flatters itself
+    best, last = [folder(tmp_path / "seed" / name) for name in ("best", "last")]
+    name = "seed"
+    with pytest.raises(
+        ConfigurationError, match=rf"give one of them: {last}, {best}$"
+    ):  # the best one flatters itself
         baselines.make(f"residual:{tmp_path / name}", env)
     shutil.rmtree(tmp_path / name)
-    with pytest.raises(ConfigurationError, match=rf"is no residual but has some inside; give one of them: {path}$"):
+    with pytest.raises(
+        ConfigurationError, match=rf"is no residual but has some inside; give one of them: {path}$"
+    ):
         baselines.make(f"residual:{tmp_path}", env)
     silent = json.dumps({"robot": "testbed"})
-    for text, message in (("{", "is not JSON"), ("[]", "must be a mapping, got list"), (silent, "base")):
+    for text, message in (
+        ("{", "is not JSON"),
+        ("[]", "must be a mapping, got list"),
+        (silent, "base"),
+    ):
         (path / "residual.json").write_text(text)
         with pytest.raises(ConfigurationError, match=message):
             baselines.make(f"residual:{path}", env)
@@ -633,7 +779,8 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_the_environment_under_a_wrapper_stays_as_it_was(mode: AutoresetMode) -> None:
     """Catches a wrapper that changes how the caller's own environment restarts."""
-    env, alone = vector("testbed", 2, mode), vector("testbed", 2, mode)
+    env = vector("testbed", 2, mode)
+    alone = vector("testbed", 2, mode)
     wrapped = ResidualVectorWrapper(env, "input")
     wrapped.reset(seed=3)
     wrapped.step(np.zeros(wrapped.action_space.shape))

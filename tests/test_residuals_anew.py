@@ -8,7 +8,14 @@ from rich.console import Console
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.compare import CompareConfig
-from train.commands.residuals import CONFIGS, RESIDUALS, beside_the_shipped, main, reproduce, shipped_seeds
+from train.commands.residuals import (
+    CONFIGS,
+    RESIDUALS,
+    beside_the_shipped,
+    main,
+    reproduce,
+    shipped_seeds,
+)
 from train.workers.executors import Executors
 
 TRAINING = """\
@@ -33,14 +40,22 @@ policies: [input, {name: "residual:testbed/seed_0", label: residual}]
 """
 
 
-def test_a_residual_stands_beside_the_one_of_the_package_and_a_second_call_goes_on(tmp_path: Path) -> None:
-    """Catches policies of the package that are compared with themselves, and finished training that begins anew."""
+def test_a_residual_stands_beside_the_one_of_the_package_and_a_second_call_goes_on(
+    tmp_path: Path,
+) -> None:
+    """Catches policies of the package that are compared with themselves, and finished training
+    that begins anew."""
     (tmp_path / "train_testbed.yaml").write_text(TRAINING)
     (tmp_path / "learned_testbed.yaml").write_text(COMPARISON)
 
     def played() -> dict[str, float]:
-        made = reproduce("testbed", tmp_path, Console(quiet=True), [3], Executors(jobs=1), configs=tmp_path)
-        return {one.condition.policy.title: one.values("link_error_rms_rad")[0] for one in made.evaluations}
+        made = reproduce(
+            "testbed", tmp_path, Console(quiet=True), [3], Executors(jobs=1), configs=tmp_path
+        )
+        return {
+            one.condition.policy.title: one.values("link_error_rms_rad")[0]
+            for one in made.evaluations
+        }
 
     first = played()
     weights = tmp_path / "testbed/training/seed_3/last/weights.safetensors"
@@ -54,7 +69,9 @@ def test_a_residual_stands_beside_the_one_of_the_package_and_a_second_call_goes_
 
 def test_all_residuals_of_the_package_can_be_trained_anew() -> None:
     """Catches a residual without its configurations, and one that its comparison does not play."""
-    assert {folder.name for folder in Path("baselines/trained").iterdir() if folder.is_dir()} == set(RESIDUALS)
+    assert {
+        folder.name for folder in Path("baselines/trained").iterdir() if folder.is_dir()
+    } == set(RESIDUALS)
     for name, compared in RESIDUALS.items():
         config = load_yaml(CONFIGS / f"{compared}.yaml", CompareConfig)
         both = beside_the_shipped(config, name, Path("run"))

@@ -1,4 +1,5 @@
-"""Robots drawn from ranges: the draws themselves, what of them reaches plant and sensors, and who may know of it."""
+"""Robots drawn from ranges: the draws themselves, what of them reaches plant and sensors, and
+who may know of it."""
 
 import math
 from pathlib import Path
@@ -30,10 +31,20 @@ from tests.three_joints import ARM
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 MASS_KG = 57.0
 DRAWN_FIELDS = (
-    "tendon_stiffness", "tendon_damping", "tendon_lengthspring", "dof_frictionloss", "body_quat", "body_pos",
-    "body_mass", "body_inertia",
-    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0",  # by the masses
-)  # fmt: skip
+    "tendon_stiffness",
+    "tendon_damping",
+    "tendon_lengthspring",
+    "dof_frictionloss",
+    "body_quat",
+    "body_pos",
+    "body_mass",
+    "body_inertia",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "tendon_invweight0",  # by the masses
+)
 NAMES = [name for name, _ in RobotRanges().intervals()]
 
 
@@ -70,9 +81,9 @@ def is_within(ranges: RobotRanges, robot: RobotDraw) -> bool:
     if not is_unpushed:
         found.append((ranges.push_n, robot.push_n))
     shares = (ranges.delay_share, robot.is_delayed), (ranges.inertial_share, robot.is_inertial)
-    return all(np.all((low <= np.array(v)) & (np.array(v) <= high)) for (low, high), v in found) and all(
-        share > 0.0 if has else share < 1.0 for share, has in shares
-    )
+    return all(
+        np.all((low <= np.array(v)) & (np.array(v) <= high)) for (low, high), v in found
+    ) and all(share > 0.0 if has else share < 1.0 for share, has in shares)
 
 
 @st.composite
@@ -105,7 +116,9 @@ def test_robots_lie_in_their_ranges(ranges: RobotRanges, number: int, seed: int)
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 5), st.integers(0, 2**31))
-def test_a_latin_hypercube_has_one_value_in_each_interval(number: int, columns: int, seed: int) -> None:
+def test_a_latin_hypercube_has_one_value_in_each_interval(
+    number: int, columns: int, seed: int
+) -> None:
     """Catches independent draws, which leave gaps, and one order for all columns."""
     points = latin_hypercube(number, columns, np.random.default_rng(seed))
     assert points.shape == (number, columns)
@@ -120,20 +133,36 @@ def test_the_bank_of_drawn_fills_its_ranges_evenly_and_its_quantities_are_indepe
     columns = np.array(
         [
             [
-                *r.stiffness_factor, *r.encoder_bias_rad, *r.imu_bias_rad, *r.load_place_m, r.damping_factor,
-                r.friction_factor, r.backlash_rad, r.load_kg, r.slope_rad, r.slope_direction_rad,
+                *r.stiffness_factor,
+                *r.encoder_bias_rad,
+                *r.imu_bias_rad,
+                *r.load_place_m,
+                r.damping_factor,
+                r.friction_factor,
+                r.backlash_rad,
+                r.load_kg,
+                r.slope_rad,
+                r.slope_direction_rad,
             ]
             for r in bank
         ]
-    )  # fmt: skip
+    )
     joints = columns[:, :12]
     assert 0.5 < np.corrcoef(joints.T)[0, 1] < 0.9  # a factor of their own, and one together
     assert (joints.min(), joints.max()) == pytest.approx((0.6, 1.4), abs=0.04)
     own = np.corrcoef(np.column_stack([joints.mean(axis=1), columns[:, 12:]]).T)
     assert np.abs(own - np.eye(len(own))).max() < 5.0 / np.sqrt(256)
-    for column, name in ((-6, "damping"), (-5, "friction"), (-4, "backlash_rad"), (-3, "load_kg"), (-2, "slope_rad")):
+    for column, name in (
+        (-6, "damping"),
+        (-5, "friction"),
+        (-4, "backlash_rad"),
+        (-3, "load_kg"),
+        (-2, "slope_rad"),
+    ):
         low, high = getattr(TRAINING_RANGES, name)
-        np.testing.assert_allclose(np.sort(columns[:, column]), np.linspace(low, high, 256), atol=(high - low) / 256)
+        np.testing.assert_allclose(
+            np.sort(columns[:, column]), np.linspace(low, high, 256), atol=(high - low) / 256
+        )
     pushes = np.array([r.push_n for r in bank])
     assert (pushes > 0.0).mean() == pytest.approx(0.5, abs=0.01)
     assert pushes.max() <= 50.0
@@ -141,13 +170,16 @@ def test_the_bank_of_drawn_fills_its_ranges_evenly_and_its_quantities_are_indepe
 
 
 def test_banks_are_the_same_everywhere_and_have_robots_of_their_own() -> None:
-    """Catches robots that are new in every process, and an evaluation on robots that training has met."""
+    """Catches robots that are new in every process, and an evaluation on robots that training
+    has met."""
     for name in ("drawn", "drawn_beyond"):
         scenario = make_scenario(name)
         bank = robot_bank(scenario)
         assert robot_bank(scenario) == bank
         assert not set(robot_bank(scenario, 1)) & set(bank)
-    assert robot_bank(make_scenario("drawn"))[0].damping_factor == pytest.approx(DAMPING_OF_THE_FIRST, rel=1e-12)
+    assert robot_bank(make_scenario("drawn"))[0].damping_factor == pytest.approx(
+        DAMPING_OF_THE_FIRST, rel=1e-12
+    )
 
 
 DAMPING_OF_THE_FIRST = 0.5748213505602238
@@ -169,7 +201,8 @@ def test_every_robot_of_drawn_beyond_has_one_quantity_beyond_the_ranges_of_drawn
 
 
 def test_a_range_that_changes_leaves_the_other_draws_as_they_are() -> None:
-    """Catches robots that all change with one interval, so that a comparison of two ranges is of other robots."""
+    """Catches robots that all change with one interval, so that a comparison of two ranges is of
+    other robots."""
     one = draw_robots([TRAINING_RANGES], 16, 12, [3])
     other = draw_robots([TRAINING_RANGES.replace(load_kg=(0.0, 0.0))], 16, 12, [3])
     assert [robot.replace(load_kg=0.0) for robot in one] == other
@@ -177,7 +210,8 @@ def test_a_range_that_changes_leaves_the_other_draws_as_they_are() -> None:
 
 
 def test_several_ranges_have_equal_shares() -> None:
-    light, heavy = RobotRanges(load_kg=(0.0, 1.0)), RobotRanges(load_kg=(5.0, 6.0))
+    light = RobotRanges(load_kg=(0.0, 1.0))
+    heavy = RobotRanges(load_kg=(5.0, 6.0))
     robots = draw_robots([light, heavy, light], 9, 2, [0])
     assert [robot.load_kg > 2.0 for robot in robots] == [False] * 3 + [True] * 3 + [False] * 3
     assert len({robot.load_kg for robot in robots}) == 9
@@ -186,8 +220,14 @@ def test_several_ranges_have_equal_shares() -> None:
 @pytest.mark.parametrize(
     ("given_", "message"),
     [
-        ({"load_kg": (4.0, 2.0)}, r"load_kg must be \[lowest, highest\] within 0 to 100 \[kg\], got \[4, 2\]"),
-        ({"friction": (-1.0, 2.0)}, r"friction must be \[lowest, highest\] within 0 to 100 \[1\], got \[-1, 2\]"),
+        (
+            {"load_kg": (4.0, 2.0)},
+            r"load_kg must be \[lowest, highest\] within 0 to 100 \[kg\], got \[4, 2\]",
+        ),
+        (
+            {"friction": (-1.0, 2.0)},
+            r"friction must be \[lowest, highest\] within 0 to 100 \[1\], got \[-1, 2\]",
+        ),
         ({"load": (0.0, 2.0)}, "load"),
         ({"delay_share": 1.5}, "delay_share"),
         ({"load_kg": (0.0, math.nan)}, "load_kg"),
@@ -215,12 +255,17 @@ def test_what_ranges_draw_is_not_said_twice() -> None:
 
 @pytest.mark.parametrize("worlds", [1, 3])
 def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(worlds: int) -> None:
-    """Catches a field that is forgotten, such as inertias for the contacts after a change of mass."""
+    """Catches a field that is forgotten, such as inertias for the contacts after a change of
+    mass."""
     arguments: dict[str, Any] = {**SHORT, "scenario": "drawn"}
-    env: Any = make_walk(**arguments) if worlds == 1 else make_walk_vector(num_envs=worlds, **arguments)
+    env: Any = (
+        make_walk(**arguments) if worlds == 1 else make_walk_vector(num_envs=worlds, **arguments)
+    )
     env.reset(seed=2)
-    config, world = env.unwrapped.task.config, worlds - 1
-    robot, plant = robot_of(env, world), plant_of(env, world)
+    config = env.unwrapped.task.config
+    world = worlds - 1
+    robot = robot_of(env, world)
+    plant = plant_of(env, world)
     joints = {
         name: joint.replace(
             stiffness=joint.stiffness * factor,
@@ -228,20 +273,27 @@ def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(world
             coulomb_friction=joint.coulomb_friction * robot.friction_factor,
             backlash=robot.backlash_rad,
         )
-        for (name, joint), factor in zip(config.true_joints.items(), robot.stiffness_factor, strict=True)
+        for (name, joint), factor in zip(
+            config.true_joints.items(), robot.stiffness_factor, strict=True
+        )
     }
     spec = elastic_spec(config.robot, joints, "tendon", config.timestep_s)
     add_load(spec, DRAWN_LOAD, robot.load_kg, np.array(robot.load_place_m))
     spec.body("floor").quat = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
     compiled = spec.compile()
-    generator, seen = np.random.default_rng(0), []
+    generator = np.random.default_rng(0)
+    seen = []
     for model in (plant, compiled):
-        model.opt.tolerance = 0.0  # else the solver stops by the mean inertia, which is not of the robot
-    data, other = mujoco.MjData(plant), mujoco.MjData(compiled)
+        model.opt.tolerance = (
+            0.0  # else the solver stops by the mean inertia, which is not of the robot
+        )
+    data = mujoco.MjData(plant)
+    other = mujoco.MjData(compiled)
     for _ in range(5):
         data.qpos[:] = env.unwrapped.simulation.qpos[world] + 0.01 * generator.normal(size=plant.nq)
         data.qvel[:] = 0.1 * generator.normal(size=plant.nv)
-        other.qpos[:], other.qvel[:] = data.qpos, data.qvel
+        other.qpos[:] = data.qpos
+        other.qvel[:] = data.qvel
         mujoco.mj_forward(plant, data)
         mujoco.mj_forward(compiled, other)
         seen.append(np.abs(other.qacc).max())
@@ -252,32 +304,45 @@ def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(world
 
 
 def test_springs_sag_by_torque_over_stiffness() -> None:
-    """Catches a K or a dead band that is drawn and not used: at rest the servo's torque is that of the spring."""
-    env = make_walk_vector(num_envs=3, **SHORT, scenario=with_ranges(TRAINING_RANGES, ground="ideal"))
+    """Catches a K or a dead band that is drawn and not used: at rest the servo's torque is that
+    of the spring."""
+    env = make_walk_vector(
+        num_envs=3, **SHORT, scenario=with_ranges(TRAINING_RANGES, ground="ideal")
+    )
     env.reset(seed=0)
-    truth, torque = env.unwrapped.truth(), np.array(env.unwrapped.simulation.bind("actuator_force"))
+    truth = env.unwrapped.truth()
+    torque = np.array(env.unwrapped.simulation.bind("actuator_force"))
     for world in range(3):
         robot = robot_of(env, world)
         K = 1001.0 * np.array(robot.stiffness_factor)
         np.testing.assert_allclose(truth.stiffness[world], K, rtol=1e-12)
         loaded = np.abs(torque[world]) > 1.0
         sag = static_deflection(torque[world], K, robot.backlash_rad)
-        np.testing.assert_allclose((truth.theta - truth.q)[world][loaded], sag[loaded], rtol=0.0, atol=1e-5)
+        np.testing.assert_allclose(
+            (truth.theta - truth.q)[world][loaded], sag[loaded], rtol=0.0, atol=1e-5
+        )
         assert loaded.sum() >= 4
     assert len({robot_of(env, world) for world in range(3)}) == 3
 
 
 def test_the_load_moves_the_center_of_mass_by_its_share_of_the_weight() -> None:
-    """Catches a load that sits elsewhere, or weighs nothing, by the center of mass that MuJoCo computes."""
+    """Catches a load that sits elsewhere, or weighs nothing, by the center of mass that MuJoCo
+    computes."""
     scenario = with_ranges(
-        RobotRanges(load_kg=(6.0, 8.0), load_x_m=(0.05, 0.1), load_y_m=(-0.1, -0.05), load_z_m=(0.1, 0.15))
+        RobotRanges(
+            load_kg=(6.0, 8.0), load_x_m=(0.05, 0.1), load_y_m=(-0.1, -0.05), load_z_m=(0.1, 0.15)
+        )
     )
     env = make_walk(**SHORT, scenario=scenario)
     env.reset(seed=0)
-    robot, simulation = robot_of(env), env.simulation
+    robot = robot_of(env)
+    simulation = env.simulation
     body = {name: simulation.model.body(name).id for name in ("pelvis", "upper_body", "drawn_load")}
-    centers, masses = np.array(simulation.bind("xipos")[0]), simulation.model.body_mass.copy()
-    R = np.array(simulation.bind("ximat")[0, body["upper_body"]]).reshape(3, 3)  # of the principal axes
+    centers = np.array(simulation.bind("xipos")[0])
+    masses = simulation.model.body_mass.copy()
+    R = np.array(simulation.bind("ximat")[0, body["upper_body"]]).reshape(
+        3, 3
+    )  # of the principal axes
     frame = np.array(simulation.bind("xmat")[0, body["upper_body"]]).reshape(3, 3)
     assert np.linalg.det(R) == pytest.approx(1.0)
     load = centers[body["upper_body"]] + frame @ np.array(robot.load_place_m)
@@ -285,16 +350,22 @@ def test_the_load_moves_the_center_of_mass_by_its_share_of_the_weight() -> None:
     without[body["drawn_load"]] = 0.0
     bare = without @ centers / without.sum()
     expected = bare + robot.load_kg / (MASS_KG + robot.load_kg) * (load - bare)
-    np.testing.assert_allclose(simulation.bind("subtree_com")[0, body["pelvis"]], expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        simulation.bind("subtree_com")[0, body["pelvis"]], expected, rtol=0.0, atol=1e-9
+    )
     assert 6.0 <= robot.load_kg <= 8.0
 
 
 @pytest.mark.parametrize("ground", ["nominal", "ideal"])
 def test_an_episode_of_a_drawn_robot_starts_at_rest(ground: str) -> None:
     """Catches a robot that was settled with another load, ground or friction than it walks with."""
-    env = make_walk(**SHORT, scenario=with_ranges(TRAINING_RANGES.replace(push_n=(0.0, 0.0)), ground=ground))
+    env = make_walk(
+        **SHORT, scenario=with_ranges(TRAINING_RANGES.replace(push_n=(0.0, 0.0)), ground=ground)
+    )
     _, info = env.reset(seed=1)
-    robot, start, reference = robot_of(env), env.truth(), env.task.assumed_model.plan.q
+    robot = robot_of(env)
+    start = env.truth()
+    reference = env.task.assumed_model.plan.q
     weight = (MASS_KG + robot.load_kg) * 9.81
     for k in range(50):
         assert info["force_left"] + info["force_right"] == pytest.approx(weight, abs=0.02)
@@ -302,20 +373,26 @@ def test_an_episode_of_a_drawn_robot_starts_at_rest(ground: str) -> None:
     truth = env.truth()
     assert np.abs(truth.q_dot).max() < 1e-3
     for name in ("q", "theta", "pelvis", "ankles"):
-        np.testing.assert_allclose(getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name
+        )
 
 
 def test_a_drawn_robot_that_cannot_stand_is_an_error_with_its_values() -> None:
     """Catches an error that leaves open which of the ranges is too wide."""
-    env = make_walk(**SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 90.0), load_x_m=(0.9, 0.9))))
+    env = make_walk(
+        **SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 90.0), load_x_m=(0.9, 0.9)))
+    )
     with pytest.raises(
-        ConfigurationError, match=r"load_kg=90\.0 .*load_place_m=\(0\.9, .* does not stand.*narrow the ran"
+        ConfigurationError,
+        match=r"load_kg=90\.0 .*load_place_m=\(0\.9, .* does not stand.*narrow the ran",
     ):
         env.reset(seed=0)
 
 
 def test_fields_follow_the_robot_from_episode_to_episode() -> None:
-    """Catches a world that keeps something of the robot that it had before, and one that changes another world's."""
+    """Catches a world that keeps something of the robot that it had before, and one that changes
+    another world's."""
     env: Any = make_walk_vector(num_envs=2, **SHORT, scenario="drawn")
     env.reset(seed=[4, 5])
     first = [plant_of(env, world) for world in (0, 1)]
@@ -334,11 +411,13 @@ def test_signals_know_the_drawn_joints() -> None:
     """Catches a joint torque that is computed with the assumed damping or dead band."""
     env = make_walk(**SHORT, scenario="drawn")
     env.reset(seed=0)
-    robot, generator = robot_of(env), np.random.default_rng(0)
+    robot = robot_of(env)
+    generator = np.random.default_rng(0)
     for _ in range(20):
         *_, info = env.step(generator.uniform(-0.02, 0.02, 12).astype(np.float32))
     truth = env.truth()
-    delta, rate = truth.theta - truth.q, truth.theta_dot - truth.q_dot
+    delta = truth.theta - truth.q
+    rate = truth.theta_dot - truth.q_dot
     spring = np.sign(delta) * np.maximum(np.abs(delta) - robot.backlash_rad / 2.0, 0.0)
     torque = 1001.0 * np.array(robot.stiffness_factor) * spring + 10.0 * robot.damping_factor * rate
     assert info["joint_torque"] == pytest.approx(np.abs(torque).max(), rel=1e-12)
@@ -363,7 +442,9 @@ def test_floor_and_pushes_are_those_of_the_robot() -> None:
     robots = [robot_of(env, world) for world in range(3)]
     np.testing.assert_allclose(largest, [robot.push_n for robot in robots], rtol=1e-12)
     quaternions = np.array([plant_of(env, world).body_quat[floor] for world in range(3)])
-    np.testing.assert_allclose(2.0 * np.arccos(quaternions[:, 0]), [r.slope_rad for r in robots], rtol=1e-6)
+    np.testing.assert_allclose(
+        2.0 * np.arccos(quaternions[:, 0]), [r.slope_rad for r in robots], rtol=1e-6
+    )
     assert len({robot.push_n for robot in robots}) == 3
 
 
@@ -374,7 +455,9 @@ def test_encoders_and_imu_are_off_by_what_was_drawn() -> None:
     observation, info = env.reset(seed=0)
     robots = [robot_of(env, world) for world in range(3)]
     encoder = observation[:, :12] - env.unwrapped.truth().theta
-    np.testing.assert_allclose(encoder, [robot.encoder_bias_rad for robot in robots], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        encoder, [robot.encoder_bias_rad for robot in robots], rtol=0.0, atol=1e-12
+    )
     imu = observation[:, 24:26] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
     np.testing.assert_allclose(imu, [robot.imu_bias_rad for robot in robots], rtol=0.0, atol=1e-12)
 
@@ -386,7 +469,8 @@ def test_measurements_are_old_in_the_worlds_of_delayed_robots_alone() -> None:
     observation, _ = env.reset(seed=0)
     is_delayed = np.array([robot_of(env, world).is_delayed for world in range(6)])
     assert 0 < is_delayed.sum() < 6
-    generator, link = np.random.default_rng(0), env.unwrapped.task.observation_table.group("link_encoder")
+    generator = np.random.default_rng(0)
+    link = env.unwrapped.task.observation_table.group("link_encoder")
     for _ in range(30):
         before = env.unwrapped.truth()
         observation, *_ = env.step(generator.uniform(-0.02, 0.02, (6, 12)).astype(np.float32))
@@ -400,15 +484,19 @@ def test_measurements_are_old_in_the_worlds_of_delayed_robots_alone() -> None:
 @pytest.mark.parametrize(
     ("ranges", "fixed"),
     [
-        ({"inertial_share": 1.0, "delay_share": 1.0}, {"inertial": InertialSensor(), "delay_steps": 1}),
+        (
+            {"inertial_share": 1.0, "delay_share": 1.0},
+            {"inertial": InertialSensor(), "delay_steps": 1},
+        ),
         ({"push_n": (50.0, 50.0)}, {"push_n": 50.0}),
         ({"delay_share": 1.0}, {"delay_steps": 1}),
     ],
-)  # fmt: skip
+)
 def test_a_range_of_one_value_is_the_condition_of_that_value(
     monkeypatch: pytest.MonkeyPatch, ranges: dict[str, Any], fixed: dict[str, Any]
 ) -> None:
-    """Catches a second mechanism beside that of the named scenarios: the same numbers must come out."""
+    """Catches a second mechanism beside that of the named scenarios: the same numbers must come
+    out."""
     monkeypatch.setattr(walk_config, "RANGES_BANK_SIZE", 1)
     nominal = make_scenario("nominal")
     seen = []
@@ -421,7 +509,8 @@ def test_a_range_of_one_value_is_the_condition_of_that_value(
 
 
 def test_robots_with_and_without_an_inertial_imu_walk_side_by_side() -> None:
-    """Catches an IMU of one robot that shows what another one's does: only one of both has the true attitude."""
+    """Catches an IMU of one robot that shows what another one's does: only one of both has the
+    true attitude."""
     scenario = with_ranges(RobotRanges(inertial_share=0.5), ground="ideal")
     env: Any = make_walk_vector(num_envs=6, **SHORT, scenario=scenario)
     observation, info = env.reset(seed=0)
@@ -450,7 +539,8 @@ def test_a_policy_assumes_the_nominal_robot() -> None:
 
 @pytest.mark.parametrize("worlds", [2, 5])
 def test_a_seed_has_the_same_robot_in_any_number_of_worlds(worlds: int) -> None:
-    """Catches a draw that depends on the other worlds: bits of a scalar environment against those of a row."""
+    """Catches a draw that depends on the other worlds: bits of a scalar environment against
+    those of a row."""
     seeds = [7, 8, 9, 10, 11][:worlds]
     env: Any = make_walk_vector(num_envs=worlds, **SHORT, scenario="drawn")
     alone = make_walk(**SHORT, scenario="drawn")
@@ -460,7 +550,8 @@ def test_a_seed_has_the_same_robot_in_any_number_of_worlds(worlds: int) -> None:
     generator = np.random.default_rng(0)
     for _ in range(60):
         action = generator.uniform(-0.01, 0.01, (worlds, 12)).astype(np.float32)
-        many, one = env.step(action), alone.step(action[-1])
+        many = env.step(action)
+        one = alone.step(action[-1])
         np.testing.assert_array_equal(many[0][-1], one[0])
         assert many[1][-1] == one[1]
 
@@ -488,7 +579,11 @@ def test_the_table_of_ranges_is_that_of_the_code() -> None:
     """Catches a range in docs/walker.md that is not drawn from, and one that is missing there."""
     text = (Path(__file__).parents[1] / "docs" / "walker.md").read_text(encoding="utf-8")
     section = text[text.index("## Drawn robots") : text.index("## The IMU")].replace("−", "-")
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| `")]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in section.splitlines()
+        if line.startswith("| `")
+    ]
     table = {cells[0].strip("`"): (cells[1], cells[2]) for cells in rows}
     beyond: dict[str, list[str]] = {}
     for changes in _BEYOND:
@@ -497,16 +592,26 @@ def test_the_table_of_ranges_is_that_of_the_code() -> None:
     for name in RobotRanges.model_fields:
         value = getattr(TRAINING_RANGES, name)
         drawn = f"{value:g}" if isinstance(value, float) else "{:.4g} to {:.4g}".format(*value)
-        assert table.pop(name) == (drawn, "1, where `push_n` is beyond" if name == "push_share" else
-                                   "; ".join(beyond.get(name, []))), name  # fmt: skip
+        assert table.pop(name) == (
+            drawn,
+            (
+                "1, where `push_n` is beyond"
+                if name == "push_share"
+                else "; ".join(beyond.get(name, []))
+            ),
+        ), name
     assert set(table) == {"drawn", "drawn_beyond"}  # of the table of figures
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
-    """Catches a quantity that is drawn and does not reach the physics, and a load or a push of a walker's."""
+    """Catches a quantity that is drawn and does not reach the physics, and a load or a push of a
+    walker's."""
     env: Any = gymnasium.make_vec(
-        "elastic_env/Testbed-v0", num_envs=num_envs, scenario="drawn", vectorization_mode="vector_entry_point"
+        "elastic_env/Testbed-v0",
+        num_envs=num_envs,
+        scenario="drawn",
+        vectorization_mode="vector_entry_point",
     ).unwrapped
     env.reset(seed=4)
     known = env.assumed_model
@@ -517,12 +622,18 @@ def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
     for world in range(num_envs):
         robot = robot_of(env, world)
         assert is_within(ranges, robot)
-        assert env.task.robot_record(world)["robot_load_kg"] == env.task.robot_record(world)["robot_push_n"] == 0.0
+        assert (
+            env.task.robot_record(world)["robot_load_kg"]
+            == env.task.robot_record(world)["robot_push_n"]
+            == 0.0
+        )
         model = env.simulation.model_of(world)
         stiffness = known.stiffness * robot.stiffness_factor
         np.testing.assert_allclose(model.tendon_stiffness[springs], stiffness, rtol=1e-12)
         np.testing.assert_allclose(env.truth().stiffness[world], stiffness, rtol=1e-12)
-        np.testing.assert_allclose(model.tendon_damping[springs], known.damping * robot.damping_factor, rtol=1e-12)
+        np.testing.assert_allclose(
+            model.tendon_damping[springs], known.damping * robot.damping_factor, rtol=1e-12
+        )
         dead_band = np.diff(model.tendon_lengthspring[springs], axis=1)[:, 0]
         np.testing.assert_allclose(dead_band, known.backlash + robot.backlash_rad, atol=1e-12)
         friction = known.coulomb_friction[0] * robot.friction_factor
@@ -530,10 +641,14 @@ def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
 
 
 def test_drawn_robots_on_a_fixed_base_begin_at_rest() -> None:
-    """Catches a robot that is placed by the K or the dead band of another one, and a homing error with another sign."""
+    """Catches a robot that is placed by the K or the dead band of another one, and a homing
+    error with another sign."""
     envs = [
         gymnasium.make_vec(
-            "elastic_env/Testbed-v0", num_envs=4, scenario=scenario, vectorization_mode="vector_entry_point"
+            "elastic_env/Testbed-v0",
+            num_envs=4,
+            scenario=scenario,
+            vectorization_mode="vector_entry_point",
         )
         for scenario in ("ideal+drawn", "ideal+drawn_beyond")
     ]
@@ -549,7 +664,8 @@ def test_drawn_robots_on_a_fixed_base_begin_at_rest() -> None:
 
 
 def test_an_arm_is_drawn_alone_as_among_others() -> None:
-    """Catches a robot that depends on the number of worlds, and measurements that are delayed in all worlds or none."""
+    """Catches a robot that depends on the number of worlds, and measurements that are delayed in
+    all worlds or none."""
     ARM.register()
     many = gymnasium.make_vec(
         "elastic_env/Arm-v0", num_envs=8, scenario="drawn", vectorization_mode="vector_entry_point"

@@ -1,4 +1,5 @@
-"""`elastic robot`: its tables against what was played and against MuJoCo, its folder, its errors."""
+"""`elastic robot`: its tables against what was played and against MuJoCo, its folder, its
+errors."""
 
 import csv
 import re
@@ -21,12 +22,20 @@ from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from elastic_env.world.joint_task import JointPlant
 from tests.gallery_files import FOLDER
 from train.commands.cli import main
-from train.commands.robot import POLICIES, Robot, joint_shares, rest_poses, robot_arguments, try_robot
+from train.commands.robot import (
+    POLICIES,
+    Robot,
+    joint_shares,
+    rest_poses,
+    robot_arguments,
+    try_robot,
+)
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation, evaluate
 
-QUICK, SEVERAL = Poses(positions=1, move_s=0.8, settle_s=0.6, measure_s=0.1), Poses(positions=5)
+QUICK = Poses(positions=1, move_s=0.8, settle_s=0.6, measure_s=0.1)
+SEVERAL = Poses(positions=5)
 SINE = {"kind": "sine", "amplitude": 0.1, "duration_s": 0.5, "onset_s": 0.25}
 JOINTS = EXAMPLE.with_suffix(".yaml")
 
@@ -54,9 +63,11 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 def test_the_table_says_what_was_played(tried: tuple[Path, str]) -> None:
-    """Catches columns that are mixed up, a unit that is not that of its title, and a comparison without effect."""
+    """Catches columns that are mixed up, a unit that is not that of its title, and a comparison
+    without effect."""
     folder, printed = tried
-    table, episodes = rows(folder / "end_effector.csv"), rows(folder / "comparison" / "episodes.csv")
+    table = rows(folder / "end_effector.csv")
+    episodes = rows(folder / "comparison" / "episodes.csv")
     assert [(row["motion"], row["policy"]) for row in table] == [
         (motion, policy) for motion in ("poses", "sine") for policy in POLICIES
     ]
@@ -66,17 +77,26 @@ def test_the_table_says_what_was_played(tried: tuple[Path, str]) -> None:
         assert float(row["error_peak_m"]) == float(episode["end_effector_error_peak_m"])
     for motion in ("poses", "sine"):
         errors = [1e3 * float(row["error_rms_m"]) for row in table if row["motion"] == motion]
-        assert [motion, *(f"{error:.3f}" for error in errors)] in [line.split()[:4] for line in printed.splitlines()]
+        assert [motion, *(f"{error:.3f}" for error in errors)] in [
+            line.split()[:4] for line in printed.splitlines()
+        ]
         assert errors[2] < 0.2 * errors[0]
 
 
 def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None:
-    """Catches a file of a robot that names what is not there, and one that describes another robot."""
+    """Catches a file of a robot that names what is not there, and one that describes another
+    robot."""
     folder, _ = tried
     assert {file.name for file in folder.iterdir()} == {
-        "config.yaml", "metadata.json", "robot.yaml", "joints.yaml", "picture.png", "end_effector.csv", "joints.csv",
+        "config.yaml",
+        "metadata.json",
+        "robot.yaml",
+        "joints.yaml",
+        "picture.png",
+        "end_effector.csv",
+        "joints.csv",
         "comparison",
-    }  # fmt: skip
+    }
     assert (folder / "comparison" / "report.html").is_file()
     again = configure_robot(**environment(str(folder / "robot.yaml")).arguments("poses"))
     given = configure_robot(str(EXAMPLE), str(JOINTS), end_effector="tool")
@@ -84,21 +104,28 @@ def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None
     for config in (again, tried_again):
         assert config.joints == given.joints
         assert config.robot.end_effector == given.robot.end_effector
-    softer = configure_robot(**robot_arguments(Robot(model=str(folder / "robot.yaml"), stiffness=300.0)))
+    softer = configure_robot(
+        **robot_arguments(Robot(model=str(folder / "robot.yaml"), stiffness=300.0))
+    )
     assert {joint.stiffness for joint in softer.joints.values()} == {300.0}
 
 
 def at_rest(model: mujoco.MjModel, stiffness: Array, theta: Array) -> Array:
-    """Where links rest, by MuJoCo's own springs about the command and Newton's method on its forces."""
-    q, data = theta.copy(), mujoco.MjData(model)
+    """Where links rest, by MuJoCo's own springs about the command and Newton's method on its
+    forces."""
+    q = theta.copy()
+    data = mujoco.MjData(model)
 
     def unbalanced(at: Array) -> Array:
-        data.qpos[:], data.qvel[:] = at, 0.0
+        data.qpos[:] = at
+        data.qvel[:] = 0.0
         mujoco.mj_forward(model, data)
         return stiffness * (theta - at) - data.qfrc_bias
 
     for _ in range(20):
-        slope = np.array([(unbalanced(q + h) - unbalanced(q - h)) / 2e-6 for h in 1e-6 * np.eye(len(q))]).T
+        slope = np.array(
+            [(unbalanced(q + h) - unbalanced(q - h)) / 2e-6 for h in 1e-6 * np.eye(len(q))]
+        ).T
         q -= np.linalg.solve(slope, unbalanced(q))
     return q
 
@@ -116,32 +143,42 @@ def arm(**arguments: object) -> JointPlant:
 
 
 def test_shares_are_finite_differences_of_mujoco() -> None:
-    """Catches a column of another joint, a deflection of the wrong sign, and shares that do not add up."""
-    plant, step = arm(), 1e-4
-    model, names = plant.true.rigid, plant.joint_names
-    parts, errors = [], []
+    """Catches a column of another joint, a deflection of the wrong sign, and shares that do not
+    add up."""
+    plant = arm()
+    step = 1e-4
+    model = plant.true.rigid
+    names = plant.joint_names
+    parts = []
+    errors = []
     for q_ref in rest_poses(plant):
         bent = at_rest(model, plant.true.stiffness, q_ref) - q_ref
         columns = [
-            tool_at(model, q_ref + step * e) - tool_at(model, q_ref - step * e) for e in bent * np.eye(len(bent))
+            tool_at(model, q_ref + step * e) - tool_at(model, q_ref - step * e)
+            for e in bent * np.eye(len(bent))
         ]
         parts.append(np.array(columns) / (2.0 * step))
         errors.append(parts[-1].sum(axis=0))
     shares = joint_shares(plant)
     assert [one.joint for one in shares] == names
     alone = np.sqrt(np.mean(np.sum(np.square(parts), axis=2), axis=0))
-    np.testing.assert_allclose([one.end_effector_rms_m for one in shares], alone, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        [one.end_effector_rms_m for one in shares], alone, rtol=1e-6, atol=1e-9
+    )
     explained = np.einsum("pji,pi->j", parts, errors) / np.sum(np.square(errors))
     np.testing.assert_allclose([one.share for one in shares], explained, atol=1e-7)
     assert sum(one.share for one in shares) == pytest.approx(1.0)
 
 
 def test_the_robot_of_the_readme_is_what_its_command_plays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a name that the command does not know, and a robot that its servos or springs cannot hold."""
+    """Catches a name that the command does not know, and a robot that its servos or springs
+    cannot hold."""
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     (name,) = re.findall(r"&& elastic robot (\w+)$", readme, flags=re.MULTILINE)
     for function in (gallery_file, gallery_robot, gallery_joints):
-        monkeypatch.setattr(f"train.commands.robot.{function.__name__}", partial(function, folder=FOLDER))
+        monkeypatch.setattr(
+            f"train.commands.robot.{function.__name__}", partial(function, folder=FOLDER)
+        )
     config = configure_robot(**robot_arguments(Robot(model=name)), reference=SEVERAL)
     shares = joint_shares(config.robot.plant(config))
     assert len(shares) == 7
@@ -159,7 +196,10 @@ def test_a_joint_without_weight_has_no_share() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["nowhere.urdf", "--stiffness", "900"], "give a file of MJCF.*or a robot of the gallery: panda"),
+        (
+            ["nowhere.urdf", "--stiffness", "900"],
+            "give a file of MJCF.*or a robot of the gallery: panda",
+        ),
         ([str(EXAMPLE)], "needs? .*stiffness|gives no joint its stiffness K"),
         ([str(EXAMPLE), "--stiffness", "nowhere.yaml"], "nowhere.yaml"),
         ([str(EXAMPLE), "--stiffness", "0"], "stiffness must be > 0"),
@@ -169,7 +209,11 @@ def test_a_joint_without_weight_has_no_share() -> None:
     ],
 )
 def test_a_wrong_input_says_what_to_do(
-    given: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    given: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Catches a traceback, and a folder that is left behind by what could not begin."""
     monkeypatch.chdir(tmp_path)
@@ -181,7 +225,8 @@ def test_a_wrong_input_says_what_to_do(
 
 
 def test_a_robot_of_the_gallery_brings_its_assumed_joints() -> None:
-    """Catches joints of another robot, a home that is lost, and the tip of the end effector that is not placed."""
+    """Catches joints of another robot, a home that is lost, and the tip of the end effector that
+    is not placed."""
     config = configure_robot(**robot_arguments(Robot(model="pusher")))
     for name, joint in gallery_joints("pusher").items():
         assert isinstance(config.joints[name], ElasticJoint)

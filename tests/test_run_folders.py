@@ -26,7 +26,8 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
     """Catches a free name that is looked up first and taken later."""
-    barrier, found = threading.Barrier(30), list[Path]()
+    barrier = threading.Barrier(30)
+    found = list[Path]()
 
     def begin() -> None:
         barrier.wait()
@@ -41,7 +42,9 @@ def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
     assert all(folder.is_dir() for folder in found)
 
 
-@pytest.mark.parametrize("name", ["../../elsewhere", "/tmp/elsewhere", "..", ".", "", "a/b", "a\\b", "a\0b"])
+@pytest.mark.parametrize(
+    "name", ["../../elsewhere", "/tmp/elsewhere", "..", ".", "", "a/b", "a\\b", "a\0b"]
+)
 def test_a_name_leads_nowhere_else(name: str, tmp_path: Path) -> None:
     """Catches a configuration that writes outside of runs."""
     with pytest.raises(ConfigurationError, match="name must be the name of a folder in runs"):
@@ -61,7 +64,9 @@ def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
         free_folder("x")
 
 
-def test_a_run_that_cannot_be_described_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_run_that_cannot_be_described_leaves_no_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Catches a folder with a configuration alone, where the disk got full behind it."""
     monkeypatch.setattr("train.runs.folders.write_whole", full_at("metadata.json"))
     with pytest.raises(OSError, match="No space"):
@@ -91,15 +96,21 @@ with lock_run(Path(sys.argv[1])):
 
 
 def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -> None:
-    """Catches two --resume of one run at once, a lock that outlives its program, and one that nobody waits for."""
+    """Catches two --resume of one run at once, a lock that outlives its program, and one that
+    nobody waits for."""
     with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", HOLD, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
         cwd=Path(__file__).parents[1],
-    ) as other:  # fmt: skip
+    ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with (
-            pytest.raises(ConfigurationError, match=f"another program, process {other.pid} of .*, works on"),
+            pytest.raises(
+                ConfigurationError, match=f"another program, process {other.pid} of .*, works on"
+            ),
             lock_run(tmp_path),
         ):
             pass
@@ -120,11 +131,14 @@ def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -
 
 
 def mark_when_imported(folder: Path) -> Path:
-    """A module and a package, `evil` and `evil_room.inner`, whose import leaves a mark: the file of it."""
+    """A module and a package, `evil` and `evil_room.inner`, whose import leaves a mark: the file
+    of it."""
     mark = folder / "ran"
     for name in ("evil.py", "residual:evil.py", "evil_room/__init__.py", "evil_room/inner.py"):
         (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(f"open({str(mark)!r}, 'w')\nROBOT = make = Algorithm = lambda env: None\n")
+        (folder / name).write_text(
+            f"open({str(mark)!r}, 'w')\nROBOT = make = Algorithm = lambda env: None\n"
+        )
     return mark
 
 
@@ -136,11 +150,14 @@ CODE = ["evil.py:make", "evil:make", "evil_room.inner:make", "./evil.py:make"]
 def test_a_training_that_is_resumed_runs_no_code_of_its_folder(
     field: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a folder from elsewhere whose algorithm, robot or base lies beside its configuration."""
+    """Catches a folder from elsewhere whose algorithm, robot or base lies beside its
+    configuration."""
     monkeypatch.syspath_prepend(str(tmp_path))
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text(f"{field}: '{code}'\n")
-    with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code|must be no residual"):
+    with pytest.raises(
+        ConfigurationError, match=r"whose code would run.*--trust-code|must be no residual"
+    ):
         resume([tmp_path], Console(quiet=True))
     assert not mark.exists()
 
@@ -158,7 +175,8 @@ FIELDS = {
 def test_a_comparison_that_is_resumed_runs_no_code_of_its_folder(
     field: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches an import while the configuration is read, before anybody asked whether the folder is trusted."""
+    """Catches an import while the configuration is read, before anybody asked whether the folder
+    is trusted."""
     monkeypatch.syspath_prepend(str(tmp_path))
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text(f"name: x\n{FIELDS[field].format(code)}\n")
@@ -167,7 +185,9 @@ def test_a_comparison_that_is_resumed_runs_no_code_of_its_folder(
     assert not mark.exists()
 
 
-def test_a_robot_that_is_called_like_a_residual_is_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_is_called_like_a_residual_is_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches an exception for policies in folders that holds for other fields too."""
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\nenv: 'residual:evil.py:ROBOT'\n")
@@ -183,9 +203,12 @@ def test_a_comparison_that_is_trusted_runs_its_code(tmp_path: Path) -> None:
     assert recorded_config(tmp_path, trust_code=True).policies[0].name == "evil.py:make"
 
 
-@pytest.mark.parametrize("place", ["summary.md", "cells", "cells/x.npz", ".lock", "config.yaml", "seed_0/best.new"])
+@pytest.mark.parametrize(
+    "place", ["summary.md", "cells", "cells/x.npz", ".lock", "config.yaml", "seed_0/best.new"]
+)
 def test_a_run_with_a_link_out_of_it_is_not_gone_on_with(place: str, tmp_path: Path) -> None:
-    """Catches files of the user's that are overwritten, locked or read through a run from elsewhere."""
+    """Catches files of the user's that are overwritten, locked or read through a run from
+    elsewhere."""
     run = tmp_path / "run"
     (run / place).parent.mkdir(parents=True)
     mine = tmp_path / "mine"
@@ -214,12 +237,16 @@ def test_a_broken_table_of_a_training_is_one_sentence(text: str, tmp_path: Path)
     (tmp_path / "seed_0" / "last").mkdir(parents=True)
     (tmp_path / "seed_0" / "progress.csv").write_text(text)
     (tmp_path / "config.yaml").write_text("name: x\n")
-    with pytest.raises(ConfigurationError, match=r"progress\.csv (must be the table of a training|has no evaluations)"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"progress\.csv (must be the table of a training|has no evaluations)",
+    ):
         resume([tmp_path], Console(quiet=True))
 
 
 def test_a_run_may_be_a_link_and_have_links_to_itself(tmp_path: Path) -> None:
-    """Catches a refusal of runs/latest, and of a best policy that is a link to one of the run's own."""
+    """Catches a refusal of runs/latest, and of a best policy that is a link to one of the run's
+    own."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.yaml").write_text("name: x\n")
     (tmp_path / "run" / "best").symlink_to("last")
@@ -239,15 +266,20 @@ def test_a_lock_is_a_file_of_its_own(kind: str, tmp_path: Path) -> None:
         "pipe": lambda: os.mkfifo(lock),
         "folder": lock.mkdir,
     }[kind]()
-    with pytest.raises(ConfigurationError, match="must be a plain file with one name"), lock_run(tmp_path):
+    with (
+        pytest.raises(ConfigurationError, match="must be a plain file with one name"),
+        lock_run(tmp_path),
+    ):
         pass
     assert mine.read_text() == "mine"
 
 
 @pytest.mark.parametrize("link", ["symbolic", "hard"])
 def test_a_file_is_written_in_the_place_of_a_link(link: str, tmp_path: Path) -> None:
-    """Catches a writer that follows a link, at the file or beside it, and one that keeps the group from reading."""
-    mine, summary = tmp_path / "mine", tmp_path / "summary.md"
+    """Catches a writer that follows a link, at the file or beside it, and one that keeps the
+    group from reading."""
+    mine = tmp_path / "mine"
+    summary = tmp_path / "summary.md"
     mine.write_text("mine")
     for path in (summary, tmp_path / f".summary.md.{os.getpid()}.new"):
         (path.symlink_to if link == "symbolic" else path.hardlink_to)(mine)
@@ -262,8 +294,11 @@ def test_a_file_is_written_in_the_place_of_a_link(link: str, tmp_path: Path) -> 
 
 
 def test_a_file_is_read_within_its_bounds(tmp_path: Path) -> None:
-    """Catches a pipe that is waited for, a device without an end, and a large file that is read to be refused."""
-    file, pipe, link = tmp_path / "file", tmp_path / "pipe", tmp_path / "link"
+    """Catches a pipe that is waited for, a device without an end, and a large file that is read
+    to be refused."""
+    file = tmp_path / "file"
+    pipe = tmp_path / "pipe"
+    link = tmp_path / "link"
     file.write_bytes(b"12345")
     os.mkfifo(pipe)
     link.symlink_to("/dev/zero")

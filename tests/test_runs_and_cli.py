@@ -1,4 +1,5 @@
-"""Result folders, comparisons and the command `elastic`: what they write, and how they refuse bad input."""
+"""Result folders, comparisons and the command `elastic`: what they write, and how they refuse
+bad input."""
 
 import csv
 import json
@@ -46,11 +47,23 @@ from train.runs.warned import each_once, said_so_far
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
-MULTISINE = {"kind": "multisine", "amplitude": 0.05, "middle": 0.2, "duration_s": 0.2, "onset_s": 0.3}
+MULTISINE = {
+    "kind": "multisine",
+    "amplitude": 0.05,
+    "middle": 0.2,
+    "duration_s": 0.2,
+    "onset_s": 0.3,
+}
 HOLD = {
-    "kind": "hold", "positions": 5, "lower": -0.3, "upper": 0.3, "rate": 0.8, "shortest_move_s": 0.3, "settle_s": 0.05,
+    "kind": "hold",
+    "positions": 5,
+    "lower": -0.3,
+    "upper": 0.3,
+    "rate": 0.8,
+    "shortest_move_s": 0.3,
+    "settle_s": 0.05,
     "measure_s": 0.05,
-}  # fmt: skip
+}
 COMMAND_SINE = "{kind: sine, amplitude: 0.05, duration_s: 0.3, onset_s: 0.2}"
 
 
@@ -61,7 +74,11 @@ def condition(policy: str = "input", reference: Any = None, **values: Any) -> Co
 
 def files_of(folder: Path) -> dict[str, bytes]:
     """Contents of all files under a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -106,7 +123,9 @@ def test_records_depend_neither_on_threads_nor_on_the_other_episodes() -> None:
     multi = {"reference": MULTISINE, "seed": 5, "scenario": "sensor"}
     together = evaluate(condition(**multi, episodes=3), num_threads=2)
     single_thread = evaluate(condition(**multi, episodes=3), num_threads=1)
-    alone = [evaluate(condition(**{**multi, "seed": 5 + i}), num_threads=1).episodes[0] for i in range(3)]
+    alone = [
+        evaluate(condition(**{**multi, "seed": 5 + i}), num_threads=1).episodes[0] for i in range(3)
+    ]
     assert together.episodes == single_thread.episodes == alone
     assert [episode["seed"] for episode in alone] == [5, 6, 7]
     assert len({episode["link_error_rms_rad"] for episode in alone}) == 3
@@ -123,21 +142,36 @@ def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.M
 
 
 def test_record_names_its_cell_and_agrees_with_its_trace() -> None:
-    """Catches metrics of another world or another window, and signals out of step with their time."""
+    """Catches metrics of another world or another window, and signals out of step with their
+    time."""
     result = evaluate(condition("uncompensated", scenario="ideal"), num_threads=1)
-    record, trace = result.episodes[0], result.trace
-    named = {"policy": "uncompensated", "scenario": "ideal", "reference": "sine", "seed": 0, "termination": ""}
+    record = result.episodes[0]
+    trace = result.trace
+    named = {
+        "policy": "uncompensated",
+        "scenario": "ideal",
+        "reference": "sine",
+        "seed": 0,
+        "termination": "",
+    }
     assert {key: record[key] for key in named} == named
     scored = trace["time_s"] > 1.2 + 1e-9
-    assert record["link_error_rms_rad"] == pytest.approx(np.sqrt(np.mean(trace["link_error"][scored] ** 2)), rel=1e-12)
+    assert record["link_error_rms_rad"] == pytest.approx(
+        np.sqrt(np.mean(trace["link_error"][scored] ** 2)), rel=1e-12
+    )
     np.testing.assert_allclose(trace["time_s"], np.arange(376) * 0.004, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(trace["reference_angle"] - trace["link_angle"], trace["link_error"], atol=1e-15)
+    np.testing.assert_allclose(
+        trace["reference_angle"] - trace["link_angle"], trace["link_error"], atol=1e-15
+    )
 
 
 def test_error_of_the_estimate_is_that_of_the_policy() -> None:
-    """Catches an estimate scored at another time than the truth: the error of the encoder is the deflection."""
+    """Catches an estimate scored at another time than the truth: the error of the encoder is the
+    deflection."""
     plain = evaluate(condition("uncompensated", scenario="ideal"), num_threads=1)
-    seen = plain.trace["deflection"][plain.trace["time_s"] > 1.2 + 1e-9][:-1]  # no policy sees the last state
+    seen = plain.trace["deflection"][plain.trace["time_s"] > 1.2 + 1e-9][
+        :-1
+    ]  # no policy sees the last state
     error = plain.episodes[0]["link_estimate_error_rms_rad"]
     assert error == pytest.approx(np.sqrt(np.mean(seen**2)), rel=1e-12)
     oracle = evaluate(condition("oracle", scenario="ideal"), num_threads=1).episodes[0]
@@ -145,14 +179,18 @@ def test_error_of_the_estimate_is_that_of_the_policy() -> None:
 
 
 def test_static_points_of_an_evaluation_are_those_of_the_first_world() -> None:
-    """Catches points averaged over worlds or windows, and references in the order of another sweep."""
+    """Catches points averaged over worlds or windows, and references in the order of another
+    sweep."""
     cell = condition("uncompensated", HOLD, scenario="ideal", env_options={"stiffness": 3000.0})
-    one, three = evaluate(cell, num_threads=1), evaluate(cell.replace(episodes=3), num_threads=1)
+    one = evaluate(cell, num_threads=1)
+    three = evaluate(cell.replace(episodes=3), num_threads=1)
     assert one.points is not None
     assert three.points is not None
     np.testing.assert_array_equal(one.points.theta, three.points.theta)
     assert len(one.points) == len(one.rest_references) == 10
-    np.testing.assert_allclose(one.points.theta, one.rest_references, rtol=0.0, atol=0.01)  # on the move
+    np.testing.assert_allclose(
+        one.points.theta, one.rest_references, rtol=0.0, atol=0.01
+    )  # on the move
 
 
 class Constant:
@@ -161,7 +199,13 @@ class Constant:
     def __init__(self, offset: float) -> None:
         self._offset = offset
 
-    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ):
         """The offset, for every world."""
         return np.full((*observation.shape[:-1], 1), self._offset), state
 
@@ -172,7 +216,8 @@ def constant(env: Any, offset: float = 0.1) -> Constant:
 
 
 def test_ones_own_policy_is_evaluated_like_a_baseline() -> None:
-    """Catches a protocol that asks for more than `predict`: no estimate, no base class, options handed on."""
+    """Catches a protocol that asks for more than `predict`: no estimate, no base class, options
+    handed on."""
     spec = PolicySpec(name=f"{__name__}:constant", label="mine", options={"offset": 0.0})
     own = evaluate(Condition(policy=spec, reference=SINE), num_threads=1).episodes[0]
     zero = evaluate(condition("zero"), num_threads=1).episodes[0]
@@ -183,7 +228,8 @@ def test_ones_own_policy_is_evaluated_like_a_baseline() -> None:
 
 
 def test_the_command_finds_ones_own_policy_in_the_current_folder() -> None:
-    """Catches a console script that looks for modules beside itself, so that nobody's own policy is found."""
+    """Catches a console script that looks for modules beside itself, so that nobody's own policy
+    is found."""
     Path("mine.py").write_text("def make(env):\n    return 'found'\n")
     command = [str(Path(sys.executable).with_name("elastic")), "evaluate", "--policy", "mine:make"]
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
@@ -204,7 +250,9 @@ def test_a_taken_name_gets_the_next_free_number() -> None:
     """Catches results that overwrite those of the run before."""
     folders = [new_run("name", {"number": i}, seed=i) for i in range(3)]
     assert folders == [Path("runs/name"), Path("runs/name-2"), Path("runs/name-3")]
-    assert [yaml.safe_load((folder / "config.yaml").read_text())["number"] for folder in folders] == [0, 1, 2]
+    assert [
+        yaml.safe_load((folder / "config.yaml").read_text())["number"] for folder in folders
+    ] == [0, 1, 2]
 
 
 def test_metadata_says_seed_versions_and_commit() -> None:
@@ -252,37 +300,56 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """Two policies, two episodes, in processes of their own."""
     root = tmp_path_factory.mktemp("compare")
     content = {
-        "name": "small", "references": [MULTISINE], "scenarios": ["soft"],
-        "policies": ["uncompensated", {"name": "input", "label": "newton", "options": {"output": "newton"}}],
-        "episodes": 2, "seed": 3, "env_options": {"stiffness": 900},
-    }  # fmt: skip
+        "name": "small",
+        "references": [MULTISINE],
+        "scenarios": ["soft"],
+        "policies": [
+            "uncompensated",
+            {"name": "input", "label": "newton", "options": {"output": "newton"}},
+        ],
+        "episodes": 2,
+        "seed": 3,
+        "env_options": {"stiffness": 900},
+    }
     (root / "small.yaml").write_text(yaml.safe_dump(content))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
-        console = Console(width=200, record=True, quiet=False, file=(root / "printed.txt").open("w"))
+        console = Console(
+            width=200, record=True, quiet=False, file=(root / "printed.txt").open("w")
+        )
         patch.setattr("train.commands.cli.CONSOLE", console)
         main(["compare", "small.yaml", "--jobs", "2"])
         console.file.close()
     return Compared(
-        root / "runs" / "small", load_yaml(root / "small.yaml", CompareConfig), (root / "printed.txt").read_text()
+        root / "runs" / "small",
+        load_yaml(root / "small.yaml", CompareConfig),
+        (root / "printed.txt").read_text(),
     )
 
 
 def test_compare_writes_one_row_per_episode_with_every_metric(compared: Compared) -> None:
-    """Catches rows or columns that are lost, and results that depend on running in a process of their own."""
+    """Catches rows or columns that are lost, and results that depend on running in a process of
+    their own."""
     rows = rows_of(compared.folder / "episodes.csv")
     cells = [(row["policy"], row["scenario"], row["reference"], row["seed"]) for row in rows]
     assert cells == [
-        (policy, "soft", "multisine", seed) for policy in ("uncompensated", "newton") for seed in ("3", "4")
+        (policy, "soft", "multisine", seed)
+        for policy in ("uncompensated", "newton")
+        for seed in ("3", "4")
     ]
     assert {metric.name for metric in METRICS} <= rows[0].keys()
     assert {"termination", "diverged", "link_estimate_error_rms_rad"} <= rows[0].keys()
-    expected = [episode for cell in compared.config.conditions() for episode in evaluate(cell, num_threads=1).episodes]
+    expected = [
+        episode
+        for cell in compared.config.conditions()
+        for episode in evaluate(cell, num_threads=1).episodes
+    ]
     assert rows == [{key: str(value) for key, value in episode.items()} for episode in expected]
 
 
 def test_compare_leaves_configuration_and_origin_beside_its_results(compared: Compared) -> None:
-    """Catches a configuration that is not the resolved one: read again, it must be the same comparison."""
+    """Catches a configuration that is not the resolved one: read again, it must be the same
+    comparison."""
     assert load_yaml(compared.folder / "config.yaml", CompareConfig) == compared.config
     assert json.loads((compared.folder / "metadata.json").read_text())["seed"] == 3
 
@@ -297,9 +364,13 @@ def test_compare_summarises_every_cell(compared: Compared) -> None:
         values = [float(row["link_error_rms_rad"]) for row in rows if row["policy"] == policy]
         median = f"{1e3 * np.median(values):.2f}"
         assert median not in [f"{1e3 * value:.2f}" for value in values]
-        assert line.startswith(f"| multisine | soft | {policy} | {median} ({1e3 * max(values):.2f}) |")
+        assert line.startswith(
+            f"| multisine | soft | {policy} | {median} ({1e3 * max(values):.2f}) |"
+        )
         assert line.endswith("| 0/2 |")
-        assert any(policy in printed and median in printed for printed in compared.printed.splitlines())
+        assert any(
+            policy in printed and median in printed for printed in compared.printed.splitlines()
+        )
 
 
 def test_compare_draws_figures_that_open_and_names_its_files(compared: Compared) -> None:
@@ -320,7 +391,12 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
     names = ("link_error_rms_rad", "link_error_peak_rad")
     episodes = [
         {"termination": reason, **dict.fromkeys(names, value)}
-        for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
+        for reason, value in (
+            ("", 0.001),
+            ("diverged", 9.0),
+            ("", 0.003),
+            ("diverged", float("nan")),
+        )
     ]
     table = Console(width=160, record=True, file=StringIO())
     train.report.summary.print_summary([Evaluation(condition(), episodes)], table)
@@ -335,9 +411,21 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
 
 
 @pytest.mark.usefixtures("in_process")
-def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Catches results that are overwritten: `elastic evaluate` twice, one after the other."""
-    arguments = ["evaluate", "--policy", "input", "--reference", COMMAND_SINE, "--episodes", "2", "--seed", "6"]
+    arguments = [
+        "evaluate",
+        "--policy",
+        "input",
+        "--reference",
+        COMMAND_SINE,
+        "--episodes",
+        "2",
+        "--seed",
+        "6",
+    ]
     main(arguments)
     first = files_of(Path("runs/evaluate"))
     main(arguments)
@@ -350,7 +438,8 @@ def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(capsys: pytes
 
 @pytest.mark.usefixtures("in_process")
 def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
-    """Catches an option that is read and forgotten: a policy that believes in 2 K compensates half the deflection."""
+    """Catches an option that is read and forgotten: a policy that believes in 2 K compensates
+    half the deflection."""
     Path("identification.json").write_text('{"stiffness_nm_per_rad": 2002.0}')
     reference = "{kind: sine, middle: 0.5, amplitude: 0.005, duration_s: 0.1, onset_s: 0.2}"
     arguments = ["evaluate", "--reference", reference, "--scenario", "ideal"]
@@ -359,7 +448,9 @@ def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
     for more in ([], ["--policy", "uncompensated"]):
         main([*arguments, *more])
     folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4", "evaluate-5"]
-    rms = [float(rows_of(Path("runs") / f / "episodes.csv")[0]["link_error_rms_rad"]) for f in folders]
+    rms = [
+        float(rows_of(Path("runs") / f / "episodes.csv")[0]["link_error_rms_rad"]) for f in folders
+    ]
     assert rms[0] == rms[1] == rms[2]
     assert rms[0] == pytest.approx(0.5 * rms[4], rel=0.05)
     assert rms[3] < 0.05 * rms[4]
@@ -367,8 +458,13 @@ def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
 
 @pytest.mark.usefixtures("in_process")
 def test_two_references_of_one_kind_stay_apart() -> None:
-    """Catches the second sine's figure written over the first's, and rows of which nobody can say whose they are."""
-    content = {"name": "two", "references": [SINE, {**SINE, "frequency_hz": 0.5}], "policies": ["zero"]}
+    """Catches the second sine's figure written over the first's, and rows of which nobody can
+    say whose they are."""
+    content = {
+        "name": "two",
+        "references": [SINE, {**SINE, "frequency_hz": 0.5}],
+        "policies": ["zero"],
+    }
     Path("two.yaml").write_text(yaml.safe_dump(content))
     main(["compare", "two.yaml"])
     assert len(list(Path("runs/two").glob("time_*.png"))) == 2
@@ -399,9 +495,15 @@ def test_output_that_holds_results_is_refused_before_the_work(
 # Bad input: exit code 2, what is wrong, and what exists.
 
 CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
-    "key": ({"name": "c", "polices": ["input"]}, ["'polices'", "policies", "scenarios", "episodes"]),
+    "key": (
+        {"name": "c", "polices": ["input"]},
+        ["'polices'", "policies", "scenarios", "episodes"],
+    ),
     "policy": ({"name": "c", "policies": ["inptu"]}, ["'inptu'", "input", "dynamic", "oracle"]),
-    "policy key": ({"name": "c", "policies": [{"name": "input", "lable": "x"}]}, ["'lable'", "label", "options"]),
+    "policy key": (
+        {"name": "c", "policies": [{"name": "input", "lable": "x"}]},
+        ["'lable'", "label", "options"],
+    ),
     "policy option": (
         {"name": "c", "policies": [{"name": "input", "options": {"stifness": 3}}]},
         ["'stifness'", "stiffness", "ramp_s"],
@@ -409,10 +511,14 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "scenario": ({"name": "c", "scenarios": ["sof"]}, ["'sof'", "soft", "nominal", "backlash"]),
     "reference": ({"name": "c", "references": ["sin"]}, ["'sin'", "sine", "hold", "steps"]),
     "reference key": (
-        {"name": "c", "references": [{"kind": "sine", "hz": 1}]}, ["'hz'", "frequency_hz", "amplitude"]
+        {"name": "c", "references": [{"kind": "sine", "hz": 1}]},
+        ["'hz'", "frequency_hz", "amplitude"],
     ),
     "environment": ({"name": "c", "env": "tesbed"}, ["'tesbed'", "testbed", "walker"]),
-    "environment option": ({"name": "c", "env_options": {"stifness": 3}}, ["'stifness'", "stiffness", "pendulum"]),
+    "environment option": (
+        {"name": "c", "env_options": {"stifness": 3}},
+        ["'stifness'", "stiffness", "pendulum"],
+    ),
     "no name": ({"policies": ["input"]}, ["name"]),
     "no policies": ({"name": "c", "policies": []}, ["policies"]),
     "twice": ({"name": "c", "policies": ["input", "input"]}, ["two policies", "'input'", "label"]),
@@ -420,37 +526,64 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "no scenarios": ({"name": "c", "scenarios": []}, ["scenarios"]),
     "negative": ({"name": "c", "episodes": -1}, ["episodes", ">= 1", "-1"]),
     "policy's environment option": (
-        {"name": "c", "policies": [{"name": "zero", "env_options": {"from": "rigid"}}]}, ["'from'", "form", "stiffness"]
+        {"name": "c", "policies": [{"name": "zero", "env_options": {"from": "rigid"}}]},
+        ["'from'", "form", "stiffness"],
     ),
-    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period cannot", "key", "of its own"]),
+    "reserved option": (
+        {"name": "c", "env_options": {"step_period": 3}},
+        ["step_period cannot", "key", "of its own"],
+    ),
     "reserved parameter": (
         {"name": "c", "env": "walker", "references": [{"step_period": 3, "scenario": "ideal"}]},
         ["references.0: scenario cannot be part of a reference; it has a key"],
     ),
     "unplaced parameter": (
-        {"name": "c", "references": [{"kind": "sine", "num_envs": 3}]}, ["num_envs cannot", "set it themselves"]
+        {"name": "c", "references": [{"kind": "sine", "num_envs": 3}]},
+        ["num_envs cannot", "set it themselves"],
     ),
     "no reference": ({"name": "c", "references": [None]}, ["reference", "name", "mapping", "None"]),
-    "policy of the figures": ({"name": "c", "figure_policies": ["inptu"]}, ["'inptu'", "uncompensated", "input"]),
-    "scenario with episodes": ({"name": "c", "scenario_episodes": {"ideal": 1}}, ["'ideal'", "nominal"]),
-    "no episodes": ({"name": "c", "scenario_episodes": {"nominal": 0}}, ["scenario_episodes", "nominal", ">= 1", "0"]),
+    "policy of the figures": (
+        {"name": "c", "figure_policies": ["inptu"]},
+        ["'inptu'", "uncompensated", "input"],
+    ),
+    "scenario with episodes": (
+        {"name": "c", "scenario_episodes": {"ideal": 1}},
+        ["'ideal'", "nominal"],
+    ),
+    "no episodes": (
+        {"name": "c", "scenario_episodes": {"nominal": 0}},
+        ["scenario_episodes", "nominal", ">= 1", "0"],
+    ),
     "sweep": ({"name": "c", "sweep": {"option": "stiffness_scale", "values": [1]}}, ["values"]),
-    "sweep key": ({"name": "c", "sweep": {"options": "x", "values": [1, 2]}}, ["'options'", "option"]),
+    "sweep key": (
+        {"name": "c", "sweep": {"options": "x", "values": [1, 2]}},
+        ["'options'", "option"],
+    ),
     "swept option": (
-        {"name": "c", "sweep": {"option": "stiffnes", "values": [1, 2]}}, ["'stiffnes'", "stiffness_scale"]
+        {"name": "c", "sweep": {"option": "stiffnes", "values": [1, 2]}},
+        ["'stiffnes'", "stiffness_scale"],
     ),
     "swept in vain": (
         {"name": "c", "sweep": {"option": "stiffness_scale", "values": [1, 2]}},
-        ["'uncompensated' of the testbed does not use stiffness_scale", "it has no options", "level: true"],
+        [
+            "'uncompensated' of the testbed does not use stiffness_scale",
+            "it has no options",
+            "level: true",
+        ],
     ),
-    "stiffness": ({"name": "c", "env_options": {"stiffness": -3}}, ["stiffness", "> 0", "[N·m/rad]", "-3"]),
+    "stiffness": (
+        {"name": "c", "env_options": {"stiffness": -3}},
+        ["stiffness", "> 0", "[N·m/rad]", "-3"],
+    ),
     "no mapping": (["input"], ["mapping", "list"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize("case", CONFIGURATIONS)
-def test_wrong_configuration_says_what_and_which_choices(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_configuration_says_what_and_which_choices(
+    case: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches a key or a name that is ignored, a traceback, and a result folder left behind."""
     content, words = CONFIGURATIONS[case]
     Path("c.yaml").write_text(yaml.safe_dump(content))
@@ -460,42 +593,81 @@ def test_wrong_configuration_says_what_and_which_choices(case: str, capsys: pyte
 
 
 COMMANDS: dict[str, tuple[list[str], list[str]]] = {
-    "policy": (["evaluate", "--policy", "inptu"], ["'inptu'", "uncompensated", "input", "dynamic", "oracle"]),
+    "policy": (
+        ["evaluate", "--policy", "inptu"],
+        ["'inptu'", "uncompensated", "input", "dynamic", "oracle"],
+    ),
     "module": (["evaluate", "--policy", "nowhere:f"], ["nowhere", "input", "module:function"]),
     "function": (["evaluate", "--policy", "math:nothing"], ["nothing", "input", "module:function"]),
-    "no policy": (["evaluate", "--policy", f"{__name__}:condition_of"], ["condition_of", "predict()"]),
+    "no policy": (
+        ["evaluate", "--policy", f"{__name__}:condition_of"],
+        ["condition_of", "predict()"],
+    ),
     "no function": (["evaluate", "--policy", "math:pi"], ["'math:pi'", "float", "module:function"]),
     "no module": (["evaluate", "--policy", ":x"], ["':x'", "module:function"]),
     "no attribute": (["evaluate", "--policy", "math:"], ["'math:'", "module:function"]),
-    "relative module": (["play", "--policy", ".x:f", "--video", "x.gif"], ["'.x:f'", "module:function"]),
-    "scenario": (["evaluate", "--scenario", "sof"], ["'sof'", "ideal", "nominal", "soft", "payload", "sensor"]),
+    "relative module": (
+        ["play", "--policy", ".x:f", "--video", "x.gif"],
+        ["'.x:f'", "module:function"],
+    ),
+    "scenario": (
+        ["evaluate", "--scenario", "sof"],
+        ["'sof'", "ideal", "nominal", "soft", "payload", "sensor"],
+    ),
     "ground": (["evaluate", "--scenario", "soft+ideal"], ["'ideal'", "first"]),
-    "reference": (["evaluate", "--reference", "sin"], ["'sin'", "hold", "sine", "multisine", "steps"]),
+    "reference": (
+        ["evaluate", "--reference", "sin"],
+        ["'sin'", "hold", "sine", "multisine", "steps"],
+    ),
     "reference key": (["evaluate", "--reference", "{kind: sine, hz: 3}"], ["'hz'", "frequency_hz"]),
     "reference text": (["evaluate", "--reference", "{kind: sine"], ["{kind: sine"]),
-    "unit": (["evaluate", "--reference", "{kind: sine, amplitude: -1}"], ["amplitude", "> 0", "[rad]", "-1"]),
-    "infeasible": (["evaluate", "--reference", "{kind: sine, frequency_hz: 9}"], ["84.0 N·m", "amplitude"]),
+    "unit": (
+        ["evaluate", "--reference", "{kind: sine, amplitude: -1}"],
+        ["amplitude", "> 0", "[rad]", "-1"],
+    ),
+    "infeasible": (
+        ["evaluate", "--reference", "{kind: sine, frequency_hz: 9}"],
+        ["84.0 N·m", "amplitude"],
+    ),
     "environment": (["evaluate", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
-    "walk": (["evaluate", "--env", "walker", "--reference", "5"], ["step_period", "24, 3, 1.6, 1.1", "5"]),
-    "walk mapping": (["evaluate", "--env", "walker", "--reference", "{steps: 2}"], ["'step_period'", "num_steps"]),
+    "walk": (
+        ["evaluate", "--env", "walker", "--reference", "5"],
+        ["step_period", "24, 3, 1.6, 1.1", "5"],
+    ),
+    "walk mapping": (
+        ["evaluate", "--env", "walker", "--reference", "{steps: 2}"],
+        ["'step_period'", "num_steps"],
+    ),
     "walk argument": (
         ["evaluate", "--env", "walker", "--reference", "{step_period: 3, steps: 2}"],
         ["'steps'", "num_steps", "gait"],
     ),
-    "walk policy": (["evaluate", "--env", "walker", "--policy", "inptu"], ["'inptu'", "input_output", "input_wrench"]),
+    "walk policy": (
+        ["evaluate", "--env", "walker", "--policy", "inptu"],
+        ["'inptu'", "input_output", "input_wrench"],
+    ),
     "episodes": (["evaluate", "--episodes", "0"], ["error: --episodes must be", ">= 1"]),
     "seed": (["evaluate", "--seed", "-1"], ["error: --seed must be", ">= 0", "-1"]),
-    "both": (["evaluate", "--seed", "-1", "--episodes", "0"], ["--episodes must be", "\n--seed must be"]),
+    "both": (
+        ["evaluate", "--seed", "-1", "--episodes", "0"],
+        ["--episodes must be", "\n--seed must be"],
+    ),
     "reserved": (
         ["evaluate", "--env", "walker", "--reference", "{step_period: 3, scenario: ideal}"],
-        ["error: --reference: scenario cannot be part of a reference; it has a key, or an option, of its own"],
+        [
+            "error: --reference: scenario cannot be part of a reference; it has a key, or an"
+            " option, of its own"
+        ],
     ),
     "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
     "assumed list": (
         ["evaluate", "--stiffness", "[1001, 1001]"],
         ["stiffness", "one number or 1", "[N·m/rad]", "(2,)"],
     ),
-    "assumed text": (["evaluate", "--stiffness", "[soft]"], ["stiffness must be numbers", "'soft'"]),
+    "assumed text": (
+        ["evaluate", "--stiffness", "[soft]"],
+        ["stiffness must be numbers", "'soft'"],
+    ),
     "assumed nan": (["evaluate", "--stiffness", "nan"], ["stiffness", "> 0", "nan"]),
     "assumed file": (["evaluate", "--stiffness", "none.json"], ["none.json"]),
     "missing file": (["compare", "none.yaml"], ["none.yaml"]),
@@ -509,14 +681,23 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "identify equal masses": (["identify", "--second-mass", "1"], ["mass"]),
     "play scenario": (["play", "--scenario", "sof", "--video", "x.gif"], ["'sof'", "soft"]),
     "play seed": (["play", "--seed", "-1", "--video", "x.gif"], ["error: --seed must be", "-1"]),
-    "play environment": (["play", "--env", "wlaker", "--video", "x.gif"], ["'wlaker'", "testbed", "walker"]),
+    "play environment": (
+        ["play", "--env", "wlaker", "--video", "x.gif"],
+        ["'wlaker'", "testbed", "walker"],
+    ),
     "play format": (["play", "--video", "x.txt", "--max-s", "0.1"], [".mp4", ".gif", "x.txt"]),
     "play time": (["play", "--video", "x.gif", "--max-s", "-1"], ["max", "-1"]),
     "speed worlds": (["speed", "--num-envs", "0"], ["error: --num-envs must be", "0"]),
     "speed steps": (["speed", "--num-envs", "2", "--steps", "0"], ["steps", "0"]),
     "speed environment": (["speed", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
-    "speed policy": (["speed", "--num-envs", "2", "--policy", "inptu"], ["'inptu'", "input", "oracle"]),
-    "speed rounds": (["speed", "--num-envs", "2", "--steps", "1", "--rounds", "0"], ["rounds", "0"]),
+    "speed policy": (
+        ["speed", "--num-envs", "2", "--policy", "inptu"],
+        ["'inptu'", "input", "oracle"],
+    ),
+    "speed rounds": (
+        ["speed", "--num-envs", "2", "--steps", "1", "--rounds", "0"],
+        ["rounds", "0"],
+    ),
 }
 
 
@@ -524,9 +705,12 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
 def test_wrong_argument_says_what_and_which_choices(
     case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches tracebacks, units that vanish as markup, names that are not listed, and folders left behind."""
+    """Catches tracebacks, units that vanish as markup, names that are not listed, and folders
+    left behind."""
     arguments, words = COMMANDS[case]
-    monkeypatch.setattr("train.commands.identify.identify", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(
+        "train.commands.identify.identify", lambda *_, **__: pytest.fail("the work began")
+    )
     Path("good.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
     message = refused(arguments, capsys)
     assert [word for word in words if word not in message] == []
@@ -551,17 +735,28 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
     ("arguments", "words"),
     [
         (["--help"], ["identify", "evaluate", "compare", "speed", "play"]),
-        (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
+        (
+            ["evaluate", "--help"],
+            ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"],
+        ),
         (["evaluate", "--help"], ["walker", "input_wrench", "step_period", "num_steps", "push"]),
-        (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
+        (
+            ["evaluate", "--help"],
+            ["a list of one per joint", "twelve on the walker", "identification.json"],
+        ),
         (["evaluate", "--help"], [*ON_JOINTS, *ON_THE_WALKER]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
-        (["compare", "--help"], ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"]),
+        (
+            ["compare", "--help"],
+            ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"],
+        ),
         (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
     ],
 )
-def test_help_teaches(arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_teaches(
+    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches a command or an option without explanation."""
     with pytest.raises(SystemExit) as caught:
         main(arguments)
@@ -587,7 +782,9 @@ NAMES = (
 OF_HARDWARE = ("scan", "check", "run", "emulate")
 
 
-@pytest.mark.parametrize("command", [*((name,) for name in NAMES), *(("hardware", name) for name in OF_HARDWARE)])
+@pytest.mark.parametrize(
+    "command", [*((name,) for name in NAMES), *(("hardware", name) for name in OF_HARDWARE)]
+)
 def test_every_command_has_help_and_refuses_what_it_does_not_know(
     command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -607,12 +804,15 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_output_that_nobody_reads_ends_as_by_sigpipe() -> None:
-    """Catches a closed pipe that ends with 1, which is bench's "worse": rich ends the program so by itself."""
+    """Catches a closed pipe that ends with 1, which is bench's "worse": rich ends the program so
+    by itself."""
     elastic = str(Path(sys.executable).with_name("elastic"))
     short = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
     for command in (f"{elastic} --help", f"{elastic} evaluate --reference '{short}'"):
         script = f"{command} | true; echo ${{PIPESTATUS[0]}}"
-        run = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120, check=True)
+        run = subprocess.run(
+            ["bash", "-c", script], capture_output=True, text=True, timeout=120, check=True
+        )
         assert run.stdout == "141\n", run.stderr
         assert "Traceback" not in run.stderr
 
@@ -620,7 +820,9 @@ def test_output_that_nobody_reads_ends_as_by_sigpipe() -> None:
 # elastic identify, speed, play, demo.
 
 
-def test_identify_writes_result_and_figure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_identify_writes_result_and_figure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches a result that is printed and not written, and a second mass that is not used."""
     masses = []
 
@@ -640,21 +842,49 @@ def test_identify_writes_result_and_figure(monkeypatch: pytest.MonkeyPatch, caps
         image.load()
     assert json.loads(Path("result/metadata.json").read_text())["seed"] == 0
     printed = capsys.readouterr().out
-    assert [text for text in ("888.0", "5.40", "hysteresis", "result/identification.json") if text not in printed] == []
+    assert [
+        text
+        for text in ("888.0", "5.40", "hysteresis", "result/identification.json")
+        if text not in printed
+    ] == []
 
 
 SPEED = ["speed", "--steps", "3", "--rounds", "1", "--threads", "1"]
 
 
 def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a contender that is measured and not reported, and one that is compared with another's reference."""
-    main([*SPEED, "--env", "testbed", "--num-envs", "4", "2", "--processes", "1", "--no-ppo", "--profile"])
+    """Catches a contender that is measured and not reported, and one that is compared with
+    another's reference."""
+    main(
+        [
+            *SPEED,
+            "--env",
+            "testbed",
+            "--num-envs",
+            "4",
+            "2",
+            "--processes",
+            "1",
+            "--no-ppo",
+            "--profile",
+        ]
+    )
     results = json.loads(Path("runs/speed/speed.json").read_text())
     found = [(r["contender"], r["num_envs"], r["against"]) for r in results]
-    loops = ["vector env", "raw mj_step", "vector env with input", "vector env with input and residual network"]
+    loops = [
+        "vector env",
+        "raw mj_step",
+        "vector env with input",
+        "vector env with input and residual network",
+    ]
     assert found[:8] == [(loop, n, f"raw mj_step, {n}") for n in (4, 2) for loop in loops]
     assert found[8:10] == [(name, 1, "raw mj_step, 1") for name in ("scalar env", "raw mj_step")]
-    others = ["Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv", "Gymnasium SyncVectorEnv", "SB3 DummyVecEnv"]
+    others = [
+        "Gymnasium AsyncVectorEnv",
+        "SB3 SubprocVecEnv",
+        "Gymnasium SyncVectorEnv",
+        "SB3 DummyVecEnv",
+    ]
     assert found[10:] == [(name, 1, "vector env, 4") for name in others]
     for result in results:
         assert min(result["steps_per_s"], result["ratio"]) > 0.0
@@ -678,22 +908,30 @@ def test_speed_of_learning_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", ["policy", "residual", "scalar"])
 def test_raw_stepping_does_the_work_of_the_environment(kind: str) -> None:
-    """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
+    """Catches a benchmark that compares unequal work: the raw worlds must end where the
+    environment's end, exactly."""
     loop = (
-        ScalarLoop("walker") if kind == "scalar" else VectorLoop("testbed", 3, 1, "input", residual=kind == "residual")
+        ScalarLoop("walker")
+        if kind == "scalar"
+        else VectorLoop("testbed", 3, 1, "input", residual=kind == "residual")
     )
     inside = loop.env.unwrapped
     raw = RawWorlds(loop, threads=2)
     loop.run(300)
     raw.run(300)
-    data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    for state, qpos, qvel in zip(raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+    data = mujoco.MjData(inside.task.model)
+    kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    for state, qpos, qvel in zip(
+        raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True
+    ):
         mujoco.mj_setState(inside.task.model, data, state, kind)
         np.testing.assert_array_equal(data.qpos, qpos)
         np.testing.assert_array_equal(data.qvel, qvel)
 
 
-def test_play_films_the_episode_and_keeps_an_existing_film(capsys: pytest.CaptureFixture[str]) -> None:
+def test_play_films_the_episode_and_keeps_an_existing_film(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Catches a film of the wrong length or of nothing, and one that is overwritten."""
     main(["play", "--policy", "input", "--reference", "sine", "--video", "x.gif", "--max-s", "0.2"])
     with Image.open("x.gif") as film:
@@ -716,7 +954,8 @@ def test_play_writes_mp4() -> None:
 def test_play_takes_one_step_at_least_and_the_episode_at_most(
     max_s: float, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a film without a picture, which is announced and not there, and a time without end that is none."""
+    """Catches a film without a picture, which is announced and not there, and a time without end
+    that is none."""
     played = []
 
     def film(env: Any, episode: Any, total: int, *_: Any) -> None:
@@ -737,16 +976,27 @@ def test_play_films_a_time_shorter_than_a_control_step() -> None:
 def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a demonstration that breaks on the way; with short references, so that it takes seconds."""
-    monkeypatch.setattr(train.commands.demo, "_STATIC", train.commands.demo._STATIC.replace(references=[HOLD]))
-    monkeypatch.setattr(train.commands.demo, "_MOTION", train.commands.demo._MOTION.replace(references=[SINE]))
+    """Catches a demonstration that breaks on the way; with short references, so that it takes
+    seconds."""
+    monkeypatch.setattr(
+        train.commands.demo, "_STATIC", train.commands.demo._STATIC.replace(references=[HOLD])
+    )
+    monkeypatch.setattr(
+        train.commands.demo, "_MOTION", train.commands.demo._MOTION.replace(references=[SINE])
+    )
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
     monkeypatch.setattr(
-        train.commands.demo, "_SLOW_WALK", train.commands.demo._SLOW_WALK.replace(references=[short_walk])
+        train.commands.demo,
+        "_SLOW_WALK",
+        train.commands.demo._SLOW_WALK.replace(references=[short_walk]),
     )
-    monkeypatch.setattr(train.commands.demo, "_WALK", train.commands.demo._WALK.replace(references=[short_walk]))
     monkeypatch.setattr(
-        train.commands.demo, "_SOFT_WALK", train.commands.demo._SOFT_WALK.replace(references=[short_walk])
+        train.commands.demo, "_WALK", train.commands.demo._WALK.replace(references=[short_walk])
+    )
+    monkeypatch.setattr(
+        train.commands.demo,
+        "_SOFT_WALK",
+        train.commands.demo._SOFT_WALK.replace(references=[short_walk]),
     )
     main(["demo"])
     printed = capsys.readouterr().out
@@ -755,14 +1005,31 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
         for name in ("pelvis", "zmp")
         for scenario in ("nominal", "soft")
     }
-    names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
+    names = {
+        "fig5_identification.png",
+        "fig6_static_errors.png",
+        "sine.png",
+        "identification.json",
+        *walks,
+    }
     names |= {"episodes.csv", "summary.md"}
-    assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
+    assert {path.name for path in Path("runs/demo").iterdir()} == names | {
+        "config.yaml",
+        "metadata.json",
+    }
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
     summary = Path("runs/demo/summary.md").read_text()
     assert [text for text in ("| sine |", "| input_output |") if text not in summary] == []
     of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")
-    policies = ("uncompensated", "input", "dynamic", "oracle", "input_output", "input_wrench", "residual")
+    policies = (
+        "uncompensated",
+        "input",
+        "dynamic",
+        "oracle",
+        "input_output",
+        "input_wrench",
+        "residual",
+    )
     assert [text for text in (*of_the_paper, *policies) if text not in printed] == []
 
 
@@ -793,26 +1060,43 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-@pytest.mark.parametrize(("how", "import_s", "wait_s"), [(signal.SIGINT, 2.0, 1.0), (signal.SIGKILL, 0.0, 2.0)])
+@pytest.mark.parametrize(
+    ("how", "import_s", "wait_s"), [(signal.SIGINT, 2.0, 1.0), (signal.SIGKILL, 0.0, 2.0)]
+)
 def test_a_comparison_that_ends_takes_its_workers_with_it(
     tmp_path: Path, how: signal.Signals, import_s: float, wait_s: float
 ) -> None:
-    """Catches a second Ctrl-C that is ignored until all is done, that workers answer with tracebacks, and workers that
+    """Catches a second Ctrl-C that is ignored until all is done, that workers answer with
+    tracebacks, and workers that
     go on.
 
-    The workers import for `import_s` longer than they need. SIGINT reaches the whole process group, as from a terminal,
-    the parent last; SIGKILL the parent alone.
+    The workers import for `import_s` longer than they need. SIGINT reaches the whole process group,
+    as from a terminal, the parent last; SIGKILL the parent alone.
     """
     (tmp_path / "sitecustomize.py").write_text(_SLOW_IMPORT.format(import_s))
-    policies = [{"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")]
+    policies = [
+        {"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")
+    ]
     (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": policies}))
     process = subprocess.Popen(
-        [sys.executable, "-c", "from train.commands.cli import main; main()", "compare", "long.yaml"],
-        cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [
+            sys.executable,
+            "-c",
+            "from train.commands.cli import main; main()",
+            "compare",
+            "long.yaml",
+        ],
+        cwd=tmp_path,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
-    )  # fmt: skip
+    )
     deadline = time.monotonic() + 60.0
-    while len(_members(process.pid)) < 4 and time.monotonic() < deadline:  # parent, tracker, two workers
+    while (
+        len(_members(process.pid)) < 4 and time.monotonic() < deadline
+    ):  # parent, tracker, two workers
         time.sleep(0.05)
     time.sleep(wait_s)
     if how is signal.SIGINT:
@@ -826,7 +1110,9 @@ def test_a_comparison_that_ends_takes_its_workers_with_it(
     else:
         process.kill()
     deadline = time.monotonic() + 10.0
-    while _members(process.pid) and time.monotonic() < deadline:  # Python's own resource tracker leaves last
+    while (
+        _members(process.pid) and time.monotonic() < deadline
+    ):  # Python's own resource tracker leaves last
         time.sleep(0.1)
     assert _members(process.pid) == []
     assert how is signal.SIGKILL or not (tmp_path / "runs" / "long").exists()
@@ -834,9 +1120,13 @@ def test_a_comparison_that_ends_takes_its_workers_with_it(
 
 def _members(group: int) -> list[int]:
     """Living processes of a process group."""
-    listing = subprocess.run(["ps", "-eo", "pid,pgid,stat"], capture_output=True, text=True, check=True).stdout
+    listing = subprocess.run(
+        ["ps", "-eo", "pid,pgid,stat"], capture_output=True, text=True, check=True
+    ).stdout
     rows = [line.split() for line in listing.splitlines()[1:]]
-    return [int(pid) for pid, pgid, state in rows if int(pgid) == group and not state.startswith("Z")]
+    return [
+        int(pid) for pid, pgid, state in rows if int(pgid) == group and not state.startswith("Z")
+    ]
 
 
 def test_name_of_a_run_cannot_leave_its_folder(tmp_path: Path) -> None:
@@ -848,14 +1138,18 @@ def test_name_of_a_run_cannot_leave_its_folder(tmp_path: Path) -> None:
 
 def test_progress_names_what_its_percents_are_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches 50 %: 0 of 16, which counts control steps before the colon and cells behind it."""
-    clock, console = [0.0], Console(file=StringIO())
+    clock = [0.0]
+    console = Console(file=StringIO())
     monkeypatch.setattr(time, "monotonic", lambda: clock[-1])
     with show_progress(console, {"all": 100}, unit="control steps") as show:
         for now, done in [(1.0, 10), (11.0, 50)]:
             clock.append(now)
             show(0, done, "0 of 16 cells done, 8 running, 0 failed")
     said = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert said[-1] == "  50 % of the control steps, about 10 s to go; 0 of 16 cells done, 8 running, 0 failed"
+    assert (
+        said[-1]
+        == "  50 % of the control steps, about 10 s to go; 0 of 16 cells done, 8 running, 0 failed"
+    )
 
 
 def test_a_warning_is_shown_once() -> None:
@@ -869,15 +1163,29 @@ def test_a_warning_is_shown_once() -> None:
                 warnings.warn("another", stacklevel=1)
             assert said_so_far() == {"said before", "3 meshes are missing", "another"}
         warnings.warn("another", stacklevel=1)
-    assert [str(warning.message) for warning in shown] == ["3 meshes are missing", "another", "another"]
+    assert [str(warning.message) for warning in shown] == [
+        "3 meshes are missing",
+        "another",
+        "another",
+    ]
 
 
-def test_where_there_is_no_terminal_progress_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a log in which long work says nothing until it ends, and one that short work fills."""
-    clock, console = [0.0], Console(file=StringIO())
+def test_where_there_is_no_terminal_progress_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a log in which long work says nothing until it ends, and one that short work
+    fills."""
+    clock = [0.0]
+    console = Console(file=StringIO())
     monkeypatch.setattr(time, "monotonic", lambda: clock[-1])
     with show_progress(console, {"seed 0": 100, "seed 1": 100}) as show:
-        for now, number, done in [(1.0, 0, 50), (11.0, 0, 60), (12.0, 1, 60), (22.0, 1, 61), (40.0, 1, 100)]:
+        for now, number, done in [
+            (1.0, 0, 50),
+            (11.0, 0, 60),
+            (12.0, 1, 60),
+            (22.0, 1, 61),
+            (40.0, 1, 100),
+        ]:
             clock.append(now)
             show(number, done)
     said = console.file.getvalue().splitlines()  # type: ignore[attr-defined]

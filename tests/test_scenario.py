@@ -12,11 +12,15 @@ from elastic_env.world.scenario import Scenario, make_scenario
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
 
-@pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])
+@pytest.mark.parametrize(
+    "scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"]
+)
 def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) -> None:
     """Catches a ceiling that is none, and identical episodes that count as many."""
     envs = [
-        gymnasium.make("elastic_env/Testbed-v0", scenario=scenario, reference="sine", observe_link=True)
+        gymnasium.make(
+            "elastic_env/Testbed-v0", scenario=scenario, reference="sine", observe_link=True
+        )
         for _ in range(2)
     ]
     runs = []
@@ -30,15 +34,23 @@ def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) 
 @pytest.mark.parametrize(
     "alone",
     [
-        {"pelvis_imu": AttitudeSensor(noise_rad=1e-3)}, {"pelvis_imu": AttitudeSensor(bias_spread_rad=1e-3)},
-        {"gyro_noise_rad_s": 1e-3}, {"force_noise_n": 1.0}, {"moment_noise_nm": 0.1}, {"encoder_bias_rad": 1e-3},
-        {"stiffness_spread": 0.3}, {"slope_rad": 0.01}, {"delay_steps": 1},
-        {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)}, {"inertial": InertialSensor()},
+        {"pelvis_imu": AttitudeSensor(noise_rad=1e-3)},
+        {"pelvis_imu": AttitudeSensor(bias_spread_rad=1e-3)},
+        {"gyro_noise_rad_s": 1e-3},
+        {"force_noise_n": 1.0},
+        {"moment_noise_nm": 0.1},
+        {"encoder_bias_rad": 1e-3},
+        {"stiffness_spread": 0.3},
+        {"slope_rad": 0.01},
+        {"delay_steps": 1},
+        {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)},
+        {"inertial": InertialSensor()},
     ],
     ids=lambda alone: "-".join(alone),
-)  # fmt: skip
+)
 def test_whatever_a_walk_draws_makes_its_scenario_random(alone: dict[str, Any]) -> None:
-    """Catches a kind of noise or a drawn robot that is forgotten where ceilings are told from samples."""
+    """Catches a kind of noise or a drawn robot that is forgotten where ceilings are told from
+    samples."""
     scenario = Scenario(friction_scale=0.0, encoder_counts=False, **alone)
     env = make_walk_vector(num_envs=2, scenario=scenario)
     env.reset(seed=[0, 1])

@@ -9,10 +9,18 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.world.sensors import AttitudeSensor, NoiseStream, angle_of_count, attitude, is_due, quantise
+from elastic_env.world.sensors import (
+    AttitudeSensor,
+    NoiseStream,
+    angle_of_count,
+    attitude,
+    is_due,
+    quantise,
+)
 
 COUNTS = 501_923
-ONE, TWO = np.dtype([("a", np.float64)]), np.dtype([("a", np.float64), ("b", np.float64)])
+ONE = np.dtype([("a", np.float64)])
+TWO = np.dtype([("a", np.float64), ("b", np.float64)])
 
 
 @given(angle=st.floats(-10.0, 10.0), counts=st.integers(1, 10**6))
@@ -26,7 +34,8 @@ def test_quantised_angles_are_the_nearest_whole_counts(angle: float, counts: int
 
 
 def test_an_encoder_without_counts_is_continuous() -> None:
-    """Catches a default resolution where none was asked for; and the input array must not be handed on for writing."""
+    """Catches a default resolution where none was asked for; and the input array must not be
+    handed on for writing."""
     angle = np.array([0.1, 0.2])
     np.testing.assert_array_equal(quantise(angle, angle_of_count(None)), angle)
 
@@ -34,9 +43,17 @@ def test_an_encoder_without_counts_is_continuous() -> None:
 def test_attitude_adds_up_its_errors() -> None:
     """Catches a bias in the wrong direction, and an error of sin q that is one of q."""
     sensor = AttitudeSensor(noise_rad=0.2, bias_rad=-0.03, sine_error_rad=0.05)
-    angle, drawn, noise = np.array([0.0, np.pi / 2, -0.4]), np.array([0.0, 0.001, 0.002]), np.array([0.0, 1.0, -2.0])
-    expected = [-0.03, np.pi / 2 - 0.03 + 0.001 + 0.05 + 0.2, -0.4 - 0.03 + 0.002 - 0.05 * np.sin(0.4) - 0.4]
-    np.testing.assert_allclose(attitude(sensor, angle, drawn, noise), expected, rtol=0.0, atol=1e-15)
+    angle = np.array([0.0, np.pi / 2, -0.4])
+    drawn = np.array([0.0, 0.001, 0.002])
+    noise = np.array([0.0, 1.0, -2.0])
+    expected = [
+        -0.03,
+        np.pi / 2 - 0.03 + 0.001 + 0.05 + 0.2,
+        -0.4 - 0.03 + 0.002 - 0.05 * np.sin(0.4) - 0.4,
+    ]
+    np.testing.assert_allclose(
+        attitude(sensor, angle, drawn, noise), expected, rtol=0.0, atol=1e-15
+    )
 
 
 def test_an_ideal_attitude_sensor_shows_the_angle() -> None:
@@ -47,10 +64,18 @@ def test_an_ideal_attitude_sensor_shows_the_angle() -> None:
 
 @pytest.mark.parametrize(
     ("rate_hz", "period_s"),
-    [("100", "0.004"), ("250", "0.004"), ("50", "0.004"), ("33", "0.004"), ("1000", "0.01"), ("290", "0.001")],
+    [
+        ("100", "0.004"),
+        ("250", "0.004"),
+        ("50", "0.004"),
+        ("33", "0.004"),
+        ("1000", "0.01"),
+        ("290", "0.001"),
+    ],
 )
 def test_samples_come_at_their_rate(rate_hz: str, period_s: str) -> None:
-    """Catches a sensor that skips or doubles a sample by rounding: an hour of steps against exact fractions."""
+    """Catches a sensor that skips or doubles a sample by rounding: an hour of steps against
+    exact fractions."""
     due = is_due(np.arange(round(3600.0 / float(period_s)) + 1), float(rate_hz), float(period_s))
     share = Fraction(rate_hz) * Fraction(period_s)
     samples = np.arange(len(due)) * share.numerator // share.denominator
@@ -66,7 +91,8 @@ def samples(stream: NoiseStream, mask: Array, count: int) -> Array:
 
 
 def test_noise_is_standard_normal_white_and_independent() -> None:
-    """Catches noise of another variance, noise that repeats with its block, and worlds that share it."""
+    """Catches noise of another variance, noise that repeats with its block, and worlds that
+    share it."""
     stream = NoiseStream(4, ONE, block=50)
     for world in range(4):
         stream.restart(world, np.random.default_rng(world))
@@ -80,7 +106,8 @@ def test_noise_is_standard_normal_white_and_independent() -> None:
 
 def test_a_stream_depends_on_its_generator_and_its_use_alone() -> None:
     """Catches a sample that is skipped or shared when other worlds draw, refill or restart."""
-    everyone, alone = NoiseStream(3, ONE, block=7), NoiseStream(1, ONE, block=7)
+    everyone = NoiseStream(3, ONE, block=7)
+    alone = NoiseStream(1, ONE, block=7)
     for world in range(3):
         everyone.restart(world, np.random.default_rng(10 + world))
     alone.restart(0, np.random.default_rng(11))
@@ -114,7 +141,11 @@ def test_a_restarted_stream_begins_anew() -> None:
         ("rate_hz", 0.0, r"> 0 \[Hz\], got 0"),
     ],
 )
-def test_a_wrong_parameter_names_itself_its_unit_and_bound(parameter: str, value: float, requirement: str) -> None:
+def test_a_wrong_parameter_names_itself_its_unit_and_bound(
+    parameter: str, value: float, requirement: str
+) -> None:
     """Catches a sensor that never delivers, and noise of negative size."""
-    with pytest.raises(ConfigurationError, match=rf"AttitudeSensor\.{parameter} must be .*{requirement}"):
+    with pytest.raises(
+        ConfigurationError, match=rf"AttitudeSensor\.{parameter} must be .*{requirement}"
+    ):
         AttitudeSensor(**{parameter: value})

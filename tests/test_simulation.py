@@ -1,4 +1,5 @@
-"""One world and many against plain MuJoCo: bit for bit, live views, models that differ from world to world, copies."""
+"""One world and many against plain MuJoCo: bit for bit, live views, models that differ from
+world to world, copies."""
 
 import copy
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 from elastic_env.core.signals import Array
 from elastic_env.world.physics import ManyWorlds, Simulation, SingleWorld, simulate
 
-# A cart with an elastic pendulum whose ball bounces on the floor; the servo has an integrator, so there is an `act`.
+# A cart with an elastic pendulum whose ball bounces on the floor; the servo has an integrator, so
+# there is an `act`.
 ROBOT = """<mujoco>
   <option timestep="0.002" integrator="implicitfast"><flag autoreset="disable"/></option>
   <worldbody>
@@ -76,7 +78,9 @@ def plain(robot: mujoco.MjModel, world: int) -> mujoco.MjData:
     return data
 
 
-def drive(robot: mujoco.MjModel, data: mujoco.MjData, world: int, steps: int, substeps: int = 4) -> mujoco.MjData:
+def drive(
+    robot: mujoco.MjModel, data: mujoco.MjData, world: int, steps: int, substeps: int = 4
+) -> mujoco.MjData:
     """The same commands and pushes by MuJoCo alone, one physics step after the other."""
     for step in range(steps):
         data.ctrl[0] = np.sin(0.3 * step * (world + 1))
@@ -101,8 +105,10 @@ def state(simulation: Simulation) -> list[Array]:
 
 @pytest.mark.parametrize("kind", ["single", "many"])
 def test_every_world_is_mujocos_bit_for_bit(kind: str) -> None:
-    """Catches substeps that are left out, commands that come a period late, and worlds that see each other."""
-    simulation, robot = worlds(kind), model()
+    """Catches substeps that are left out, commands that come a period late, and worlds that see
+    each other."""
+    simulation = worlds(kind)
+    robot = model()
     views = [simulation.bind("sensordata"), simulation.bind("site_xpos")]
     start(simulation)
     advance(simulation, 60)
@@ -110,7 +116,9 @@ def test_every_world_is_mujocos_bit_for_bit(kind: str) -> None:
         data = drive(robot, plain(robot, world), world, 60)
         assert data.time == pytest.approx(0.48)
         for name in ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "xfrc_applied"):
-            np.testing.assert_array_equal(simulation.bind(name)[world], getattr(data, name), err_msg=name)
+            np.testing.assert_array_equal(
+                simulation.bind(name)[world], getattr(data, name), err_msg=name
+            )
         np.testing.assert_array_equal(views[0][world], data.sensordata)
         np.testing.assert_array_equal(views[1][world], data.site_xpos)
         assert np.abs(data.qvel).max() > 0.01
@@ -161,8 +169,10 @@ def test_a_bound_state_is_the_state(kind: str, field: str) -> None:
 
 @pytest.mark.parametrize("kind", ["single", "many"])
 def test_derived_fields_lag_by_one_physics_step_until_they_are_refreshed(kind: str) -> None:
-    """Catches a refresh that moves the world, or one of another stage: the accelerometer needs all of them."""
-    simulation, robot = worlds(kind), model()
+    """Catches a refresh that moves the world, or one of another stage: the accelerometer needs
+    all of them."""
+    simulation = worlds(kind)
+    robot = model()
     tip, sensors = (simulation.bind(name) for name in ("site_xpos", "sensordata"))
     start(simulation)
     advance(simulation, 10)
@@ -183,7 +193,8 @@ def test_derived_fields_lag_by_one_physics_step_until_they_are_refreshed(kind: s
 
 def test_only_the_chosen_worlds_are_refreshed() -> None:
     """Catches a mask taken for indices, or ignored."""
-    many, single = worlds("many"), worlds("single")
+    many = worlds("many")
+    single = worlds("single")
     for simulation, chosen in ((many, [False, True, False]), (single, [False])):
         tip = simulation.bind("site_xpos")
         simulation.refresh(np.ones(simulation.num_worlds, dtype=bool))
@@ -197,7 +208,8 @@ def test_only_the_chosen_worlds_are_refreshed() -> None:
 
 
 def of_world(field: str, world: int) -> tuple[int, float | list[float]]:
-    """Which entry of a field another world has, and its value: the spring, the slope of the floor, the friction."""
+    """Which entry of a field another world has, and its value: the spring, the slope of the
+    floor, the friction."""
     values: dict[str, tuple[int, float | list[float]]] = {
         "tendon_stiffness": (0, 15.0 + 20.0 * world),
         "body_quat": (1, [1.0, 0.0, 0.02 + 0.01 * world, 0.0]),
@@ -209,7 +221,8 @@ def of_world(field: str, world: int) -> tuple[int, float | list[float]]:
 @pytest.mark.parametrize("kind", ["single", "many"])
 @pytest.mark.parametrize("field", ["tendon_stiffness", "body_quat", "dof_frictionloss"])
 def test_every_world_can_have_its_own_model(kind: str, field: str) -> None:
-    """Catches a variation that all worlds share, that reaches the caller's model, or that a restart takes back."""
+    """Catches a variation that all worlds share, that reaches the caller's model, or that a
+    restart takes back."""
     robot = model()
     simulation = simulate(robot, 1 if kind == "single" else NUM, num_threads=2)
     before = getattr(robot, field).copy()
@@ -273,7 +286,8 @@ def test_a_copy_continues_as_the_original_and_then_goes_its_own_way(kind: str) -
 
 @pytest.mark.parametrize("kind", ["single", "many"])
 def test_a_restart_is_a_new_world_and_leaves_the_others_alone(kind: str) -> None:
-    """Catches a restart of all worlds, and one that leaves warm start, pushes or integrators behind."""
+    """Catches a restart of all worlds, and one that leaves warm start, pushes or integrators
+    behind."""
     simulation = worlds(kind)
     start(simulation)
     advance(simulation, 10)
@@ -291,11 +305,13 @@ def test_a_restart_is_a_new_world_and_leaves_the_others_alone(kind: str) -> None
 
 @pytest.mark.parametrize("kind", ["single", "many"])
 def test_a_bad_number_is_noticed_in_its_world_until_the_restart(kind: str) -> None:
-    """Catches MuJoCo's silent reset of a world, and a warning that sticks or is forgotten by a copy."""
+    """Catches MuJoCo's silent reset of a world, and a warning that sticks or is forgotten by a
+    copy."""
     simulation = worlds(kind)
     start(simulation)
     simulation.advance(3)
-    none, bad = np.zeros(simulation.num_worlds, dtype=bool), np.arange(simulation.num_worlds) == 0
+    none = np.zeros(simulation.num_worlds, dtype=bool)
+    bad = np.arange(simulation.num_worlds) == 0
     np.testing.assert_array_equal(simulation.diverged(), none)
     simulation.qvel[0, 0] = np.nan
     simulation.advance(3)

@@ -31,8 +31,11 @@ def walker() -> WalkerModel:
 
 
 def half_period(model: WalkerModel) -> float:
-    """Half a period of the slowest sway, springs in series with the position gain of the servos [s]."""
-    compliance = 1.0 / model.stiffness + 1.0 / np.array([servo.position_gain for servo in model.servos])
+    """Half a period of the slowest sway, springs in series with the position gain of the servos
+    [s]."""
+    compliance = 1.0 / model.stiffness + 1.0 / np.array(
+        [servo.position_gain for servo in model.servos]
+    )
     return float(np.pi / sway_frequencies(model.biped, model.plan.pelvis[0], 1.0 / compliance)[0])
 
 
@@ -43,7 +46,8 @@ def plain(steps: Array, duration_s: float) -> Array:
 
 @pytest.mark.parametrize("model", [walker(), pendulum()], ids=["walker", "testbed"])
 def test_ramp_grows_from_nothing_to_everything_without_turning_back(model: Any) -> None:
-    """Catches a ramp that starts with a jump, overshoots, or is not over at its end, also for rows of worlds."""
+    """Catches a ramp that starts with a jump, overshoots, or is not over at its end, also for
+    rows of worlds."""
     ramp = Ramp(model, 1.0)
     share = ramp.share(STEPS)
     assert share[0] == 0.0
@@ -59,26 +63,34 @@ def test_ramp_grows_from_nothing_to_everything_without_turning_back(model: Any) 
 
 
 def test_ramp_of_the_walker_is_two_halves_half_a_sway_apart() -> None:
-    """Catches a delay of a whole period, of the springs alone, or halves that do not end together with the ramp."""
+    """Catches a delay of a whole period, of the springs alone, or halves that do not end
+    together with the ramp."""
     delay = half_period(walker())
     assert 0.3 < delay < 0.8
     each = 1.0 - delay
-    first, second = plain(STEPS, each), plain(STEPS - delay / PERIOD_S, each)
-    np.testing.assert_allclose(Ramp(walker(), 1.0).share(STEPS), 0.5 * (first + second), rtol=0.0, atol=1e-12)
+    first = plain(STEPS, each)
+    second = plain(STEPS - delay / PERIOD_S, each)
+    np.testing.assert_allclose(
+        Ramp(walker(), 1.0).share(STEPS), 0.5 * (first + second), rtol=0.0, atol=1e-12
+    )
 
 
 def test_halves_cancel_the_swing_of_an_oscillator() -> None:
-    """Catches a shape that does not cancel: an undamped pendulum of the sway's period must stand still after the ramp.
+    """Catches a shape that does not cancel: an undamped pendulum of the sway's period must stand
+    still after the ramp.
 
     Its swing after a ramp is |∫ ṡ e^{iωt} dt| of what is ramped; the plain ramp leaves much of it.
     """
-    omega, time = np.pi / half_period(walker()), np.arange(0.0, 1.2, 1e-4)
+    omega = np.pi / half_period(walker())
+    time = np.arange(0.0, 1.2, 1e-4)
     swing = {}
     for name, share in (
         ("shaped", Ramp(walker(), 1.0).share(time / PERIOD_S)),
         ("plain", plain(time / PERIOD_S, 1.0)),
     ):
-        swing[name] = abs((np.diff(share) * np.exp(1j * omega * 0.5 * (time[1:] + time[:-1]))).sum())
+        swing[name] = abs(
+            (np.diff(share) * np.exp(1j * omega * 0.5 * (time[1:] + time[:-1]))).sum()
+        )
     assert swing["shaped"] < 1e-3
     assert swing["plain"] > 0.1
 
@@ -89,10 +101,13 @@ def test_testbed_has_the_plain_ramp() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scale", "margin"), [(1.0, 0.99), (1.0, 0.5), (0.1, 1.0)], ids=["just too short", "short", "unstable"]
+    ("scale", "margin"),
+    [(1.0, 0.99), (1.0, 0.5), (0.1, 1.0)],
+    ids=["just too short", "short", "unstable"],
 )
 def test_ramp_is_plain_where_half_a_period_does_not_fit(scale: float, margin: float) -> None:
-    """Catches a delay that leaves the halves no time, and the nan of a robot so soft that it has no sway."""
+    """Catches a delay that leaves the halves no time, and the nan of a robot so soft that it has
+    no sway."""
     model = walker().with_stiffness(scale * walker().stiffness)
     duration = margin * half_period(walker()) / 0.8
     assert np.isnan(half_period(model)) == (scale < 1.0)  # type: ignore[arg-type]
@@ -113,14 +128,20 @@ def test_a_ramp_of_one_control_step_is_over_in_the_first(duration_s: float) -> N
 
 
 def test_standing_walker_is_not_left_swinging() -> None:
-    """Catches a ramp that excites the sway: the shaped one leaves less than a third of the plain one's swing.
+    """Catches a ramp that excites the sway: the shaped one leaves less than a third of the plain
+    one's swing.
 
     Two robots without friction in a gait so slow that they nearly stand, 1.5 s after the ramp.
     """
     env: Any = gymnasium.make_vec(
-        "elastic_env/WalkInPlace-v0", num_envs=2, vectorization_mode="vector_entry_point", num_threads=1,
-        step_period=24.0, num_steps=1, scenario="ideal",
-    )  # fmt: skip
+        "elastic_env/WalkInPlace-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        num_threads=1,
+        step_period=24.0,
+        num_steps=1,
+        scenario="ideal",
+    )
     shaped, unshaped = (baselines.make("input_open", env) for _ in range(2))
     unshaped._ramp = plain(np.arange(len(shaped._ramp)), 1.0)  # type: ignore[attr-defined]
     pitch_rate = env.unwrapped.task.observation_table.names.index("imu_rate.y")

@@ -70,7 +70,8 @@ def test_it_is_a_dictionary_with_everything(look: str) -> None:
 
 
 def test_what_is_given_costs_nothing() -> None:
-    """Catches a rest that is computed although nobody asks for it, and one that overwrites what was set."""
+    """Catches a rest that is computed although nobody asks for it, and one that overwrites what
+    was set."""
     lazy, rest = info()
     assert (lazy["given"], "other" in lazy) == (1, True)
     lazy["late"] = "mine"

@@ -31,10 +31,11 @@ def balanced(robot: Biped, height: float = 0.66) -> Array:
 
 
 def linearised(robot: Biped, pelvis: Array, stiffness: Array) -> Array:
-    """Squared angular frequencies of the eighteen coordinates with both feet held, by MuJoCo, (6,) [1/s²].
+    """Squared angular frequencies of the eighteen coordinates with both feet held, by MuJoCo, (6,)
+    [1/s²].
 
-    The forces of the ground stay as they are in the stance; what a small motion along the constraints changes in the
-    joint torques, gravity and springs, is the stiffness of the sway.
+    The forces of the ground stay as they are in the stance; what a small motion along the
+    constraints changes in the joint torques, gravity and springs, is the stiffness of the sway.
     """
     model = robot.rigid
     data = mujoco.MjData(model)
@@ -47,7 +48,8 @@ def linearised(robot: Biped, pelvis: Array, stiffness: Array) -> Array:
     ground = np.array([0.0, 0.0, model.body_mass.sum() * 9.81 / 2.0])
 
     def load(qpos: Array) -> tuple[Array, Array]:
-        """Generalised force that gravity and ground leave to the springs, and the Jacobian of both feet."""
+        """Generalised force that gravity and ground leave to the springs, and the Jacobian of
+        both feet."""
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
         jacobians = np.zeros((2, 2, 3, model.nv))
@@ -60,7 +62,8 @@ def linearised(robot: Biped, pelvis: Array, stiffness: Array) -> Array:
     np.testing.assert_allclose(torque[:6], 0.0, atol=1e-8)  # the stance is balanced
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    h, K = 1e-6, np.zeros((model.nv, model.nv))
+    h = 1e-6
+    K = np.zeros((model.nv, model.nv))
     for i in range(model.nv):
         ends = []
         for sign in (1.0, -1.0):
@@ -72,13 +75,16 @@ def linearised(robot: Biped, pelvis: Array, stiffness: Array) -> Array:
     free = linalg.null_space(jacobian)
     assert free.shape == (18, 6)
     reduced = free.T @ K @ free
-    np.testing.assert_allclose(reduced, reduced.T, rtol=0.0, atol=1e-3)  # a potential's second derivative
+    np.testing.assert_allclose(
+        reduced, reduced.T, rtol=0.0, atol=1e-3
+    )  # a potential's second derivative
     return linalg.eigh((reduced + reduced.T) / 2.0, free.T @ mass @ free, eigvals_only=True)
 
 
 @pytest.mark.parametrize("stiffness", [np.full(12, 1001.0), UNEQUAL], ids=["equal", "unequal"])
 def test_frequencies_are_those_of_mujoco_linearised_about_the_stance(stiffness: Array) -> None:
-    """Catches gravity that does not soften, springs of the wrong joints, and a mass matrix without the legs."""
+    """Catches gravity that does not soften, springs of the wrong joints, and a mass matrix
+    without the legs."""
     pelvis = balanced(BIPED)
     expected = np.sqrt(linearised(BIPED, pelvis, stiffness))
     np.testing.assert_allclose(sway_frequencies(BIPED, pelvis, stiffness), expected, rtol=1e-5)
@@ -86,8 +92,10 @@ def test_frequencies_are_those_of_mujoco_linearised_about_the_stance(stiffness: 
 
 
 def test_a_direction_in_which_gravity_wins_has_no_frequency() -> None:
-    """Catches the root of a magnitude in place of nan, and an unstable direction that hides the stable ones."""
-    pelvis, soft = balanced(BIPED), np.full(12, 200.0)
+    """Catches the root of a magnitude in place of nan, and an unstable direction that hides the
+    stable ones."""
+    pelvis = balanced(BIPED)
+    soft = np.full(12, 200.0)
     expected = linearised(BIPED, pelvis, soft)
     frequencies = sway_frequencies(BIPED, pelvis, soft)
     np.testing.assert_array_equal(np.isnan(frequencies), expected < 0.0)
@@ -107,16 +115,21 @@ def changed(**factors: float) -> Biped:
 
 def test_without_gravity_frequencies_grow_with_the_root_of_the_stiffness() -> None:
     """Catches gravity that is built in, and springs that enter other than linearly."""
-    weightless, pelvis = changed(gravity=1e-9), balanced(BIPED)
+    weightless = changed(gravity=1e-9)
+    pelvis = balanced(BIPED)
     once = sway_frequencies(weightless, pelvis, UNEQUAL)
-    np.testing.assert_allclose(sway_frequencies(weightless, pelvis, 4.0 * UNEQUAL), 2.0 * once, rtol=1e-6)
+    np.testing.assert_allclose(
+        sway_frequencies(weightless, pelvis, 4.0 * UNEQUAL), 2.0 * once, rtol=1e-6
+    )
     assert once[0] > 1.1 * sway_frequencies(BIPED, pelvis, UNEQUAL)[0]
 
 
 @pytest.mark.parametrize("stiffness", [400.0, 1001.0])
 def test_a_trunk_on_massless_legs_sways_sideways_as_an_inverted_pendulum(stiffness: float) -> None:
-    r"""Catches a lever or factor that is wrong: ω² = 4K/(m l²) − g/l where only the four roll joints give way."""
-    robot, length = changed(legs=1e-7), 0.66 - 0.1
+    r"""Catches a lever or factor that is wrong: ω² = 4K/(m l²) − g/l where only the four roll
+    joints give way."""
+    robot = changed(legs=1e-7)
+    length = 0.66 - 0.1
     springs = np.where(["roll" in name for name in LEG_JOINTS], stiffness, 1e6)
     expected = np.sqrt(4.0 * stiffness / (robot.chains.mass * length**2) - 9.81 / length)
     frequency = sway_frequencies(robot, balanced(robot), springs)[0]
@@ -131,8 +144,10 @@ def test_a_trunk_on_massless_legs_sways_sideways_as_an_inverted_pendulum(stiffne
 def test_the_simulated_robot_sways_with_these_frequencies(
     axis: int, number: int, contact_time_s: float | None, tolerance: float
 ) -> None:
-    """Catches a sway of another robot: slow modes of the plant after a small push, its rotors too heavy to move."""
-    model, pelvis = elastic_spec(ROBOT, ROBOT.joints).compile(), balanced(BIPED)
+    """Catches a sway of another robot: slow modes of the plant after a small push, its rotors
+    too heavy to move."""
+    model = elastic_spec(ROBOT, ROBOT.joints).compile()
+    pelvis = balanced(BIPED)
     ankles = np.pad(BIPED.footholds, ((0, 0), (0, 1)), constant_values=BIPED.ankle_height)
     q = BIPED.joint_angles(pelvis, ankles)
     rest = settle(model, LEG_JOINTS, pelvis, q, q)
@@ -142,7 +157,8 @@ def test_the_simulated_robot_sways_with_these_frequencies(
     if contact_time_s is not None:
         model.geom_solref[:, 0] = contact_time_s
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[axis] = rest.qpos, 0.01
+    data.qpos[:] = rest.qpos
+    data.qvel[axis] = 0.01
     path = np.empty(3000)
     for step in range(len(path)):
         mujoco.mj_step(model, data)

@@ -1,4 +1,5 @@
-"""The testbed environment: what any user of Gymnasium may rely on, and the physics that it promises."""
+"""The testbed environment: what any user of Gymnasium may rely on, and the physics that it
+promises."""
 
 import copy
 import json
@@ -33,18 +34,37 @@ ID = "elastic_env/Testbed-v0"
 PERIOD_S = TestbedConfig().control_period_s
 SHORT: dict[str, dict[str, Any]] = {
     "hold": {
-        "kind": "hold", "positions": 2, "lower": -0.02, "upper": 0.02, "overrun": 0.04, "rate": 0.4,
-        "shortest_move_s": 0.1, "settle_s": 0.02, "measure_s": 0.02,
+        "kind": "hold",
+        "positions": 2,
+        "lower": -0.02,
+        "upper": 0.02,
+        "overrun": 0.04,
+        "rate": 0.4,
+        "shortest_move_s": 0.1,
+        "settle_s": 0.02,
+        "measure_s": 0.02,
     },
     "sine": {"kind": "sine", "amplitude": 0.02, "duration_s": 0.1, "onset_s": 0.1},
     "multisine": {"kind": "multisine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2},
     "steps": {"kind": "steps", "amplitude": 0.1, "move_s": 0.3, "rest_s": 0.05, "moves": 1},
-}  # fmt: skip
+}
 """References as short as can be: a second of standing, then a moment of motion."""
 INFO_KEYS = {
-    "time_s", "reference_angle", "link_angle", "link_angle_imu", "link_error", "link_error_imu", "deflection",
-    "joint_torque", "servo_error", "command_rate", "rest", "clipped", "reward_terms", "termination",
-}  # fmt: skip
+    "time_s",
+    "reference_angle",
+    "link_angle",
+    "link_angle_imu",
+    "link_error",
+    "link_error_imu",
+    "deflection",
+    "joint_torque",
+    "servo_error",
+    "command_rate",
+    "rest",
+    "clipped",
+    "reward_terms",
+    "termination",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +79,8 @@ def random_actions(steps: int, worlds: int, seed: int = 0) -> Array:
 
 
 def episode(env: ElasticEnv, seed: int, actions: Array) -> list[tuple[Any, ...]]:
-    """Reset, then steps until the end or until the actions are used up; what each of them returned."""
+    """Reset, then steps until the end or until the actions are used up; what each of them
+    returned."""
     log: list[tuple[Any, ...]] = [env.reset(seed=seed)]
     for action in actions:
         log.append(env.step(action))
@@ -73,12 +94,14 @@ def break_world(env: Any, world: int = 0, value: float = np.nan) -> None:
     env.unwrapped.simulation.qvel[world, -1] = value
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Contracts of Gymnasium and Stable-Baselines3
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments", [{}, {"observe_link": True, "scenario": "sensor", "reference": "multisine"}])
+@pytest.mark.parametrize(
+    "arguments", [{}, {"observe_link": True, "scenario": "sensor", "reference": "multisine"}]
+)
 def test_gymnasium_check_env(arguments: dict[str, Any]) -> None:
     """Catches spaces, dtypes, seeding and return types that are not Gymnasium's."""
     check_env(gymnasium.make(ID, **arguments).unwrapped, skip_render_check=True)
@@ -97,7 +120,11 @@ def test_same_seed_same_rollout_and_other_seed_another(reference: str, scenario:
     """Catches randomness outside the seed, and a seed that is ignored."""
     actions = random_actions(300, 1)[:, 0]
     first, again, other = (
-        episode(make_testbed(reference=SHORT[reference], scenario=scenario, observe_link=True), seed, actions)
+        episode(
+            make_testbed(reference=SHORT[reference], scenario=scenario, observe_link=True),
+            seed,
+            actions,
+        )
         for seed in (3, 3, 4)
     )
     assert_equal(first, again)
@@ -106,7 +133,8 @@ def test_same_seed_same_rollout_and_other_seed_another(reference: str, scenario:
 
 def test_episodes_of_one_environment_follow_from_its_first_seed() -> None:
     """Catches a second episode that depends on how the first one ended, or that repeats it."""
-    first, second = [], []
+    first = []
+    second = []
     for steps in (5, 90):
         env = make_testbed(reference=SHORT["multisine"], scenario="sensor", observe_link=True)
         first.append(episode(env, 7, random_actions(steps, 1)[:, 0])[0])
@@ -137,7 +165,9 @@ def test_spaces_describe_what_the_environment_takes_and_gives(vector: bool) -> N
     env: Any = make_testbed_vector(num_envs=3, **arguments) if vector else make_testbed(**arguments)
     observation, _ = env.reset(seed=0)
     assert env.action_space.dtype == np.float32
-    np.testing.assert_allclose(np.abs([env.action_space.low, env.action_space.high]), 0.3, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.abs([env.action_space.low, env.action_space.high]), 0.3, rtol=1e-6
+    )
     for _ in range(3):
         assert observation.dtype == np.float64
         assert env.observation_space.contains(observation)
@@ -156,7 +186,9 @@ def test_results_are_fresh_and_writing_to_them_changes_nothing(vector: bool) -> 
     logs = []
     for spoil in (False, True):
         arguments = {"reference": SHORT["sine"], "scenario": "sensor", "observe_link": True}
-        env: Any = make_testbed_vector(num_envs=2, **arguments) if vector else make_testbed(**arguments)
+        env: Any = (
+            make_testbed_vector(num_envs=2, **arguments) if vector else make_testbed(**arguments)
+        )
         actions = random_actions(20, 2) if vector else random_actions(20, 1)[:, 0]
         results: list[Any] = [env.reset(seed=0)]
         kept = [copy.deepcopy(results[0])]
@@ -165,7 +197,9 @@ def test_results_are_fresh_and_writing_to_them_changes_nothing(vector: bool) -> 
             results.append(env.step(given))
             kept.append(copy.deepcopy(results[-1]))
             if spoil:
-                truth = [value for value in vars(env.truth()).values() if isinstance(value, np.ndarray)]
+                truth = [
+                    value for value in vars(env.truth()).values() if isinstance(value, np.ndarray)
+                ]
                 spoil_arrays([results[-1], given, truth])
         if not spoil:
             assert_equal(results, kept)
@@ -189,11 +223,14 @@ def test_no_column_of_the_observation_is_constant() -> None:
     log = episode(env, 0, random_actions(400, 1)[:, 0])
     columns = np.array([entry[0] for entry in log])
     names = env.task.observation_table.names
-    assert [name for name, spread in zip(names, np.ptp(columns, axis=0), strict=True) if spread == 0.0] == []
+    assert [
+        name for name, spread in zip(names, np.ptp(columns, axis=0), strict=True) if spread == 0.0
+    ] == []
 
 
 def test_docstring_of_the_module_is_the_table_of_signals() -> None:
-    """Catches a table in the documentation that names, orders or measures the columns otherwise than the code."""
+    """Catches a table in the documentation that names, orders or measures the columns otherwise
+    than the code."""
     table = make_testbed(observe_link=True).task.observation_table
     rows, info = documented_tables(testbed.__doc__ or "")
     documented = [(int(column), name.strip("`"), unit) for column, name, unit, _ in rows]
@@ -206,9 +243,9 @@ def test_docstring_of_the_module_is_the_table_of_signals() -> None:
     assert info == {*env.step(np.zeros(1, np.float32))[4], "episode_metrics"}
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # One world and many
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 class Pair:
@@ -216,17 +253,21 @@ class Pair:
 
     def __init__(self, num_envs: int, mode: AutoresetMode, **arguments: Any) -> None:
         self.many = make_testbed_vector(num_envs, autoreset_mode=mode, **arguments)
-        self.single = SyncVectorEnv([lambda: make_testbed(**arguments)] * num_envs, autoreset_mode=mode)
+        self.single = SyncVectorEnv(
+            [lambda: make_testbed(**arguments)] * num_envs, autoreset_mode=mode
+        )
 
     def reset(self, **arguments: Any) -> None:
         """Reset both and compare."""
-        expected, result = self.single.reset(**copy.deepcopy(arguments)), self.many.reset(**arguments)
+        expected = self.single.reset(**copy.deepcopy(arguments))
+        result = self.many.reset(**arguments)
         np.testing.assert_array_equal(result[0], expected[0])
         assert_info_of_rows(result[1], expected[1], self.many.num_envs)
 
     def step(self, actions: Array) -> tuple[Any, ...]:
         """Step both and compare, exactly."""
-        expected, result = self.single.step(actions), self.many.step(actions)
+        expected = self.single.step(actions)
+        result = self.many.step(actions)
         for part, (result_part, wanted) in enumerate(zip(result[:4], expected[:4], strict=True)):
             np.testing.assert_array_equal(result_part, wanted, err_msg=f"part {part} of the result")
         assert_info_of_rows(result[4], expected[4], self.many.num_envs)
@@ -238,8 +279,11 @@ class Pair:
         break_world(self.single.envs[world], 0, value)
 
 
-def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], num_envs: int, path: str = "info") -> None:
-    """Everything that the scalar environments say stands in the vector's info, in the row of the same world."""
+def assert_info_of_rows(
+    info: dict[str, Any], expected: dict[str, Any], num_envs: int, path: str = "info"
+) -> None:
+    """Everything that the scalar environments say stands in the vector's info, in the row of the
+    same world."""
     for key, values in expected.items():
         if key.startswith("_"):
             continue
@@ -249,9 +293,13 @@ def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], num_envs
             assert_info_of_rows(info[key], values, num_envs, f"{path}[{key!r}]")
             continue
         for row in rows:
-            np.testing.assert_array_equal(info[key][row], values[row], err_msg=f"{path}[{key!r}][{row}]")
+            np.testing.assert_array_equal(
+                info[key][row], values[row], err_msg=f"{path}[{key!r}][{row}]"
+            )
         if f"_{key}" in info:
-            np.testing.assert_array_equal(info[f"_{key}"], expected[f"_{key}"], err_msg=f"{path}['_{key}']")
+            np.testing.assert_array_equal(
+                info[f"_{key}"], expected[f"_{key}"], err_msg=f"{path}['_{key}']"
+            )
 
 
 @pytest.mark.parametrize(
@@ -267,8 +315,11 @@ def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], num_envs
         ("steps", "sensor", AutoresetMode.NEXT_STEP),
     ],
 )
-def test_vector_environment_is_the_scalar_one_row_by_row(reference: str, scenario: str, mode: AutoresetMode) -> None:
-    """Catches any rule that one of the faces has and the other has not, to the last bit, also across autoreset."""
+def test_vector_environment_is_the_scalar_one_row_by_row(
+    reference: str, scenario: str, mode: AutoresetMode
+) -> None:
+    """Catches any rule that one of the faces has and the other has not, to the last bit, also
+    across autoreset."""
     pair = Pair(3, mode, reference=SHORT[reference], scenario=scenario, observe_link=True)
     pair.reset(seed=11)
     steps = pair.many.task.num_steps + 20
@@ -280,7 +331,8 @@ def test_vector_environment_is_the_scalar_one_row_by_row(reference: str, scenari
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_worlds_that_end_at_different_times_keep_apart(mode: AutoresetMode) -> None:
-    """Catches an end in one world that shows in the results of another: masks of reset, truncation and divergence."""
+    """Catches an end in one world that shows in the results of another: masks of reset,
+    truncation and divergence."""
     pair = Pair(4, mode, reference=SHORT["multisine"], scenario="sensor", observe_link=True)
     pair.reset(seed=[5, 6, 9, 5])
     ends = np.zeros(4, dtype=int)
@@ -297,7 +349,8 @@ def test_worlds_that_end_at_different_times_keep_apart(mode: AutoresetMode) -> N
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
 def test_a_world_that_diverges_starts_anew_and_lives_on(value: float) -> None:
-    """Catches a warning counter that is never cleared: the world would end at every step from then on."""
+    """Catches a warning counter that is never cleared: the world would end at every step from
+    then on."""
     env = make_testbed_vector(3, reference=SHORT["multisine"])
     env.reset(seed=0)
     break_world(env, 1, value)
@@ -317,12 +370,17 @@ def test_a_world_that_diverges_starts_anew_and_lives_on(value: float) -> None:
 
 @pytest.mark.parametrize("reference", ["sine", "multisine"])
 def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(reference: str) -> None:
-    """Catches a world whose noise, start or physics depends on its neighbours or on who computes it."""
+    """Catches a world whose noise, start or physics depends on its neighbours or on who computes
+    it."""
     actions = random_actions(120, 64, seed=2)
     logs = {}
     for num_envs, num_threads in [(64, 1), (64, 2), (7, 1), (7, 2), (1, 1)]:
         env = make_testbed_vector(
-            num_envs, num_threads=num_threads, reference=SHORT[reference], scenario="sensor", observe_link=True
+            num_envs,
+            num_threads=num_threads,
+            reference=SHORT[reference],
+            scenario="sensor",
+            observe_link=True,
         )
         log = [env.reset(seed=100)[0]]
         log += [env.step(action[:num_envs])[0] for action in actions]
@@ -338,7 +396,11 @@ def test_make_and_make_vec_find_the_environments() -> None:
     assert isinstance(env.unwrapped, ElasticEnv)
     assert env.unwrapped.task.config.scenario.name == "ideal"
     many = gymnasium.make_vec(
-        ID, num_envs=5, vectorization_mode="vector_entry_point", autoreset_mode="SameStep", scenario="soft"
+        ID,
+        num_envs=5,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="SameStep",
+        scenario="soft",
     )
     assert isinstance(many.unwrapped, ElasticVectorEnv)
     assert many.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -346,15 +408,18 @@ def test_make_and_make_vec_find_the_environments() -> None:
     assert many.unwrapped.truth().model.stiffness.tolist() == pytest.approx([0.7 * 1001.0])
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Physics and scores
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scenario", [*scenario_names(walks=False), "ideal+soft", "ideal+backlash", "ideal+sensor"])
+@pytest.mark.parametrize(
+    "scenario", [*scenario_names(walks=False), "ideal+soft", "ideal+backlash", "ideal+sensor"]
+)
 @pytest.mark.parametrize("reference", [*SHORT, "raised"])
 def test_an_episode_starts_in_static_equilibrium(reference: str, scenario: str) -> None:
-    """Catches a start with slack springs or an empty integrator: under zero action nothing may move."""
+    """Catches a start with slack springs or an empty integrator: under zero action nothing may
+    move."""
     raised = {"kind": "sine", "middle": 0.8, "amplitude": 0.1}
     env = make_testbed_vector(6, reference=SHORT.get(reference, raised), scenario=scenario)
     env.reset(seed=1)
@@ -395,8 +460,11 @@ def test_the_start_is_at_rest_inside_and_outside_the_dead_band(middle: float) ->
 def test_uncompensated_at_rest_the_link_error_is_the_deflection(
     scenario: str, stiffness: float, load: float, play: float, angle: float
 ) -> None:
-    """Catches a wrong sign of the link error, a scenario that changes the wrong parameter, and a servo that droops."""
-    env = make_testbed(reference={"kind": "sine", "middle": angle, "amplitude": 0.01}, scenario=scenario)
+    """Catches a wrong sign of the link error, a scenario that changes the wrong parameter, and a
+    servo that droops."""
+    env = make_testbed(
+        reference={"kind": "sine", "middle": angle, "amplitude": 0.01}, scenario=scenario
+    )
     env.reset(seed=0)
     for _ in range(20):
         info = env.step(np.zeros(1, dtype=np.float32))[4]
@@ -408,9 +476,12 @@ def test_uncompensated_at_rest_the_link_error_is_the_deflection(
 
 
 def test_the_exact_offset_brings_the_link_to_its_reference() -> None:
-    """Catches an offset that acts on anything but θ_cmd: with τ_g(q_ref)/K the error at rest vanishes."""
+    """Catches an offset that acts on anything but θ_cmd: with τ_g(q_ref)/K the error at rest
+    vanishes."""
     still = {"kind": "sine", "middle": -0.9, "amplitude": 1e-12}
-    env = make_testbed(reference=still, scenario="ideal", joint=H54_200_S500_R.replace(damping=100.0))
+    env = make_testbed(
+        reference=still, scenario="ideal", joint=H54_200_S500_R.replace(damping=100.0)
+    )
     env.reset(seed=0)
     offset = np.full(1, 60.0 * np.sin(-0.9) / 1001.0)
     for _ in range(500):
@@ -420,8 +491,11 @@ def test_the_exact_offset_brings_the_link_to_its_reference() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["nominal", "sensor", "soft+payload"])
-def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(scenario: str) -> None:
-    """Catches a term that is missing in info, or computed from another quantity than it is named after."""
+def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(
+    scenario: str,
+) -> None:
+    """Catches a term that is missing in info, or computed from another quantity than it is named
+    after."""
     env = make_testbed_vector(3, reference=SHORT["multisine"], scenario=scenario)
     env.reset(seed=0)
     weights = env.task.config.reward
@@ -429,7 +503,9 @@ def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(sc
         _, reward, _, _, info = env.step(actions)
         terms = info["reward_terms"]
         np.testing.assert_allclose(reward, sum(terms.values()), rtol=0.0, atol=1e-13)
-        np.testing.assert_allclose(terms["link_error"], -weights.link_error * np.abs(info["link_error"]), rtol=1e-14)
+        np.testing.assert_allclose(
+            terms["link_error"], -weights.link_error * np.abs(info["link_error"]), rtol=1e-14
+        )
         np.testing.assert_allclose(
             terms["command_rate"], -weights.command_rate * np.abs(info["command_rate"]), rtol=1e-14
         )
@@ -437,7 +513,8 @@ def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(sc
 
 
 def test_info_holds_the_documented_keys_and_they_agree_with_the_truth() -> None:
-    """Catches a key that disappears, and a score that is computed from measurements instead of the truth."""
+    """Catches a key that disappears, and a score that is computed from measurements instead of
+    the truth."""
     env = make_testbed(reference=SHORT["multisine"], scenario="sensor")
     observation, info = env.reset(seed=2)
     assert set(info) == INFO_KEYS - {"clipped", "reward_terms", "termination"}
@@ -454,15 +531,20 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth() -> None:
         assert info["link_error_imu"] == reference - info["link_angle_imu"]
         assert info["deflection"] == truth.theta[0, 0] - truth.q[0, 0]
         rate = truth.theta_dot[0, 0] - truth.q_dot[0, 0]
-        assert info["joint_torque"] == pytest.approx(1001.0 * info["deflection"] + 10.0 * rate, abs=1e-9)
-        assert info["command_rate"] == pytest.approx((float(action[0]) - before) / PERIOD_S, abs=1e-12)
+        assert info["joint_torque"] == pytest.approx(
+            1001.0 * info["deflection"] + 10.0 * rate, abs=1e-9
+        )
+        assert info["command_rate"] == pytest.approx(
+            (float(action[0]) - before) / PERIOD_S, abs=1e-12
+        )
         assert info["termination"] == ""
         before = float(action[0])
 
 
 @pytest.mark.parametrize("reference", list(SHORT))
 def test_episode_metrics_are_those_of_the_recorded_signals(reference: str) -> None:
-    """Catches samples of standing or of the episode before in the scores, and a wrong statistic under a right name."""
+    """Catches samples of standing or of the episode before in the scores, and a wrong statistic
+    under a right name."""
     env = make_testbed(reference=SHORT[reference], scenario="sensor")
     episode(env, 0, random_actions(30, 1)[:, 0])  # left half-way: must not show in the next
     plan = env.task.config.reference.plan(np.random.default_rng(0), PERIOD_S)
@@ -470,7 +552,10 @@ def test_episode_metrics_are_those_of_the_recorded_signals(reference: str) -> No
     assert len(log) == plan.num_steps == env.task.num_steps
     assert log[-1][3]
     assert not any("episode_metrics" in entry[4] for entry in log[:-1])
-    recorded = {key: np.array([entry[4][key] for entry in log]) for key in INFO_KEYS - {"reward_terms", "termination"}}
+    recorded = {
+        key: np.array([entry[4][key] for entry in log])
+        for key in INFO_KEYS - {"reward_terms", "termination"}
+    }
     scored = plan.scored[1:]
     assert 0 < scored.sum() < len(log)
     statistics = {
@@ -485,7 +570,9 @@ def test_episode_metrics_are_those_of_the_recorded_signals(reference: str) -> No
     assert set(metrics) == {metric.name for metric in env.task.metrics}
     for metric in env.task.metrics:
         values = recorded[metric.signal][scored if metric.over == "scored" else slice(None)]
-        assert metrics[metric.name] == pytest.approx(statistics[metric.statistic](values), rel=1e-9, abs=1e-15), metric
+        assert metrics[metric.name] == pytest.approx(
+            statistics[metric.statistic](values), rel=1e-9, abs=1e-15
+        ), metric
 
 
 def test_names_of_metrics_end_with_their_unit() -> None:
@@ -497,13 +584,14 @@ def test_names_of_metrics_end_with_their_unit() -> None:
     assert required <= set(names)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Measurements
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_in_ideal_the_observation_is_the_truth() -> None:
-    """Catches noise, counts or delay where there should be none, and columns in another order than the table's."""
+    """Catches noise, counts or delay where there should be none, and columns in another order
+    than the table's."""
     reference = Sine(**SHORT["sine"])
     env = make_testbed(reference=reference, scenario="ideal", observe_link=True)
     plan = reference.plan(np.random.default_rng(0), PERIOD_S)
@@ -515,9 +603,13 @@ def test_in_ideal_the_observation_is_the_truth() -> None:
         truth = env.truth()
         theta = truth.theta[0, 0]
         expected = [
-            theta, (theta - before) / PERIOD_S, plan.q[k + 2], plan.q_dot[k + 2], plan.q_ddot[k + 2],
+            theta,
+            (theta - before) / PERIOD_S,
+            plan.q[k + 2],
+            plan.q_dot[k + 2],
+            plan.q_ddot[k + 2],
             plan.q[k + 1] + float(action[0]),
-        ]  # fmt: skip
+        ]
         np.testing.assert_allclose(observation[:6], expected, rtol=0.0, atol=1e-12)
         before = theta
         if (k + 1) % 5 == 0:  # 100 Hz beside 250 Hz
@@ -525,8 +617,11 @@ def test_in_ideal_the_observation_is_the_truth() -> None:
 
 
 def test_in_nominal_the_encoder_counts_and_the_imu_is_biased_and_noisy() -> None:
-    """Catches counts of the wrong size, an IMU that is sampled too often, and noise of the wrong size."""
-    env = make_testbed(reference={"kind": "sine", "amplitude": 0.3, "duration_s": 5.0}, observe_link=True)
+    """Catches counts of the wrong size, an IMU that is sampled too often, and noise of the wrong
+    size."""
+    env = make_testbed(
+        reference={"kind": "sine", "amplitude": 0.3, "duration_s": 5.0}, observe_link=True
+    )
     log = episode(env, 0, np.zeros((2000, 1), dtype=np.float32))
     observations = np.array([entry[0] for entry in log])
     step = 2.0 * np.pi / ENCODER_COUNTS_PER_TURN
@@ -541,12 +636,15 @@ def test_in_nominal_the_encoder_counts_and_the_imu_is_biased_and_noisy() -> None
     assert fresh.mean() == pytest.approx(0.4, abs=1e-3)
     errors = imu_error[fresh]
     imu = make_scenario("nominal").imu
-    assert errors.mean() == pytest.approx(imu.bias_rad, abs=5 * imu.noise_rad / np.sqrt(len(errors)))
+    assert errors.mean() == pytest.approx(
+        imu.bias_rad, abs=5 * imu.noise_rad / np.sqrt(len(errors))
+    )
     assert errors.std() == pytest.approx(imu.noise_rad, rel=5 / np.sqrt(2 * len(errors)))
 
 
 def test_in_sensor_measurements_are_one_control_step_old_and_homed_with_an_error() -> None:
-    """Catches a delay of two steps or none, a rate that is not that of the angles shown, and a bias that wanders."""
+    """Catches a delay of two steps or none, a rate that is not that of the angles shown, and a
+    bias that wanders."""
     env = make_testbed(reference=SHORT["multisine"], scenario="sensor", observe_link=True)
     log = episode(env, 3, random_actions(400, 1)[:, 0])
     observations = np.array([entry[0] for entry in log])
@@ -556,7 +654,9 @@ def test_in_sensor_measurements_are_one_control_step_old_and_homed_with_an_error
     assert np.ptp(bias) <= step * (1 + 1e-9)
     assert 1e-5 < abs(bias.mean()) <= make_scenario("sensor").encoder_bias_rad
     assert np.ptp(observations[:, 0] - theta) > 5 * step  # without the delay it would not fit
-    np.testing.assert_allclose(observations[1:, 1], np.diff(observations[:, 0]) / PERIOD_S, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        observations[1:, 1], np.diff(observations[:, 0]) / PERIOD_S, rtol=0.0, atol=1e-12
+    )
 
 
 def test_biases_of_the_worlds_are_spread_over_their_interval() -> None:
@@ -577,9 +677,9 @@ def test_biases_of_the_worlds_are_spread_over_their_interval() -> None:
     assert abs(np.corrcoef(encoder, imu)[0, 1]) < 0.3
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Actions
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=20)
@@ -602,13 +702,17 @@ def test_an_action_that_is_not_finite_names_value_bounds_and_shape(value: float)
     """Catches NaN that reaches the physics, where it would look like a divergence."""
     env = make_testbed(reference=SHORT["sine"])
     env.reset(seed=0)
-    with pytest.raises(ActionError, match=rf"finite, within ±0\.3 rad, shape \(1,\).* got \[ *{value}\]"):
+    with pytest.raises(
+        ActionError, match=rf"finite, within ±0\.3 rad, shape \(1,\).* got \[ *{value}\]"
+    ):
         env.step(np.array([value], dtype=np.float32))
     many = make_testbed_vector(4, reference=SHORT["sine"])
     many.reset(seed=0)
     actions = np.zeros((4, 1), dtype=np.float32)
     actions[2] = value
-    with pytest.raises(ActionError, match=rf"finite, within ±0\.3 rad.* got \[ *{value}\] in world 2"):
+    with pytest.raises(
+        ActionError, match=rf"finite, within ±0\.3 rad.* got \[ *{value}\] in world 2"
+    ):
         many.step(actions)
 
 
@@ -625,7 +729,8 @@ def test_an_action_of_wrong_shape_names_the_right_one(shape: tuple[int, ...]) ->
 
 @pytest.mark.parametrize("shape", [(), (1,), (4,), (1, 1), (3, 1), (4, 2), (4, 1, 1)])
 def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> None:
-    """Catches one action that is silently given to all worlds, and NumPy's error in place of ours."""
+    """Catches one action that is silently given to all worlds, and NumPy's error in place of
+    ours."""
     env = make_testbed_vector(4, reference=SHORT["sine"])
     env.reset(seed=0)
     with pytest.raises(ActionError) as error:
@@ -634,9 +739,9 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
     assert f"got shape {shape}" in str(error.value)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Divergence
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
@@ -662,7 +767,8 @@ def test_divergence_ends_the_episode_with_its_reason(value: float) -> None:
 
 
 def test_an_unstable_plant_diverges_by_itself() -> None:
-    """Catches a divergence that only a written NaN would trigger: a spring far too stiff for the physics step."""
+    """Catches a divergence that only a written NaN would trigger: a spring far too stiff for the
+    physics step."""
     env = make_testbed(reference=SHORT["steps"], scenario="ideal")
     env.reset(seed=0)
     env.simulation.vary("tendon_stiffness")[:] = 1e9
@@ -676,30 +782,54 @@ def test_an_unstable_plant_diverges_by_itself() -> None:
     assert info["termination"] == "diverged"
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Arguments
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"scenario": "nominl"}, r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*'nominal'"),
+        (
+            {"scenario": "nominl"},
+            r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*'nominal'",
+        ),
         (
             {"scenario": "ideal+sof"},
-            r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, spread, payload, backlash",
+            (
+                r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, spread,"
+                r" payload, backlash"
+            ),
         ),
         ({"scenario": ""}, r"unknown scenario ''; choose one of: ideal"),
-        ({"scenario": "soft+ideal"}, r"'soft\+ideal': 'ideal' is a ground and can only stand first"),
-        ({"reference": "sin"}, r"unknown reference 'sin'; choose one of: hold, sine, multisine, steps.*'sine'"),
+        (
+            {"scenario": "soft+ideal"},
+            r"'soft\+ideal': 'ideal' is a ground and can only stand first",
+        ),
+        (
+            {"reference": "sin"},
+            r"unknown reference 'sin'; choose one of: hold, sine, multisine, steps.*'sine'",
+        ),
         ({"reference": {"amplitude": 1.0}}, r"unknown reference None; choose one of: hold, sine"),
-        ({"reference": {"kind": "sine", "amp": 1}}, r"unknown parameter of Sine 'amp'; choose one of: .*amplitude"),
+        (
+            {"reference": {"kind": "sine", "amp": 1}},
+            r"unknown parameter of Sine 'amp'; choose one of: .*amplitude",
+        ),
         ({"form": "tendons"}, r"form must be 'tendon' or 'rigid', got 'tendons'"),
         ({"form": "series"}, r"form must be 'tendon' or 'rigid', got 'series'"),
         ({"render_mode": "ascii"}, r"unknown render mode 'ascii'; choose one of: rgb_array, human"),
-        ({"stiffness": -5.0}, r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got -5"),
-        ({"stiffness": 0}, r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got 0"),
-        ({"stiffness": float("nan")}, r"ElasticJoint\.stiffness must be .*finite.*\[N·m/rad\], got nan"),
+        (
+            {"stiffness": -5.0},
+            r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got -5",
+        ),
+        (
+            {"stiffness": 0},
+            r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got 0",
+        ),
+        (
+            {"stiffness": float("nan")},
+            r"ElasticJoint\.stiffness must be .*finite.*\[N·m/rad\], got nan",
+        ),
         (
             {"stiffness": "no/such/identification.json"},
             r"number \[N·m/rad\] or an identification file, found no file no/",
@@ -712,14 +842,22 @@ def test_an_unstable_plant_diverges_by_itself() -> None:
             {"reference": {"kind": "hold", "settle_s": -1}},
             r"Hold\.settle_s must be a finite number >= 0 and",
         ),
-        ({"reference": {"kind": "multisine", "components": 1}}, r"Multisine\.components must be a whole number >= 2"),
+        (
+            {"reference": {"kind": "multisine", "components": 1}},
+            r"Multisine\.components must be a whole number >= 2",
+        ),
         ({"reference": {"kind": "steps", "seed": -1}}, r"Steps\.seed must be a whole number >= 0"),
         ({"reference": 3}, r"a reference is a name, a mapping or a model, got int"),
-        ({"reference": {"kind": "sine", "frequency_hz": 20.0}}, r"'sine' can need .* N·m of a servo limited to 84"),
+        (
+            {"reference": {"kind": "sine", "frequency_hz": 20.0}},
+            r"'sine' can need .* N·m of a servo limited to 84",
+        ),
         ({"joint": H54_200_S500_R.replace(servo=None)}, r"needs a servo, got None"),
     ],
 )
-def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any], message: str) -> None:
+def test_a_wrong_argument_names_itself_and_what_exists(
+    arguments: dict[str, Any], message: str
+) -> None:
     """Catches an argument that is ignored, and an error that sends the user into the source."""
     with pytest.raises(ConfigurationError, match=message):
         make_testbed(**arguments)
@@ -728,12 +866,20 @@ def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any]
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"autoreset_mode": "Next"}, r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled"),
+        (
+            {"autoreset_mode": "Next"},
+            r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled",
+        ),
         ({"num_envs": 0}, r"num_envs must be a whole number >= 1, got 0"),
-        ({"render_mode": "human"}, r"unknown render mode of a vector environment 'human'; choose one of: rgb_array"),
+        (
+            {"render_mode": "human"},
+            r"unknown render mode of a vector environment 'human'; choose one of: rgb_array",
+        ),
     ],
 )
-def test_a_wrong_argument_of_the_vector_environment_names_itself(arguments: dict[str, Any], message: str) -> None:
+def test_a_wrong_argument_of_the_vector_environment_names_itself(
+    arguments: dict[str, Any], message: str
+) -> None:
     """Catches the same for the arguments that only many worlds have."""
     with pytest.raises(ConfigurationError, match=message):
         make_testbed_vector(**arguments)
@@ -753,14 +899,32 @@ def test_a_list_of_seeds_needs_one_per_world() -> None:
             {"control_period_s": 0.0},
             r"TestbedConfig\.control_period_s must be a finite number > 0 \[s\], got 0",
         ),
-        ({"timestep_s": -1e-3}, r"TestbedConfig\.timestep_s must be a finite number > 0 \[s\], got -0\.001"),
-        ({"timestep_s": 3e-4}, r"timestep_s must divide the control period of 0\.004 s, got 0\.0003 s"),
-        ({"perod": 1.0}, r"unknown parameter of TestbedConfig 'perod'; choose one of: .*control_period_s"),
-        ({"pendulum": {"mass": -1.0}}, r"TestbedConfig\.pendulum\.mass must be a finite number > 0 \[kg\], got -1"),
-        ({"pendulum": {"mas": 1.0}}, r"unknown parameter of pendulum 'mas'; choose one of: gravity_torque, mass"),
+        (
+            {"timestep_s": -1e-3},
+            r"TestbedConfig\.timestep_s must be a finite number > 0 \[s\], got -0\.001",
+        ),
+        (
+            {"timestep_s": 3e-4},
+            r"timestep_s must divide the control period of 0\.004 s, got 0\.0003 s",
+        ),
+        (
+            {"perod": 1.0},
+            r"unknown parameter of TestbedConfig 'perod'; choose one of: .*control_period_s",
+        ),
+        (
+            {"pendulum": {"mass": -1.0}},
+            r"TestbedConfig\.pendulum\.mass must be a finite number > 0 \[kg\], got -1",
+        ),
+        (
+            {"pendulum": {"mas": 1.0}},
+            r"unknown parameter of pendulum 'mas'; choose one of: gravity_torque, mass",
+        ),
         (
             {"reference": {"kind": "sine", "amplitude": -1.0}},
-            r"TestbedConfig\.reference\.amplitude must be a finite number > 0 and < 3\.14159 \[rad\], got -1",
+            (
+                r"TestbedConfig\.reference\.amplitude must be a finite number > 0 and < 3\.14159"
+                r" \[rad\], got -1"
+            ),
         ),
         ({"reference": {"kind": "sin"}}, r"(?s)reference.*sin.*hold.*sine.*multisine.*steps"),
         (
@@ -770,14 +934,18 @@ def test_a_list_of_seeds_needs_one_per_world() -> None:
         ({"form": "tendons"}, r"TestbedConfig\.form must be 'tendon' or 'rigid', got 'tendons'"),
     ],
 )
-def test_a_wrong_configuration_names_parameter_unit_and_bound(values: dict[str, Any], message: str) -> None:
-    """Catches errors of nested models that lose the name, the unit or the choices on their way up."""
+def test_a_wrong_configuration_names_parameter_unit_and_bound(
+    values: dict[str, Any], message: str
+) -> None:
+    """Catches errors of nested models that lose the name, the unit or the choices on their way
+    up."""
     with pytest.raises(ConfigurationError, match=message):
         testbed.TestbedTask(TestbedConfig(**values), 1)
 
 
 def test_stiffness_can_come_from_an_identification(tmp_path: Path) -> None:
-    """Catches a file whose K is read and not used, and a file of another kind that is taken for one."""
+    """Catches a file whose K is read and not used, and a file of another kind that is taken for
+    one."""
     file = tmp_path / "identification.json"
     file.write_text(json.dumps({"stiffness_nm_per_rad": 987.0}))
     assert make_testbed(stiffness=file).assumed_model.stiffness.tolist() == [987.0]
@@ -792,23 +960,37 @@ def test_stiffness_can_come_from_an_identification(tmp_path: Path) -> None:
 
 def test_the_assumed_model_does_not_know_the_scenario() -> None:
     """Catches a compensator that is told the true stiffness or mass."""
-    assumed, nominal = (make_testbed(scenario=name).assumed_model for name in ("soft+payload+backlash", "ideal"))
-    for parameter in ("stiffness", "damping", "rotor_inertia", "backlash", "coulomb_friction", "viscous_friction"):
-        np.testing.assert_array_equal(getattr(assumed, parameter), getattr(nominal, parameter), err_msg=parameter)
+    assumed, nominal = (
+        make_testbed(scenario=name).assumed_model for name in ("soft+payload+backlash", "ideal")
+    )
+    for parameter in (
+        "stiffness",
+        "damping",
+        "rotor_inertia",
+        "backlash",
+        "coulomb_friction",
+        "viscous_friction",
+    ):
+        np.testing.assert_array_equal(
+            getattr(assumed, parameter), getattr(nominal, parameter), err_msg=parameter
+        )
     np.testing.assert_array_equal(assumed.rigid.body_mass, nominal.rigid.body_mass)
 
 
 def test_a_second_of_standing_comes_first_and_is_not_scored() -> None:
     """Catches policies that are scored while they ramp in."""
     for name, reference in SHORT.items():
-        plan = make_testbed(reference=reference).task.config.reference.plan(np.random.default_rng(0), PERIOD_S)
+        plan = make_testbed(reference=reference).task.config.reference.plan(
+            np.random.default_rng(0), PERIOD_S
+        )
         standing = round(STAND_S / PERIOD_S)
         np.testing.assert_array_equal(plan.q[: standing + 1], plan.q[0], err_msg=name)
         assert not plan.scored[: standing + 1].any(), name
 
 
 def test_the_rigid_form_has_no_deflection() -> None:
-    """Catches a rigid testbed that still bends, or whose motor and link angles are read from different places."""
+    """Catches a rigid testbed that still bends, or whose motor and link angles are read from
+    different places."""
     env = make_testbed(reference=SHORT["sine"], scenario="ideal", form="rigid")
     for entry in episode(env, 0, random_actions(60, 1)[:, 0]):
         assert entry[-1]["deflection"] == 0.0
@@ -816,11 +998,16 @@ def test_the_rigid_form_has_no_deflection() -> None:
 
 
 def test_defaults_are_those_of_the_paper() -> None:
-    """Catches a default that drifts: the robot, the experiment and the control rate of the paper."""
+    """Catches a default that drifts: the robot, the experiment and the control rate of the
+    paper."""
     config = make_testbed().task.config
     assert isinstance(config.reference, Hold)
     assert config.scenario.name == "nominal"
-    assert (config.joint.stiffness, config.joint.rotor_inertia, config.joint.coulomb_friction) == (1001.0, 0.839, 5.4)
+    assert (config.joint.stiffness, config.joint.rotor_inertia, config.joint.coulomb_friction) == (
+        1001.0,
+        0.839,
+        5.4,
+    )
     assert config.joint.servo == H54_200_S500_R.servo
     assert isinstance(config.joint.servo, Servo)
     assert config.joint.servo.torque_limit == 84.0
@@ -839,7 +1026,8 @@ def test_a_deep_copy_goes_on_as_the_original(num_envs: int) -> None:
         env.step(action)
     twin = copy.deepcopy(env)
     for _ in range(300):
-        expected, observation = env.step(action)[0], twin.step(action)[0]
+        expected = env.step(action)[0]
+        observation = twin.step(action)[0]
     np.testing.assert_array_equal(observation, expected)
     assert np.abs(expected[:, 0]).min() > 0.01
 
@@ -851,24 +1039,32 @@ def test_a_reference_without_a_scored_step_is_an_error() -> None:
 
 
 def test_a_shorter_physics_step_changes_little() -> None:
-    """Catches a timestep_s that is taken for another number of steps per control period, or not at all."""
+    """Catches a timestep_s that is taken for another number of steps per control period, or not
+    at all."""
     ends = []
     for timestep_s in (None, 2.5e-4):
-        env: Any = gymnasium.make("elastic_env/Testbed-v0", scenario="ideal", reference="sine", timestep_s=timestep_s)
+        env: Any = gymnasium.make(
+            "elastic_env/Testbed-v0", scenario="ideal", reference="sine", timestep_s=timestep_s
+        )
         env.reset(seed=0)
         for _ in range(500):
             info = env.step(np.zeros(1, np.float32))[4]
-        ends.append((env.unwrapped.simulation.model.opt.timestep, info["time_s"], info["link_angle"]))
+        ends.append(
+            (env.unwrapped.simulation.model.opt.timestep, info["time_s"], info["link_angle"])
+        )
     (coarse, time_s, link), (fine, same_time_s, same_link) = ends
     assert (coarse, fine, time_s) == (5e-4, 2.5e-4, same_time_s)
     assert 0.0 < abs(link - same_link) < 1e-6
 
 
 def test_the_step_that_residuals_are_trained_with_errs_by_little() -> None:
-    """Catches steps so long that what is learned in them is another joint: 0.02 mrad, a hundredth of what is left."""
+    """Catches steps so long that what is learned in them is another joint: 0.02 mrad, a
+    hundredth of what is left."""
     links = []
     for timestep_s in (1e-3, 1e-4):
-        env: Any = gymnasium.make("elastic_env/Testbed-v0", reference="multisine", timestep_s=timestep_s)
+        env: Any = gymnasium.make(
+            "elastic_env/Testbed-v0", reference="multisine", timestep_s=timestep_s
+        )
         env.reset(seed=5)
         links.append([env.step(np.zeros(1, np.float32))[4]["link_angle"] for _ in range(1000)])
     off = np.abs(np.subtract(*links))

@@ -1,4 +1,5 @@
-"""Friction fed forward, and the disturbance observer with the IMU of the link, on robots of one joint."""
+"""Friction fed forward, and the disturbance observer with the IMU of the link, on robots of one
+joint."""
 
 from typing import Any
 
@@ -9,7 +10,12 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.disturbance_observer import DisturbanceObserver, ObserverGains
-from baselines.compensation.compensators import PRESLIDING_RAD, DynamicCompensator, Motion, presliding_friction
+from baselines.compensation.compensators import (
+    PRESLIDING_RAD,
+    DynamicCompensator,
+    Motion,
+    presliding_friction,
+)
 from baselines.policies import Track, sensors_needed, track
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -18,7 +24,8 @@ from tests.three_joints import ARM
 ID = "elastic_env/Testbed-v0"
 PERIOD_S = 0.004
 HANGING = {"kind": "sine", "amplitude": 1e-6, "duration_s": 2.0, "onset_s": 0.5}
-K, FRICTION = 1001.0, 5.4
+K = 1001.0
+FRICTION = 5.4
 
 
 def made(worlds: int = 1, **arguments: Any) -> Any:
@@ -26,9 +33,14 @@ def made(worlds: int = 1, **arguments: Any) -> Any:
     return gymnasium.make_vec(ID, num_envs=worlds, vectorization_mode="vector_entry_point", **given)
 
 
-def played(policy: Any, env: Any, steps: int | None = None, seed: int = 0) -> tuple[Array, list[Any], Any]:
+def played(
+    policy: Any, env: Any, steps: int | None = None, seed: int = 0
+) -> tuple[Array, list[Any], Any]:
     """True link error, (T, num_worlds) [rad], states, and the last `info` of an episode."""
-    (observation, info), state, errors, states = env.reset(seed=seed), None, [], []
+    observation, info = env.reset(seed=seed)
+    state = None
+    errors = []
+    states = []
     for step in range(steps or env.unwrapped.task.num_steps):
         action, state = policy.predict(observation, state, np.full(len(observation), step == 0))
         observation, _, _, _, info = env.step(action)
@@ -38,22 +50,29 @@ def played(policy: Any, env: Any, steps: int | None = None, seed: int = 0) -> tu
 
 
 def test_friction_turns_round_over_a_displacement() -> None:
-    """Catches a sign and a displacement of another unit: from −F, F (1 − 2 e^{−x/x₀}); at rest it stays."""
-    friction, coulomb = np.array([-FRICTION]), np.array([FRICTION])
+    """Catches a sign and a displacement of another unit: from −F, F (1 − 2 e^{−x/x₀}); at rest
+    it stays."""
+    friction = np.array([-FRICTION])
+    coulomb = np.array([FRICTION])
     for _ in range(50):
         friction = presliding_friction(friction, np.array([1e-5]), coulomb)
-    assert friction[0] == pytest.approx(FRICTION * (1.0 - 2.0 * np.exp(-50 * 1e-5 / PRESLIDING_RAD)), rel=1e-9)
+    assert friction[0] == pytest.approx(
+        FRICTION * (1.0 - 2.0 * np.exp(-50 * 1e-5 / PRESLIDING_RAD)), rel=1e-9
+    )
     np.testing.assert_array_equal(presliding_friction(friction, np.zeros(1), coulomb), friction)
 
 
 @pytest.mark.parametrize("rate", [0.2, -0.2])
 def test_at_constant_speed_the_command_leads_by_friction_over_k(rate: float) -> None:
-    """Catches a friction that pushes, and one that a servo with an integrator is led for for ever."""
+    """Catches a friction that pushes, and one that a servo with an integrator is led for for
+    ever."""
     model = made().unwrapped.assumed_model
     offsets = []
     for knows in (True, False):
         compensator = DynamicCompensator(model, friction=knows)
-        q, dot, offset = np.zeros((1, 1)), np.full((1, 1), rate), np.zeros((1, 1))
+        q = np.zeros((1, 1))
+        dot = np.full((1, 1), rate)
+        offset = np.zeros((1, 1))
         memory = compensator.begin(Motion(q, dot, 0.0 * dot))
         for _ in range(500):
             q = q + rate * PERIOD_S
@@ -64,7 +83,11 @@ def test_at_constant_speed_the_command_leads_by_friction_over_k(rate: float) -> 
 
 def test_friction_fed_forward_leaves_less_error() -> None:
     """Catches a friction of the wrong sign at the robot, which would double the error."""
-    arguments = {"reference": {"kind": "sine", "duration_s": 2.0}, "scenario": "nominal", "sensors": []}
+    arguments = {
+        "reference": {"kind": "sine", "duration_s": 2.0},
+        "scenario": "nominal",
+        "sensors": [],
+    }
     env = made(**arguments)
     figures = []
     for name in ("dynamic", "friction"):
@@ -74,12 +97,18 @@ def test_friction_fed_forward_leaves_less_error() -> None:
 
 
 def rows_of_a_link(env: Any, torque: Array) -> Array:
-    """Observations of a motor that stands and a link under disturbances that hold it back, (T, m): its own ODE."""
-    table, model = env.unwrapped.task.observation_table, env.unwrapped.assumed_model
-    damping, per_rad = float(model.damping[0]), 60.0
+    """Observations of a motor that stands and a link under disturbances that hold it back, (T,
+    m): its own ODE."""
+    table = env.unwrapped.task.observation_table
+    model = env.unwrapped.assumed_model
+    damping = float(model.damping[0])
+    per_rad = 60.0
     inertia = 10.0 * ((60.0 / 98.1) ** 2 + 0.1**2)
     row, _ = env.reset(seed=0)
-    rows, q, q_dot, fine = [], 0.0, 0.0, 200
+    rows = []
+    q = 0.0
+    q_dot = 0.0
+    fine = 200
     for d in torque:
         for _ in range(fine):
             q_ddot = (-K * q - damping * q_dot - per_rad * np.sin(q) - d) / inertia
@@ -100,17 +129,25 @@ class Still:
 
 
 def test_the_observer_finds_a_torque_of_known_size_in_the_stated_time() -> None:
-    """Catches a sign, an inertia, a term that lags behind the others: two filters in series, T and that of the rate.
+    """Catches a sign, an inertia, a term that lags behind the others: two filters in series, T and
+    that of the rate.
 
-    The link swings on its spring meanwhile, by as much as it gives way: what is not consistent rings in the estimate.
+    The link swings on its spring meanwhile, by as much as it gives way: what is not consistent
+    rings in the estimate.
     """
-    gains, env = ObserverGains(time_constant_s=0.3, rate_filter_s=0.03, zero_s=0.0, friction=False), made()
-    torque, action = np.where(np.arange(500) < 100, 0.0, 6.0), np.zeros((1, 1))
-    policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
+    gains = ObserverGains(time_constant_s=0.3, rate_filter_s=0.03, zero_s=0.0, friction=False)
+    env = made()
+    torque = np.where(np.arange(500) < 100, 0.0, 6.0)
+    action = np.zeros((1, 1))
+    policy = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains)
+    state = None
+    found = []
     for step, row in enumerate(rows_of_a_link(env, torque)):
         action, state = policy.predict(row, state, np.array([step == 0]))
         found.append(state.joints.disturbance[0, 0])
-    T, T_v, time = 0.3, 0.03, PERIOD_S * (np.arange(100, 500) - 99)
+    T = 0.3
+    T_v = 0.03
+    time = PERIOD_S * (np.arange(100, 500) - 99)
     expected = 6.0 * (1.0 - (T * np.exp(-time / T) - T_v * np.exp(-time / T_v)) / (T - T_v))
     np.testing.assert_allclose(found[:100], 0.0, atol=1e-9)
     np.testing.assert_allclose(found[100:], expected, atol=0.02 * 6.0)
@@ -119,8 +156,11 @@ def test_the_observer_finds_a_torque_of_known_size_in_the_stated_time() -> None:
 
 
 def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
-    """Catches a lead of the wrong sign or K: 6 N·m bend the joint by 6/1061 rad, of which nothing stays."""
-    env = made(reference={**HANGING, "duration_s": 2.0}, joint={"damping": 60.0})  # else it rings for long
+    """Catches a lead of the wrong sign or K: 6 N·m bend the joint by 6/1061 rad, of which
+    nothing stays."""
+    env = made(
+        reference={**HANGING, "duration_s": 2.0}, joint={"damping": 60.0}
+    )  # else it rings for long
     task = env.unwrapped.task
     address = task.model.joint("joint").dofadr[0]
 
@@ -129,7 +169,9 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
         task.simulation.bind("qfrc_applied")[:, address] = -6.0 if is_late else 0.0
 
     task._disturb = disturb
-    errors, states, _ = played(baselines.make("disturbance_observer", env, observer=ObserverGains(friction=False)), env)
+    errors, states, _ = played(
+        baselines.make("disturbance_observer", env, observer=ObserverGains(friction=False)), env
+    )
     uncompensated, _, _ = played(baselines.make("dynamic", env), env)
     assert uncompensated[-1, 0] == pytest.approx(6.0 / 1061.0, rel=0.02)
     assert abs(errors[-1, 0]) < 0.02 * uncompensated[-1, 0]
@@ -138,9 +180,12 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
 
 def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
     """Catches an integral behind the bound: it leaves the bound as soon as the torque does."""
-    gains, env = ObserverGains(limit_nm=2.0, zero_s=0.0, friction=False), made()
+    gains = ObserverGains(limit_nm=2.0, zero_s=0.0, friction=False)
+    env = made()
     torque = np.where(np.arange(400) < 200, 20.0, 0.0)
-    policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
+    policy = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains)
+    state = None
+    found = []
     for step, row in enumerate(rows_of_a_link(env, torque)):
         _, state = policy.predict(row, state, np.array([step == 0]))
         found.append(state.joints.disturbance[0, 0])
@@ -149,9 +194,12 @@ def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
 
 
 def test_at_rest_what_friction_can_hold_is_no_disturbance() -> None:
-    """Catches an observer that winds up against a link that sticks: of 6 N·m only what is beyond 5.4 counts."""
-    gains, env = ObserverGains(zero_s=0.0), made()
-    policy, state = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None
+    """Catches an observer that winds up against a link that sticks: of 6 N·m only what is beyond
+    5.4 counts."""
+    gains = ObserverGains(zero_s=0.0)
+    env = made()
+    policy = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains)
+    state = None
     for step, row in enumerate(rows_of_a_link(env, np.full(100, FRICTION - 0.1))):
         _, state = policy.predict(row, state, np.array([step == 0]))
     assert abs(state.joints.disturbance[0, 0]) < 1.0
@@ -167,7 +215,8 @@ def test_the_imu_is_zeroed_where_the_joint_hangs(middle: float, expected: float)
 
 @pytest.mark.parametrize("scenario", ["nominal", "soft", "stiff", "payload", "backlash", "sensor"])
 def test_the_observer_is_stable_in_every_scenario(scenario: str) -> None:
-    """Catches a loop through the resonance: after quick steps the link is still, in the last half second of a rest."""
+    """Catches a loop through the resonance: after quick steps the link is still, in the last
+    half second of a rest."""
     steps = {"kind": "steps", "amplitude": 0.3, "moves": 1, "move_s": 0.8, "rest_s": 2.0}
     env = made(reference=steps, scenario=scenario)
     errors, _, _ = played(baselines.make("disturbance_observer", env), env)
@@ -176,11 +225,16 @@ def test_the_observer_is_stable_in_every_scenario(scenario: str) -> None:
 
 
 def test_the_link_imu_is_a_sensor() -> None:
-    """Catches other columns than `observe_link` has, and an observation that changes where nobody asks."""
-    tables = [made(sensors=given).unwrapped.task.observation_table.names for given in (["link_imu"], [])]
+    """Catches other columns than `observe_link` has, and an observation that changes where
+    nobody asks."""
+    tables = [
+        made(sensors=given).unwrapped.task.observation_table.names for given in (["link_imu"], [])
+    ]
     asked = made(sensors=[], observe_link=True).unwrapped.task.observation_table.names
     assert list(tables[0]) == list(asked) == [*tables[1], "link_angle_imu"]
-    with_both = made(sensors=["joint_torque", "link_imu"], observe_link=True).unwrapped.task.observation_table.names
+    with_both = made(
+        sensors=["joint_torque", "link_imu"], observe_link=True
+    ).unwrapped.task.observation_table.names
     assert list(with_both) == [*asked, "joint_torque"]
     with pytest.raises(ConfigurationError, match="one joint, and arm has 3"):
         ARM.robot.make(sensors=["link_imu"])
@@ -198,9 +252,13 @@ def test_tracks_and_sensors_are_said() -> None:
 def test_worlds_are_apart_and_episodes_begin_anew() -> None:
     """Catches memory that leaks from world to world or from one episode to the next."""
     env = made(
-        worlds=2, reference={"kind": "sine", "amplitude": 0.1, "duration_s": 1.0, "onset_s": 0.5}, scenario="nominal"
+        worlds=2,
+        reference={"kind": "sine", "amplitude": 0.1, "duration_s": 1.0, "onset_s": 0.5},
+        scenario="nominal",
     )
-    policy, recorded, state = baselines.make("disturbance_observer", env), [], None
+    policy = baselines.make("disturbance_observer", env)
+    recorded = []
+    state = None
     observation, _ = env.reset(seed=5)
     for step in range(300):
         action, state = policy.predict(observation, state, np.full(2, step == 0))

@@ -16,7 +16,8 @@ def held(robot: Thormang | None = None) -> mujoco.MjModel:
 
 
 def test_mass_and_center_of_mass_are_those_of_the_sources() -> None:
-    """Catches a link left out or counted twice: 57 kg, legs of 11.860 kg, COM 0.054 m over the hip axis."""
+    """Catches a link left out or counted twice: 57 kg, legs of 11.860 kg, COM 0.054 m over the
+    hip axis."""
     model = held()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -34,7 +35,9 @@ def test_gravity_torques_agree_with_pinocchio() -> None:
     for q in np.random.default_rng(0).uniform(-0.6, 0.6, (20, 12)):
         data.qpos[columns] = q
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(body.gravity_torque(q), data.qfrc_bias[columns], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            body.gravity_torque(q), data.qfrc_bias[columns], rtol=0.0, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("side", [0, 1])
@@ -59,7 +62,8 @@ def test_closed_form_kinematics_are_those_of_the_model(side: int) -> None:
 
 
 def test_static_torques_of_figure_1_are_those_of_the_facts() -> None:
-    """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, ZMP under the ankle: 65.5, 36 and 8.3 N·m.
+    """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, ZMP under the ankle: 65.5, 36 and
+    8.3 N·m.
 
     Catches a load that is carried by the wrong leg, and an upper body put in the wrong place.
     """
@@ -101,7 +105,8 @@ def test_options_change_what_they_say() -> None:
     assert twin["r_knee"].servo is not None
     assert twin["r_knee"].servo.torque_limit == 168.0
     loaded = held(Thormang(torso_load_kg=5.0))
-    load, torso = loaded.body("load"), loaded.body("upper_body")
+    load = loaded.body("load")
+    torso = loaded.body("upper_body")
     assert load.mass[0] == 5.0
     np.testing.assert_allclose(load.pos + load.ipos, 2.0 * torso.ipos)  # on the shoulders
     assert load.pos[2] + load.ipos[2] == pytest.approx(0.319)

@@ -21,9 +21,14 @@ SPRING = """<mujoco><option timestep="0.01" integrator="{integrator}" gravity="0
 SERVO = Servo(position_gain=2e3, velocity_gain=100.0, torque_limit=50.0, speed_limit=3.0)
 
 
-@pytest.mark.parametrize(("integrator", "limit"), [("Euler", 2.0), ("implicitfast", 2.0), ("RK4", 2.0 * np.sqrt(2.0))])
-def test_a_spring_without_damper_has_the_limit_of_the_textbook(integrator: str, limit: float) -> None:
-    """Catches a wrong state, and differences in place of the integrator's own step: ωh < 2, or 2√2 of RK4."""
+@pytest.mark.parametrize(
+    ("integrator", "limit"), [("Euler", 2.0), ("implicitfast", 2.0), ("RK4", 2.0 * np.sqrt(2.0))]
+)
+def test_a_spring_without_damper_has_the_limit_of_the_textbook(
+    integrator: str, limit: float
+) -> None:
+    """Catches a wrong state, and differences in place of the integrator's own step: ωh < 2, or
+    2√2 of RK4."""
     model = mujoco.MjModel.from_xml_string(SPRING.format(integrator=integrator, stiffness=4e6))
     omega = np.sqrt(4e6 / 4.0)
     assert omega * largest_stable_timestep(model) == pytest.approx(limit, rel=2e-3)
@@ -45,12 +50,16 @@ def test_a_model_that_no_step_follows_is_refused_without_messages_of_mujoco(
 
 
 @pytest.mark.parametrize(("stiffness", "is_refused"), [(4e4, False), (6e4, True), (1e5, True)])
-def test_a_walker_that_would_explode_is_refused_with_the_largest_step(stiffness: float, is_refused: bool) -> None:
+def test_a_walker_that_would_explode_is_refused_with_the_largest_step(
+    stiffness: float, is_refused: bool
+) -> None:
     """Catches a stiffness that ends as "fell" with joints at a million rad/s."""
     if not is_refused:
         gymnasium.make("elastic_env/WalkInPlace-v0", stiffness=stiffness)
         return
-    with pytest.raises(ConfigurationError, match=r"largest stable one is timestep_s = 0\.000\d+ s") as error:
+    with pytest.raises(
+        ConfigurationError, match=r"largest stable one is timestep_s = 0\.000\d+ s"
+    ) as error:
         gymnasium.make("elastic_env/WalkInPlace-v0", stiffness=stiffness)
     timestep_s = float(str(error.value).rsplit("timestep_s = ", 1)[1].split()[0])
     gymnasium.make("elastic_env/WalkInPlace-v0", stiffness=stiffness, timestep_s=timestep_s)
@@ -102,43 +111,61 @@ def arm(integrator: str, timestep_s: float) -> mujoco.MjSpec:
     return spec
 
 
-@pytest.mark.parametrize(("integrator", "becomes"), [("Euler", True), ("RK4", True), ("implicitfast", False)])
-def test_the_integrator_is_changed_where_the_springs_need_it(integrator: str, becomes: bool) -> None:
-    """Catches a model that explodes, a change without a word and one without need; the sag has a closed form."""
-    spec, joints = arm(integrator, 3e-3), {"shoulder": JOINT.replace(servo=SERVO)}
+@pytest.mark.parametrize(
+    ("integrator", "becomes"), [("Euler", True), ("RK4", True), ("implicitfast", False)]
+)
+def test_the_integrator_is_changed_where_the_springs_need_it(
+    integrator: str, becomes: bool
+) -> None:
+    """Catches a model that explodes, a change without a word and one without need; the sag has a
+    closed form."""
+    spec = arm(integrator, 3e-3)
+    joints = {"shoulder": JOINT.replace(servo=SERVO)}
     assert is_well(moved(transformed(spec, joints).compile(), 2.0)) == (not becomes)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         model = make_elastic(spec, joints).compile()
     assert [str(one.message) for one in said] == becomes * [
-        f"the elastic joints explode with {integrator.upper()} at a physics step of 0.003 s; the elastic model has the "
-        "integrator IMPLICITFAST, which follows them"
+        f"the elastic joints explode with {integrator.upper()} at a physics step of 0.003 s; the"
+        " elastic model has the integrator IMPLICITFAST, which follows them"
     ]
     assert model.opt.integrator == IMPLICITFAST
     data = moved(model, 10.0)
     assert is_well(data)
     q = data.joint("shoulder").qpos[0]
     torque = 9.81 * model.body_mass.sum() * 0.15 * np.cos(q)
-    assert q == pytest.approx(torque * (1.0 / JOINT.stiffness + 1.0 / SERVO.position_gain), rel=1e-6)
+    assert q == pytest.approx(
+        torque * (1.0 / JOINT.stiffness + 1.0 / SERVO.position_gain), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
 def test_what_no_integrator_follows_is_refused_with_the_largest_step(integrator: str) -> None:
-    """Catches a step that is named and explodes, and one that is named far below what MuJoCo follows."""
-    with pytest.raises(ConfigurationError, match=r"at most 0\.\d+ s before they are made elastic") as error:
+    """Catches a step that is named and explodes, and one that is named far below what MuJoCo
+    follows."""
+    with pytest.raises(
+        ConfigurationError, match=r"at most 0\.\d+ s before they are made elastic"
+    ) as error:
         make_elastic(arm(integrator, 0.01), {"shoulder": JOINT})
     largest_s = float(str(error.value).split("at most ")[1].split()[0])
     for timestep_s, holds in ((largest_s, True), (1.3 * largest_s, False)):
         elastic = transformed(arm("implicitfast", timestep_s), {"shoulder": JOINT})
         assert is_well(moved(elastic.compile(), 10.0)) == holds
-    with pytest.warns(UserWarning, match="IMPLICITFAST") if integrator != "implicitfast" else nullcontext():
+    with (
+        pytest.warns(UserWarning, match="IMPLICITFAST")
+        if integrator != "implicitfast"
+        else nullcontext()
+    ):
         make_elastic(arm(integrator, largest_s), {"shoulder": JOINT})
 
 
 @pytest.mark.parametrize("path", ASSETS, ids=lambda path: path.stem)
-@pytest.mark.filterwarnings("ignore:the elastic joints explode", "ignore:compiler attribute 'settotalmass'")
+@pytest.mark.filterwarnings(
+    "ignore:the elastic joints explode", "ignore:compiler attribute 'settotalmass'"
+)
 def test_known_robots_move_or_are_refused(path: Path) -> None:
-    """Catches an integrator that does not fit: with their own, half of Gymnasium's robots explode with this joint."""
+    """Catches an integrator that does not fit: with their own, half of Gymnasium's robots
+    explode with this joint."""
     spec = mujoco.MjSpec.from_file(str(path))
     hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
     joints = dict.fromkeys(hinges, JOINT)
@@ -153,7 +180,8 @@ def test_known_robots_move_or_are_refused(path: Path) -> None:
 
 
 def test_no_reset_hides_a_divergence() -> None:
-    """Catches a model that MuJoCo starts anew: its state is finite then, and its clock begins at zero."""
+    """Catches a model that MuJoCo starts anew: its state is finite then, and its clock begins at
+    zero."""
     model = make_elastic(arm("implicitfast", 1e-3), {"shoulder": JOINT}).compile()
     model.tendon_stiffness[:] *= 1e4
     data = moved(model, 1.0)
@@ -180,7 +208,9 @@ def test_a_full_arena_is_said_once_and_is_no_divergence() -> None:
     """Catches an episode that ends as diverged although its state is finite."""
     from elastic_env.world.physics import SingleWorld
 
-    bodies = "".join(f'<body pos="{0.05 * i} 0 .02"><freejoint/><geom size=".03"/></body>' for i in range(12))
+    bodies = "".join(
+        f'<body pos="{0.05 * i} 0 .02"><freejoint/><geom size=".03"/></body>' for i in range(12)
+    )
     simulation = SingleWorld(mujoco.MjModel.from_xml_string(FULL.format(bodies=bodies)))
     simulation.advance(5)
     with pytest.warns(UserWarning, match="too many .* for its memory"):

@@ -1,4 +1,5 @@
-"""Training of residuals: resumed against uninterrupted to the last bit, states, mixtures, and what is refused."""
+"""Training of residuals: resumed against uninterrupted to the last bit, states, mixtures, and
+what is refused."""
 
 import csv
 import itertools
@@ -47,11 +48,21 @@ from train.workers.executors import Executors
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
 SMALL: dict[str, Any] = {
-    "env": "testbed", "reference": SINE, "base": "input", "worlds": 4, "decisions": 192, "evaluate_every": 96,
-    "checkpoint_every": 64, "evaluation_episodes": 1, "settings": {"decision_period": 100, "history": 1},
-}  # fmt: skip
+    "env": "testbed",
+    "reference": SINE,
+    "base": "input",
+    "worlds": 4,
+    "decisions": 192,
+    "evaluate_every": 96,
+    "checkpoint_every": 64,
+    "evaluation_episodes": 1,
+    "settings": {"decision_period": 100, "history": 1},
+}
 PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "anneal": True}
-SAC = {"algorithm": "SAC", "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1}}
+SAC = {
+    "algorithm": "SAC",
+    "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1},
+}
 
 
 def options(**given: Any) -> dict[str, Any]:
@@ -64,19 +75,30 @@ def network(**given: Any) -> dict[str, Any]:
     return options(policy_kwargs=given)
 
 
-def some_worlds(robot: str = "testbed", n: int = 3, scenario: str = "nominal", **options: Any) -> Any:
+def some_worlds(
+    robot: str = "testbed", n: int = 3, scenario: str = "nominal", **options: Any
+) -> Any:
     """A few worlds that nobody restarts."""
     name = "elastic_env/Testbed-v0" if robot == "testbed" else "elastic_env/WalkInPlace-v0"
-    motion = {"reference": SINE} if robot == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+    motion = (
+        {"reference": SINE}
+        if robot == "testbed"
+        else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+    )
     return gymnasium.make_vec(
-        name, num_envs=n, vectorization_mode="vector_entry_point", scenario=scenario,
+        name,
+        num_envs=n,
+        vectorization_mode="vector_entry_point",
+        scenario=scenario,
         **{"autoreset_mode": AutoresetMode.DISABLED, **motion, **options},
-    )  # fmt: skip
+    )
 
 
 def under_residuals(env: Any, base: str = "input") -> ResidualVectorWrapper:
     """Residuals in worlds that restart in the step in which they end."""
-    return ResidualVectorWrapper(env, base, history=1, decision_period=10, autoreset_mode=AutoresetMode.SAME_STEP)
+    return ResidualVectorWrapper(
+        env, base, history=1, decision_period=10, autoreset_mode=AutoresetMode.SAME_STEP
+    )
 
 
 def wrapped(
@@ -107,7 +129,8 @@ def interrupted_after(decisions: int) -> Callable[[int], None]:
 def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     options: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Catches a random state, a world, a memory, an optimiser or a buffer that does not go on where it was."""
+    """Catches a random state, a world, a memory, an optimiser or a buffer that does not go on
+    where it was."""
     whole = TrainConfig(**{**SMALL, **options})
     Training(whole, 1, tmp_path / "whole").run()
     with pytest.raises(KeyboardInterrupt):
@@ -115,24 +138,30 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     resumed = Training(whole, 1, tmp_path / "part")
     assert 0 < resumed.done < whole.decisions
     resumed.run()
-    one, other = weights(tmp_path / "whole" / "last"), weights(tmp_path / "part" / "last")
+    one = weights(tmp_path / "whole" / "last")
+    other = weights(tmp_path / "part" / "last")
     assert one.keys() == other.keys()
     for name, tensor in one.items():
         np.testing.assert_array_equal(tensor, other[name], err_msg=name)
     events = EventAccumulator(str(tmp_path / "whole" / "tensorboard")).Reload()
     assert {"rollout/reward_per_decision", "train/learning_rate"} <= set(events.Tags()["scalars"])
     assert "rollout/ep_rew_mean" not in events.Tags()["scalars"]
-    assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "part" / "progress.csv").read_bytes()
+    assert (tmp_path / "whole" / "progress.csv").read_bytes() == (
+        tmp_path / "part" / "progress.csv"
+    ).read_bytes()
 
 
 def test_curves_say_how_much_better_than_the_base_a_policy_is(tmp_path: Path) -> None:
-    """Catches a curve that falls while the error does, and one of another figure than progress.csv has."""
+    """Catches a curve that falls while the error does, and one of another figure than
+    progress.csv has."""
     Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).run()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     shown = {event.step: event.value for event in events.Scalars("eval/link_error_rms_rad_change")}
     rows = read_progress(tmp_path)
     assert shown == {
-        row["decisions"]: pytest.approx(row["link_error_rms_rad"] / row["base_link_error_rms_rad"] - 1.0, abs=1e-7)
+        row["decisions"]: pytest.approx(
+            row["link_error_rms_rad"] / row["base_link_error_rms_rad"] - 1.0, abs=1e-7
+        )
         for row in rows
     }
     assert [event.value for event in events.Scalars("eval/failed")] == [0.0] * len(rows)
@@ -147,12 +176,15 @@ def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
     curves.close()
     events = EventAccumulator(str(tmp_path)).Reload()
     assert events.Tags()["scalars"] == ["rollout/reward_per_decision"]
-    ((step, value),) = [(event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")]
+    ((step, value),) = [
+        (event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")
+    ]
     assert (step, value) == (7, -8.0)
 
 
 def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
-    """Catches first episodes, which are cut and of the beginning of the motion, in a mean with whole ones."""
+    """Catches first episodes, which are cut and of the beginning of the motion, in a mean with
+    whole ones."""
     worlds = SB3VecEnv(wrapped(n=4), np.random.default_rng(0))
     worlds.reset()
     lengths = []
@@ -166,7 +198,8 @@ def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
 
 def spoilt(worlds: SB3VecEnv, after: int, part: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a step after some others return nan as its observation (0) or its reward (1)."""
-    step, count = worlds.env.step, itertools.count()
+    step = worlds.env.step
+    count = itertools.count()
 
     def spoil(actions: Any) -> Any:
         result = list(step(actions))
@@ -184,7 +217,10 @@ def test_nan_ends_a_training_with_one_sentence(
     """Catches a traceback of torch, a checkpoint that holds nan, and one that is lost."""
     training = Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path)
     spoilt(training._worlds, 20, part, monkeypatch)
-    message = rf"{quantity} is not a finite number at decision 8\d of training seed 1; the checkpoint of decision 64 is"
+    message = (
+        rf"{quantity} is not a finite number at decision 8\d of training seed 1; the checkpoint of"
+        r" decision 64 is"
+    )
     with pytest.raises(ElasticError, match=message):
         training.run()
     assert Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).done == 64
@@ -210,15 +246,21 @@ def test_weights_that_are_nan_are_named(tmp_path: Path) -> None:
     training = Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path)
     with torch.no_grad():
         training.model.policy.log_std.fill_(np.nan)
-    with pytest.raises(ElasticError, match=r"log_std of the network is not a finite number.*no checkpoint was due"):
+    with pytest.raises(
+        ElasticError, match=r"log_std of the network is not a finite number.*no checkpoint was due"
+    ):
         training.run()
 
 
-def test_a_search_whose_reward_is_nan_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_search_whose_reward_is_nan_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Catches a search that is told nan and goes anywhere."""
     search = ConstantSearch(TrainConfig(**SEARCH), 0, tmp_path)
     step = search._worlds.step
-    monkeypatch.setattr(search._worlds, "step", lambda given: (lambda r: (r[0], r[1] * np.nan, *r[2:]))(step(given)))
+    monkeypatch.setattr(
+        search._worlds, "step", lambda given: (lambda r: (r[0], r[1] * np.nan, *r[2:]))(step(given))
+    )
     with pytest.raises(ElasticError, match="the reward is not a finite number"):
         search.run()
 
@@ -236,18 +278,21 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
                 damaged.unlink()
             else:
                 damaged.write_bytes(damaged.read_bytes()[:size])
-            with pytest.raises(ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"):
+            with pytest.raises(
+                ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"
+            ):
                 Training(config, 1, folder)
 
 
 def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
     code = (
-        "from pathlib import Path; import sys; from tests.test_training import SMALL, PPO;"
-        "from train.learn.training import Training; from train.learn.train_config import TrainConfig;"
-        "Training(TrainConfig(**{**SMALL, **PPO}), 1, Path(sys.argv[1])).run()"
+        "from pathlib import Path; import sys; from tests.test_training import SMALL, PPO;from"
+        " train.learn.training import Training; from train.learn.train_config import"
+        " TrainConfig;Training(TrainConfig(**{**SMALL, **PPO}), 1, Path(sys.argv[1])).run()"
     )
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    killed = tmp_path / "killed"
+    whole = tmp_path / "whole"
     process = subprocess.Popen([sys.executable, "-c", code, str(killed)], cwd=ROOT)
     while not (killed / "checkpoint").exists():
         time.sleep(0.02)
@@ -262,7 +307,8 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
 
 
 def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: Path) -> None:
-    """Catches a beginning that is far from the base, whose score is taken for it without playing."""
+    """Catches a beginning that is far from the base, whose score is taken for it without
+    playing."""
     config = TrainConfig(**{**SMALL, **PPO})
     with pytest.raises(KeyboardInterrupt):
         Training(config, 1, tmp_path).run(interrupted_after(1))
@@ -277,25 +323,50 @@ def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: 
 
 
 SEARCH: dict[str, Any] = {
-    **SMALL, "base": "input", "algorithm": "CMA-ES", "worlds": 8, "decisions": 1200, "evaluate_every": 600,
-    "checkpoint_every": 200, "algorithm_options": {"population_size": 8, "sigma": 0.3}, "scenarios": ["ideal+soft"],
+    **SMALL,
+    "base": "input",
+    "algorithm": "CMA-ES",
+    "worlds": 8,
+    "decisions": 1200,
+    "evaluate_every": 600,
+    "checkpoint_every": 200,
+    "algorithm_options": {"population_size": 8, "sigma": 0.3},
+    "scenarios": ["ideal+soft"],
     "settings": {"decision_period": 10},
-}  # fmt: skip
+}
 
 
 def test_the_search_finds_the_stiffness_that_is_wrong(tmp_path: Path) -> None:
-    """Catches a search up the hill, candidates mixed up among worlds, and constants that are exported wrongly.
+    """Catches a search up the hill, candidates mixed up among worlds, and constants that are
+    exported wrongly.
 
     With the true K at 0.7 of the assumed one, slow motion is compensated at 1 + r = 1 / 0.7.
     """
-    slow = {"kind": "sine", "duration_s": 2.0, "onset_s": 1.5, "amplitude": 0.6, "frequency_hz": 0.1}
-    given = {"reference": slow, "base": "dynamic", "decisions": 3000, "evaluate_every": 3000, "checkpoint_every": 3000}
-    search = ConstantSearch(TrainConfig(**{**SEARCH, **given, "settings": {"decision_period": 25}}), 0, tmp_path)
+    slow = {
+        "kind": "sine",
+        "duration_s": 2.0,
+        "onset_s": 1.5,
+        "amplitude": 0.6,
+        "frequency_hz": 0.1,
+    }
+    given = {
+        "reference": slow,
+        "base": "dynamic",
+        "decisions": 3000,
+        "evaluate_every": 3000,
+        "checkpoint_every": 3000,
+    }
+    search = ConstantSearch(
+        TrainConfig(**{**SEARCH, **given, "settings": {"decision_period": 25}}), 0, tmp_path
+    )
     search.run()
     _, network = load_residual(tmp_path / "last")
     found = network(np.random.default_rng(0).normal(size=(3, network.num_features)))
     np.testing.assert_allclose(0.6 * found, 1.0 / 0.7 - 1.0, atol=0.02)
-    assert read_progress(tmp_path)[-1]["link_error_rms_rad"] < 0.1 * read_progress(tmp_path)[0]["link_error_rms_rad"]
+    assert (
+        read_progress(tmp_path)[-1]["link_error_rms_rad"]
+        < 0.1 * read_progress(tmp_path)[0]["link_error_rms_rad"]
+    )
 
 
 def test_a_resumed_search_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
@@ -321,7 +392,8 @@ def test_a_mixture_is_its_parts() -> None:
     observation, _ = whole.reset(seed=7)
     alone = np.concatenate([parts[0].reset(seed=7)[0], parts[1].reset(seed=9)[0]])
     np.testing.assert_array_equal(observation, alone)
-    generator, ends = np.random.default_rng(2), 0
+    generator = np.random.default_rng(2)
+    ends = 0
     for _ in range(100):
         residual = generator.uniform(-1.0, 1.0, (3, 1))
         observation, reward, terminated, truncated, info = whole.step(residual)
@@ -335,9 +407,14 @@ def test_a_mixture_is_its_parts() -> None:
                     final = results[part][4]
                     np.testing.assert_array_equal(info["final_obs"][world], final["final_obs"][row])
                     metrics = final["final_info"]["episode_metrics"]["link_error_rms_rad"]
-                    assert info["final_info"]["episode_metrics"]["link_error_rms_rad"][world] == metrics[row]
+                    assert (
+                        info["final_info"]["episode_metrics"]["link_error_rms_rad"][world]
+                        == metrics[row]
+                    )
     assert ends > 0
-    observation, _ = whole.reset(seed=[1, 2, 3], options={"reset_mask": np.array([False, True, False])})
+    observation, _ = whole.reset(
+        seed=[1, 2, 3], options={"reset_mask": np.array([False, True, False])}
+    )
     again, _ = parts[0].reset(seed=[1, 2], options={"reset_mask": np.array([False, True])})
     np.testing.assert_array_equal(observation[:2], again)
 
@@ -353,8 +430,11 @@ def test_a_mixture_is_its_parts() -> None:
         (4, 4, [1] * 4),
     ],
 )
-def test_the_last_environments_share_what_cores_are_left(cores: int, environments: int, threads: list[int]) -> None:
-    """Catches a core that waits while the last of five scenarios steps, and more threads than cores."""
+def test_the_last_environments_share_what_cores_are_left(
+    cores: int, environments: int, threads: list[int]
+) -> None:
+    """Catches a core that waits while the last of five scenarios steps, and more threads than
+    cores."""
     assert threads_of_each(cores, environments) == threads
 
 
@@ -375,7 +455,8 @@ def test_rewards_of_a_scenario_count_by_its_weight() -> None:
 
 
 def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
-    """Catches worlds whose observation, length or assumed robot differs from what the policy was made for."""
+    """Catches worlds whose observation, length or assumed robot differs from what the policy was
+    made for."""
     one = some_worlds(n=1)
     with pytest.raises(ConfigurationError, match=r"at least one environment"):
         MixedVectorEnv([])
@@ -388,8 +469,13 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
     ):
         with pytest.raises(ConfigurationError, match=f"must have the same {problem}"):
             MixedVectorEnv([one, other])
-    for pair in ([one, some_worlds(n=1, stiffness=900.0)], [some_worlds("walker", 1, x) for x in ("ideal", "soft")]):
-        with pytest.raises(ConfigurationError, match=r"assume the same joints: .* apart from the others"):
+    for pair in (
+        [one, some_worlds(n=1, stiffness=900.0)],
+        [some_worlds("walker", 1, x) for x in ("ideal", "soft")],
+    ):
+        with pytest.raises(
+            ConfigurationError, match=r"assume the same joints: .* apart from the others"
+        ):
             MixedVectorEnv(pair)
     with pytest.raises(ConfigurationError, match=r"oracle .* which MixedVectorEnv does not have"):
         baselines.make("oracle", MixedVectorEnv([one]))
@@ -397,16 +483,21 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
 
 @pytest.mark.parametrize("env", ["testbed", "walker"])
 def test_episodes_played_together_score_as_alone(env: str) -> None:
-    """Catches scores of another world, episode, scenario or policy, and a fall that counts as a score."""
+    """Catches scores of another world, episode, scenario or policy, and a fall that counts as a
+    score."""
     motion: Any = SINE if env == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
     base = "input" if env == "testbed" else "uncompensated"
     metric = "link_error_rms_rad" if env == "testbed" else "pelvis_error_rms_rad"
-    config = TrainConfig(env=env, reference=motion, scenarios=["soft", "nominal", "sensor"], base=base)
+    config = TrainConfig(
+        env=env, reference=motion, scenarios=["soft", "nominal", "sensor"], base=base
+    )
     conditions = [
         config.condition(scenario, base).replace(episodes=n)
         for scenario, n in zip(config.scenarios, (2, 1, 3), strict=True)
     ]
-    for (values, failed), condition in zip(played_together(conditions, [metric]), conditions, strict=True):
+    for (values, failed), condition in zip(
+        played_together(conditions, [metric]), conditions, strict=True
+    ):
         alone = evaluate(condition, num_threads=1)
         assert values.shape == (condition.episodes, 1)
         assert failed.sum() == alone.num_failed
@@ -414,7 +505,8 @@ def test_episodes_played_together_score_as_alone(env: str) -> None:
 
 
 def test_staggered_worlds_stand_all_over_the_walk() -> None:
-    """Catches worlds that begin together for good, so that every batch shows one phase, and a cut that is an end."""
+    """Catches worlds that begin together for good, so that every batch shows one phase, and a
+    cut that is an end."""
     env = wrapped("walker", 6, base="input_output")
     env.reset(seed=0)
     env.stagger(np.random.default_rng(0))
@@ -436,7 +528,9 @@ def test_staggered_worlds_stand_all_over_the_walk() -> None:
     assert times[-1] - times[0] > 0.6 * length
 
 
-def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_training_seeds_and_evaluation_seeds_are_disjoint(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Catches a policy that is scored on episodes that it learned from."""
     seen: list[Any] = []
     reset = MixedVectorEnv.reset
@@ -469,24 +563,39 @@ def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> Non
 def test_train_command_trains_every_seed_and_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches a seed left out, seeds that differ side by side, policies without a player, a resume that begins anew."""
+    """Catches a seed left out, seeds that differ side by side, policies without a player, a
+    resume that begins anew."""
     monkeypatch.chdir(tmp_path)
     given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
     Path("c.yaml").write_text(yaml.safe_dump(given))
     main(["train", "c.yaml", "--jobs", "2"])
     Training(TrainConfig(**given), 4, tmp_path / "alone").run()
     for name, tensor in weights(tmp_path / "alone" / "last").items():
-        np.testing.assert_array_equal(tensor, weights(tmp_path / "runs/mine/seed_4/last")[name], err_msg=name)
+        np.testing.assert_array_equal(
+            tensor, weights(tmp_path / "runs/mine/seed_4/last")[name], err_msg=name
+        )
     assert "elastic train --resume runs/mine" in capsys.readouterr().out
     for seed in (3, 4):
         description, _ = load_residual(Path(f"runs/mine/seed_{seed}/last"))
         assert description.training["seed"] == seed
-        assert {row["scenario"] for row in read_progress(Path(f"runs/mine/seed_{seed}"))} == {"nominal"}
+        assert {row["scenario"] for row in read_progress(Path(f"runs/mine/seed_{seed}"))} == {
+            "nominal"
+        }
     before = (Path("runs/mine/seed_3/last/weights.safetensors")).read_bytes()
     main(["train", "--resume", "runs/mine"])
     assert "runs/mine is complete" in capsys.readouterr().out
     assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
-    main(["evaluate", "--policy", "residual:runs/mine/seed_3/last", "--reference", "sine", "--output", "e"])
+    main(
+        [
+            "evaluate",
+            "--policy",
+            "residual:runs/mine/seed_3/last",
+            "--reference",
+            "sine",
+            "--output",
+            "e",
+        ]
+    )
     with Path("e/episodes.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["link_error_rms_rad"]) > 0.0
@@ -495,16 +604,37 @@ def test_train_command_trains_every_seed_and_resumes(
 def test_several_configurations_are_trained_in_one_pool(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches configurations that wait for one another, a seed in the folder of another, a resume of one alone."""
+    """Catches configurations that wait for one another, a seed in the folder of another, a
+    resume of one alone."""
     monkeypatch.chdir(tmp_path)
-    pools, opened = list[int](), Executors.open
+    pools = list[int]()
+    opened = Executors.open
     monkeypatch.setattr(
-        Executors, "open", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder)
+        Executors,
+        "open",
+        lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder),
     )
-    configs = {name: {"name": name, **SMALL, **PPO, "base": base} for name, base in (("a", "input"), ("b", "dynamic"))}
+    configs = {
+        name: {"name": name, **SMALL, **PPO, "base": base}
+        for name, base in (("a", "input"), ("b", "dynamic"))
+    }
     for name, config in configs.items():
         Path(f"{name}.yaml").write_text(yaml.safe_dump(config))
-    main(["train", "a.yaml", "b.yaml", "--seeds", "3", "--decisions", "64", "--jobs", "2", "--output", "both"])
+    main(
+        [
+            "train",
+            "a.yaml",
+            "b.yaml",
+            "--seeds",
+            "3",
+            "--decisions",
+            "64",
+            "--jobs",
+            "2",
+            "--output",
+            "both",
+        ]
+    )
     assert pools == [2]
     for name in configs:
         description, _ = load_residual(Path(f"both/{name}/seed_3/last"))
@@ -519,7 +649,8 @@ def test_several_configurations_are_trained_in_one_pool(
 def test_a_training_seed_that_another_program_trains_is_left_alone(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches two programs that write into one folder, where a lock of the whole run does not reach."""
+    """Catches two programs that write into one folder, where a lock of the whole run does not
+    reach."""
     config = TrainConfig(**{**SMALL, **PPO, "seeds": [3]})
     monkeypatch.setattr("train.learn.run_training._PATIENCE_S", 0.0)
     monkeypatch.chdir(tmp_path)
@@ -528,7 +659,9 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
     (tmp_path / "run" / "config.yaml").write_text(Path("c.yaml").read_text())
     with (
         lock_run(tmp_path / "run" / "seed_3"),
-        pytest.raises(ConfigurationError, match=rf"process {os.getpid()} of .* works on .*run/seed_3"),
+        pytest.raises(
+            ConfigurationError, match=rf"process {os.getpid()} of .* works on .*run/seed_3"
+        ),
     ):
         resume([tmp_path / "run"], Console(quiet=True))
     assert {path.name for path in (tmp_path / "run" / "seed_3").iterdir()} == {".lock"}
@@ -546,34 +679,70 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
         ({"weights": {"nominal": -1.0}}, "greater than 0"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"base": "zero"}, "acts on deflection, which Zero does not have.*command"),
-        ({"weights": {"nominal": 1e200}}, "weights.nominal must be less than or equal to 1000000, got 1e\\+200"),
-        ({"env_options": {"reward": {"link_error": 1e200}}}, r"link_error must be .* <= 1e\+06 \[1/rad\], got 1e\+200"),
-        ({"algorithm_options": {"foo": 1}}, "unknown parameter of algorithm_options 'foo'; choose one of: .*n_steps"),
-        (network(activation_fn="Foo"), "policy_kwargs.activation_fn must be 'Tanh' or 'ReLU', got 'Foo'"),
-        (network(log_std_init=1e9), r"policy_kwargs.log_std_init must be .*>= -20 and <= 2, got 1000000000.0 \(log"),
-        (network(net_arch=[64, 10**9]), r"net_arch: must be a list .*<= 4096.*, got \[64, 1000000000\]"),
-        (options(learning_rate="x"), "algorithm_options.learning_rate must be .*> 0 and <= 1, got 'x' .step"),
-        (options(learning_rate=1e30), r"algorithm_options.learning_rate must be .*<= 1, got 1e\+30 \(step"),
+        (
+            {"weights": {"nominal": 1e200}},
+            "weights.nominal must be less than or equal to 1000000, got 1e\\+200",
+        ),
+        (
+            {"env_options": {"reward": {"link_error": 1e200}}},
+            r"link_error must be .* <= 1e\+06 \[1/rad\], got 1e\+200",
+        ),
+        (
+            {"algorithm_options": {"foo": 1}},
+            "unknown parameter of algorithm_options 'foo'; choose one of: .*n_steps",
+        ),
+        (
+            network(activation_fn="Foo"),
+            "policy_kwargs.activation_fn must be 'Tanh' or 'ReLU', got 'Foo'",
+        ),
+        (
+            network(log_std_init=1e9),
+            r"policy_kwargs.log_std_init must be .*>= -20 and <= 2, got 1000000000.0 \(log",
+        ),
+        (
+            network(net_arch=[64, 10**9]),
+            r"net_arch: must be a list .*<= 4096.*, got \[64, 1000000000\]",
+        ),
+        (
+            options(learning_rate="x"),
+            "algorithm_options.learning_rate must be .*> 0 and <= 1, got 'x' .step",
+        ),
+        (
+            options(learning_rate=1e30),
+            r"algorithm_options.learning_rate must be .*<= 1, got 1e\+30 \(step",
+        ),
         (options(device="cuda"), "leave out 'device': training runs on the CPU"),
         (options(policy="MlpPolicy"), "leave out 'policy': .*policy_kwargs"),
         (options(env="walker"), "leave out 'env': "),
         (options(seed=3), "leave out 'seed': .*seeds"),
         (options(verbose=1), "leave out 'verbose': "),
-        (options(tensorboard_log="x"), "leave out 'tensorboard_log': .*folder of the training seed"),
+        (
+            options(tensorboard_log="x"),
+            "leave out 'tensorboard_log': .*folder of the training seed",
+        ),
         ({"algorithm": "m:C", **options(device="cuda")}, "leave out 'device'"),
-        ({"algorithm": "SAC", **options(ent_coef="auot")}, "ent_coef: must be the weight .* got 'auot'"),
-        ({"algorithm": "A2C", **options(batch_size=8)}, "unknown parameter of algorithm_options 'batch_size'"),
+        (
+            {"algorithm": "SAC", **options(ent_coef="auot")},
+            "ent_coef: must be the weight .* got 'auot'",
+        ),
+        (
+            {"algorithm": "A2C", **options(batch_size=8)},
+            "unknown parameter of algorithm_options 'batch_size'",
+        ),
         ({"seeds": [0, 1, 0]}, r"can stand but once, got \[0, 1, 0\]"),
     ],
 )
-def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_a_training_that_cannot_be_says_why(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     """Catches a traceback, or hours of training of something else."""
     with pytest.raises(ConfigurationError, match=message):
         Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
 
 
 def test_a_motion_that_is_left_out_stays_the_default() -> None:
-    """Catches a configuration that is refused when one of its values is replaced, or when it is read back."""
+    """Catches a configuration that is refused when one of its values is replaced, or when it is
+    read back."""
     for config in (
         TrainConfig(env="testbed"),
         BenchCase(env="testbed", policy="input", figures={"link_max_rad": None}),
@@ -582,7 +751,9 @@ def test_a_motion_that_is_left_out_stays_the_default() -> None:
         assert type(config).model_validate(config.model_dump(mode="json")) == config
 
 
-def test_a_training_that_cannot_begin_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_training_that_cannot_begin_leaves_no_folder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Catches a run that could be resumed for ever, and numbers that are used up."""
     monkeypatch.chdir(tmp_path)
     Path("c.yaml").write_text(yaml.safe_dump({**SMALL, **PPO, "base": "inptu"}))
@@ -610,12 +781,17 @@ def test_a_candidate_that_falls_comes_last(monkeypatch: pytest.MonkeyPatch, tmp_
     [
         ({"worlds": 7}, "each of 8 candidates in each scenario, 8, got worlds: 7"),
         ({"algorithm_options": {"popsize": 8}}, "'popsize'.*population_size"),
-        (options(population_size=0), "population_size must be a whole number >= 2 and <= 100000, got 0"),
+        (
+            options(population_size=0),
+            "population_size must be a whole number >= 2 and <= 100000, got 0",
+        ),
         (options(sigma=0), "sigma must be a finite number > 0 and <= 2, got 0"),
         (options(sigma="wide"), "sigma must be a finite number > 0 and <= 2, got 'wide'"),
     ],
 )
-def test_a_search_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_a_search_that_cannot_be_says_why(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     """Catches a candidate without a world, and an option that is silently left out."""
     with pytest.raises(ConfigurationError, match=message):
         ConstantSearch(TrainConfig(**{**SEARCH, **changes}), 0, tmp_path)

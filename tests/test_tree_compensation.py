@@ -1,4 +1,5 @@
-"""Compensation on trees with `gravcomp`, springs of joints, and servos that give way under a load."""
+"""Compensation on trees with `gravcomp`, springs of joints, and servos that give way under a
+load."""
 
 from typing import Any
 
@@ -15,7 +16,8 @@ from elastic_env.rigid.tree.torque import TreeTorque
 from elastic_env.world.robot_model import RobotModel
 from tests.played import metrics_of
 
-# As an arm: a base that turns, a shoulder with a spring, an elbow, and gravity compensation on two of the bodies.
+# As an arm: a base that turns, a shoulder with a spring, an elbow, and gravity compensation on two
+# of the bodies.
 ARM = """<mujoco>
   <compiler angle="radian"/>
   <worldbody>
@@ -46,10 +48,16 @@ def rigid() -> mujoco.MjSpec:
 def joints(integral_gain: float) -> dict[str, ElasticJoint]:
     gain = 20.0 * KP if integral_gain else KP
     servo = Servo(
-        position_gain=gain, velocity_gain=60.0, integral_gain=integral_gain, torque_limit=150.0, speed_limit=5.0
+        position_gain=gain,
+        velocity_gain=60.0,
+        integral_gain=integral_gain,
+        torque_limit=150.0,
+        speed_limit=5.0,
     )
     return {
-        name: ElasticJoint(stiffness=K, damping=4.0, rotor_inertia=0.2, coulomb_friction=0.3, servo=servo)
+        name: ElasticJoint(
+            stiffness=K, damping=4.0, rotor_inertia=0.2, coulomb_friction=0.3, servo=servo
+        )
         for name, K in STIFFNESS.items()
     }
 
@@ -63,16 +71,20 @@ def poses(count: int) -> np.ndarray:
 
 
 def test_the_torque_is_that_of_mujoco() -> None:
-    """Catches gravcomp of the wrong sign and a spring that pulls the wrong way; MuJoCo's own forces are the judge."""
+    """Catches gravcomp of the wrong sign and a spring that pulls the wrong way; MuJoCo's own
+    forces are the judge."""
     model = rigid().compile()
-    data, torque = mujoco.MjData(model), TreeTorque(model, NAMES)
+    data = mujoco.MjData(model)
+    torque = TreeTorque(model, NAMES)
     for q, q_dot, q_ddot in zip(poses(20), poses(20)[::-1], 3.0 * poses(20), strict=True):
         for name, *state in zip(NAMES, q, q_dot, q_ddot, strict=True):
             joint = data.joint(name)
             joint.qpos, joint.qvel, joint.qacc = state
         mujoco.mj_inverse(model, data)
         expected = [data.joint(name).qfrc_inverse[0] for name in NAMES]
-        np.testing.assert_allclose(torque.inverse_dynamics(q, q_dot, q_ddot), expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            torque.inverse_dynamics(q, q_dot, q_ddot), expected, rtol=1e-9, atol=1e-9
+        )
         change = 1e-6 * np.eye(3)
         slope = (torque.gravity_torque(q + change) - torque.gravity_torque(q - change)).T / 2e-6
         np.testing.assert_allclose(torque.gravity_gradient(q), slope, atol=1e-6)
@@ -80,7 +92,8 @@ def test_the_torque_is_that_of_mujoco() -> None:
 
 @pytest.mark.parametrize("integral_gain", [0.0, 8000.0])
 def test_policy_and_live_compensator_agree(integral_gain: float) -> None:
-    """Catches two formulas for one thing: springs, gravcomp, and the sag of a servo without an integrator."""
+    """Catches two formulas for one thing: springs, gravcomp, and the sag of a servo without an
+    integrator."""
     model = rigid().compile()
     live = PositionCompensator(
         model, STIFFNESS, joints=NAMES, limit_rad=10.0, position_gain=None if integral_gain else KP
@@ -89,10 +102,14 @@ def test_policy_and_live_compensator_agree(integral_gain: float) -> None:
     q = poses(50)
     offset, _ = policy.offset(Motion(q, 0.0 * q, 0.0 * q), np.zeros((50, 0)))
     np.testing.assert_allclose(q + offset, [live.command(row) for row in q], atol=1e-9)
-    np.testing.assert_allclose(policy.link_angle(q, offset), [live.link_angle(row) for row in q], atol=1e-9)
+    np.testing.assert_allclose(
+        policy.link_angle(q, offset), [live.link_angle(row) for row in q], atol=1e-9
+    )
 
 
-def errors(policy: str, scenario: str, integral_gain: float, home: Any, reference: dict[str, Any]) -> float:
+def errors(
+    policy: str, scenario: str, integral_gain: float, home: Any, reference: dict[str, Any]
+) -> float:
     """RMS link error of an episode [rad]."""
     env = robot(integral_gain, home).robot.make(scenario=scenario, reference=reference)
     metrics = metrics_of(env, policy)
@@ -106,7 +123,8 @@ MOVING = {"kind": "sine", "amplitude": 0.4, "frequency_hz": 0.3, "duration_s": 3
 
 @pytest.mark.parametrize("integral_gain", [0.0, 8000.0])
 def test_at_rest_input_takes_the_sag_away(integral_gain: float) -> None:
-    """Catches a compensator that leaves the sag of the servo, or compensates a weight that gravcomp carries."""
+    """Catches a compensator that leaves the sag of the servo, or compensates a weight that
+    gravcomp carries."""
     for home in poses(3):
         sag = errors("uncompensated", "ideal", integral_gain, home, STILL)
         assert errors("input", "ideal", integral_gain, home, STILL) < 0.01 * sag
@@ -121,7 +139,8 @@ def test_in_motion_dynamic_takes_the_error_away(integral_gain: float) -> None:
 
 
 def test_a_robot_of_servos_that_give_way_starts_at_rest() -> None:
-    """Catches a start above the sag, from which the robot drops: θ = u − τ/k_p, by MuJoCo's own acceleration."""
+    """Catches a start above the sag, from which the robot drops: θ = u − τ/k_p, by MuJoCo's own
+    acceleration."""
     env: Any = robot(0.0).robot.make(scenario="ideal", reference=STILL)
     env.reset(seed=0)
     first = env.unwrapped.truth()

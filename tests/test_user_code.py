@@ -23,14 +23,18 @@ print(env.step(env.action_space.sample() * 0.0)[1] <= 0.0)
 
 
 def test_the_users_own_train_py_gets_the_wrappers(tmp_path: Path) -> None:
-    """Catches a file of the user that imports itself in the place of our package, which is called train too."""
+    """Catches a file of the user that imports itself in the place of our package, which is
+    called train too."""
     (tmp_path / "train.py").write_text(TRAIN)
-    run = subprocess.run([sys.executable, "train.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        [sys.executable, "train.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert run.stdout.split() == ["True"], run.stderr
 
 
 def test_a_policy_is_found_by_the_path_of_its_file(tmp_path: Path) -> None:
-    """Catches a file that is looked for among the modules, where another one, such as our train, has its name."""
+    """Catches a file that is looked for among the modules, where another one, such as our train,
+    has its name."""
     (tmp_path / "train.py").write_text("def answer(env):\n    return 42\n")
     assert named_object(f"{tmp_path / 'train.py'}:answer")(None) == 42
     (tmp_path / "other").mkdir()
@@ -40,7 +44,8 @@ def test_a_policy_is_found_by_the_path_of_its_file(tmp_path: Path) -> None:
 
 def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     """Catches a traceback for a missing file, a broken one, or a function that it does not have."""
-    good, bad = tmp_path / "good.py", tmp_path / "bad.py"
+    good = tmp_path / "good.py"
+    bad = tmp_path / "bad.py"
     good.write_text("def answer(env):\n    return 42\n")
     bad.write_text("raise SystemExit(5)\n")
     for name, said in (
@@ -69,7 +74,8 @@ references: [{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}]
 
 
 def plant(folder: Path) -> Path:
-    """Lay modules into a folder that leave their names in a file when they are imported; that file."""
+    """Lay modules into a folder that leave their names in a file when they are imported; that
+    file."""
     said = folder / "imported"
     for name in (*STANDARD, "train", "baselines", "elastic_env"):
         (folder / f"{name}.py").write_text(f"open({str(said)!r}, 'a').write('{name} ')\n")
@@ -80,11 +86,14 @@ def elastic(folder: Path, *arguments: str, **more: str) -> "subprocess.Completed
     """Run the console script in a folder, with further variables of the environment."""
     command = [str(Path(sys.executable).with_name("elastic")), *arguments]
     known = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    return subprocess.run(command, cwd=folder, env={**known, **more}, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, cwd=folder, env={**known, **more}, capture_output=True, text=True, check=False
+    )
 
 
 def test_nothing_of_the_working_folder_stands_before_what_is_installed(tmp_path: Path) -> None:
-    """Catches workers that import a user's multiprocessing.py, and a baselines.py that breaks every command."""
+    """Catches workers that import a user's multiprocessing.py, and a baselines.py that breaks
+    every command."""
     said = plant(tmp_path)
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "own.py").write_text(MINE)
@@ -101,11 +110,15 @@ def test_a_file_that_stands_before_a_package_is_named(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     run = elastic(tmp_path / "work", "evaluate", "--help", PYTHONPATH=str(tmp_path))
     assert run.returncode == 2
-    assert run.stderr.startswith(f"error: {tmp_path / 'baselines.py'} stands in the place of the package baselines")
+    assert run.stderr.startswith(
+        f"error: {tmp_path / 'baselines.py'} stands in the place of the package baselines"
+    )
     assert len(run.stderr.splitlines()) == 1
 
 
-def test_the_path_keeps_its_order_but_for_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_path_keeps_its_order_but_for_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a path that loses entries or has the folder twice, first, or before our packages."""
     monkeypatch.chdir(tmp_path)
     others = [entry for entry in sys.path if entry and Path(entry).resolve() != tmp_path]
@@ -119,9 +132,14 @@ def test_the_path_keeps_its_order_but_for_the_working_folder(tmp_path: Path, mon
         assert str(ROOT) in sys.path
 
 
-def test_a_module_that_stands_before_the_users_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_stands_before_the_users_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches "train has no 'make'" for a user whose train.py has one."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "train.py").write_text("def make(env):\n    return 42\n")
-    with pytest.raises(ConfigurationError, match=r"stands before your train\.py; name the file itself: train\.py:make"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"stands before your train\.py; name the file itself: train\.py:make",
+    ):
         named_object("train:make")

@@ -19,7 +19,14 @@ from websockets.sync.client import ClientConnection, connect
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
-from elastic_env.rendering.side_by_side import COPIES, LINK, MOTOR, REFERENCE, SideBySide, enlarged_pose
+from elastic_env.rendering.side_by_side import (
+    COPIES,
+    LINK,
+    MOTOR,
+    REFERENCE,
+    SideBySide,
+    enlarged_pose,
+)
 from tests.three_joints import ARM
 from train.commands.view import Page, Playback, record, show
 from train.commands.view_proxy import Access, Head, RefusedError, listen
@@ -47,7 +54,8 @@ def posed(picture: Any, now: Any, factor: float) -> tuple[SideBySide, mujoco.MjD
 
 
 def test_the_link_side_at_factor_one_is_the_robot_of_the_physics(walker: Any) -> None:
-    """Catches joints in another order, and a base that is elsewhere: MuJoCo's own bodies say where the robot is."""
+    """Catches joints in another order, and a base that is elsewhere: MuJoCo's own bodies say
+    where the robot is."""
     scene, data = posed(walker.unwrapped.picture, walker.info, 1.0)
     simulation = walker.unwrapped.simulation
     truth = mujoco.MjData(simulation.model)
@@ -55,7 +63,9 @@ def test_the_link_side_at_factor_one_is_the_robot_of_the_physics(walker: Any) ->
     mujoco.mj_kinematics(simulation.model, truth)
     offset = scene.model.body(f"{LINK}pelvis").pos - scene.model.body(f"{MOTOR}pelvis").pos
     for foot in ("l_foot", "r_foot", "pelvis"):
-        np.testing.assert_allclose(data.body(LINK + foot).xpos - offset, truth.body(foot).xpos, atol=2e-9)
+        np.testing.assert_allclose(
+            data.body(LINK + foot).xpos - offset, truth.body(foot).xpos, atol=2e-9
+        )
         np.testing.assert_allclose(data.body(LINK + foot).xmat, truth.body(foot).xmat, atol=2e-9)
 
 
@@ -66,7 +76,9 @@ def test_the_motor_side_is_what_the_encoders_say(walker: Any) -> None:
     truth = walker.unwrapped.truth()
     for number, name in enumerate(walker.unwrapped.picture.alone().joints):
         deflection = data.joint(MOTOR + name).qpos - data.joint(LINK + name).qpos
-        np.testing.assert_allclose(deflection, truth.theta[0, number] - truth.q[0, number], atol=1e-12)
+        np.testing.assert_allclose(
+            deflection, truth.theta[0, number] - truth.q[0, number], atol=1e-12
+        )
 
 
 def test_deviations_grow_with_the_factor_and_the_reference_stays(walker: Any) -> None:
@@ -82,8 +94,10 @@ def test_deviations_grow_with_the_factor_and_the_reference_stays(walker: Any) ->
 
 
 def test_a_pose_is_enlarged_about_the_planned_one() -> None:
-    """Catches an angle that is enlarged about another axis; SciPy's rotation vectors are the reference."""
-    planned, turn = Rotation.from_rotvec([0.1, -0.2, 0.3]), np.array([0.02, 0.01, -0.03])
+    """Catches an angle that is enlarged about another axis; SciPy's rotation vectors are the
+    reference."""
+    planned = Rotation.from_rotvec([0.1, -0.2, 0.3])
+    turn = np.array([0.02, 0.01, -0.03])
     true = planned * Rotation.from_rotvec(turn)
     poses = [
         np.array([*position, *rotation.as_quat(scalar_first=True)])
@@ -92,18 +106,26 @@ def test_a_pose_is_enlarged_about_the_planned_one() -> None:
     found = enlarged_pose(poses[0], poses[1], 3.0)
     np.testing.assert_allclose(found[:3], [0.3, 0.0, 1.6])
     expected = planned * Rotation.from_rotvec(3.0 * turn)
-    np.testing.assert_allclose(Rotation.from_quat(found[3:], scalar_first=True).as_matrix(), expected.as_matrix())
+    np.testing.assert_allclose(
+        Rotation.from_quat(found[3:], scalar_first=True).as_matrix(), expected.as_matrix()
+    )
 
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Page]:
     """A page that shows the testbed, with its loop in a thread."""
-    condition = Condition(env="testbed", policy=PolicySpec(name="input"), scenario="ideal", reference="sine")
+    condition = Condition(
+        env="testbed", policy=PolicySpec(name="input"), scenario="ideal", reference="sine"
+    )
     recording = record(condition, Console(quiet=True), max_s=0.2)
     np.testing.assert_allclose(recording.times_s, np.arange(0.004, 0.2, 0.02))
     playback = Playback(recording, paused=True)
     playback.tick()
-    assert (playback.time_s, recording.at(0.0), recording.at(1e9)) == (0.0, recording.frames[0], recording.frames[-1])
+    assert (playback.time_s, recording.at(0.0), recording.at(1e9)) == (
+        0.0,
+        recording.frames[0],
+        recording.frames[-1],
+    )
     with show(recording) as shown:
         for _ in range(3):
             shown.handle.sync()
@@ -140,8 +162,11 @@ def open_socket(page: Page, path: str, **arguments: Any) -> ClientConnection:
 
 
 def test_the_page_serves_the_three_robots(page: Page) -> None:
-    """Catches a viewer that does not start, a page without its model, and a cookie that does not open the rest."""
-    assert [page.handle.model.joint(number).name for number in range(3)] == [f"{copy}link" for copy in COPIES]
+    """Catches a viewer that does not start, a page without its model, and a cookie that does not
+    open the rest."""
+    assert [page.handle.model.joint(number).name for number in range(3)] == [
+        f"{copy}link" for copy in COPIES
+    ]
     with ask(page, f"/?token={token(page)}") as answer:
         assert answer.status == 200
         assert b"<canvas" in answer.read()
@@ -149,7 +174,9 @@ def test_the_page_serves_the_three_robots(page: Page) -> None:
         assert answer.headers["Cross-Origin-Opener-Policy"] == "same-origin"
     end = time.monotonic() + 20.0
     model = b""
-    while b"link" not in model and time.monotonic() < end:  # its thread takes the model a little later
+    while (
+        b"link" not in model and time.monotonic() < end
+    ):  # its thread takes the model a little later
         page.handle.sync()
         with ask(page, "/model", Cookie=cookie(page)) as answer:
             model = answer.read()
@@ -157,7 +184,8 @@ def test_the_page_serves_the_three_robots(page: Page) -> None:
 
 
 def test_the_page_draws_by_its_sockets(page: Page) -> None:
-    """Catches a proxy that answers pages and holds up WebSockets, with the Origin that a browser sends."""
+    """Catches a proxy that answers pages and holds up WebSockets, with the Origin that a browser
+    sends."""
     with open_socket(page, "/state?sid=1", origin=f"http://127.0.0.1:{page.access.port}") as state:
         assert "viewers=1" in str(state.recv(timeout=20.0))
         page.handle.sync()
@@ -166,12 +194,20 @@ def test_the_page_draws_by_its_sockets(page: Page) -> None:
 
 
 FOREIGN: list[dict[str, str]] = [
-    {"Host": "evil.example"}, {"Host": "evil.example:{port}"}, {"Host": "127.0.0.1:1"}, {"Host": "127.0.0.1"},
-    {"Host": "127.0.0.1.evil.example:{port}"}, {"Host": "localhost:{port}@evil.example"}, {"Host": ""},
-    {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:1"},
-    {"Origin": "https://127.0.0.1:{port}"}, {"Origin": "http://localhost:{port}"},
+    {"Host": "evil.example"},
+    {"Host": "evil.example:{port}"},
+    {"Host": "127.0.0.1:1"},
+    {"Host": "127.0.0.1"},
+    {"Host": "127.0.0.1.evil.example:{port}"},
+    {"Host": "localhost:{port}@evil.example"},
+    {"Host": ""},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://127.0.0.1:1"},
+    {"Origin": "https://127.0.0.1:{port}"},
+    {"Origin": "http://localhost:{port}"},
     {"Origin": "http://127.0.0.1:{port}.evil.example"},
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("headers", FOREIGN, ids=str)
@@ -186,9 +222,12 @@ def test_requests_of_others_are_refused(page: Page, headers: dict[str, str]) -> 
     assert refused.value.response.status_code == 403
 
 
-@pytest.mark.parametrize("path", ["/", "/?token=", "/?token=wrong", "/model", "/web_client.js", "/ui", "/state"])
+@pytest.mark.parametrize(
+    "path", ["/", "/?token=", "/?token=wrong", "/model", "/web_client.js", "/ui", "/state"]
+)
 def test_requests_without_the_token_are_refused(page: Page, path: str) -> None:
-    """Catches a door that only the first page has, and a token that is compared by its beginning."""
+    """Catches a door that only the first page has, and a token that is compared by its
+    beginning."""
     for kept in ({}, {"Cookie": f"{page.access.cookie}=wrong"}, {"Cookie": f"{cookie(page)}x"}):
         with ask(page, path, **kept) as answer:
             assert answer.status == 403
@@ -196,7 +235,9 @@ def test_requests_without_the_token_are_refused(page: Page, path: str) -> None:
         open_socket(page, path, additional_headers={})
 
 
-@pytest.mark.parametrize("path", ["/drop", "/drop?sid=1", "/drop/", "/DROP", "//drop", "/%64rop", "/state/../drop"])
+@pytest.mark.parametrize(
+    "path", ["/drop", "/drop?sid=1", "/drop/", "/DROP", "//drop", "/%64rop", "/state/../drop"]
+)
 def test_uploads_are_refused(page: Page, path: str) -> None:
     """Catches a model that is dropped on the page: MuJoCo reads any file that it names."""
     if path.startswith("/drop"):
@@ -232,12 +273,18 @@ def test_only_this_machine_reaches_the_page(page: Page) -> None:
 
 
 def test_another_model_does_not_end_the_page(page: Page, tmp_path: Path) -> None:
-    """Catches a page that takes a model without our joints, and ends as a defect of this program."""
+    """Catches a page that takes a model without our joints, and ends as a defect of this
+    program."""
     file = tmp_path / "other.xml"
-    file.write_text("<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>")
+    file.write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
     page.handle.dispatch(messages.LoadModelEvent(path=str(file)))
     assert page.handle.model.nbody > 2
-    page.handle.sync(mujoco.MjModel.from_xml_path(str(file)), mujoco.MjData(mujoco.MjModel.from_xml_path(str(file))))
+    page.handle.sync(
+        mujoco.MjModel.from_xml_path(str(file)),
+        mujoco.MjData(mujoco.MjModel.from_xml_path(str(file))),
+    )
 
 
 def test_a_page_that_cannot_listen_says_so() -> None:
@@ -261,10 +308,13 @@ def test_a_page_that_cannot_listen_says_so() -> None:
     ],
 )
 def test_a_page_knows_its_hosts(host: str, own: list[str], foreign: list[str]) -> None:
-    """Catches a page on a network that any name may stand for, or that its own address does not open."""
+    """Catches a page on a network that any name may stand for, or that its own address does not
+    open."""
     access = Access(host, 80)
     for name in own:
-        request = Head(f"GET /?token={access.token} HTTP/1.1", [("Host", name), ("Origin", f"http://{name}")])
+        request = Head(
+            f"GET /?token={access.token} HTTP/1.1", [("Host", name), ("Origin", f"http://{name}")]
+        )
         assert access.admit(request).path == "/"
     for name in foreign:
         with pytest.raises(RefusedError):

@@ -1,4 +1,5 @@
-"""The walking environment: what any user of Gymnasium may rely on, and the physics and scores that it promises."""
+"""The walking environment: what any user of Gymnasium may rely on, and the physics and scores
+that it promises."""
 
 import copy
 import re
@@ -32,20 +33,56 @@ from tests.docstrings import documented_tables
 ID = "elastic_env/WalkInPlace-v0"
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 """The shortest named step, once: a second of standing, 1.1 s of walking, a second of standing."""
-WALK_BEGIN, LIFT_OFF, TOUCH_DOWN, WALK_END, NUM_STEPS = 250, 325, 450, 525, 775
+WALK_BEGIN = 250
+LIFT_OFF = 325
+TOUCH_DOWN = 450
+WALK_END = 525
+NUM_STEPS = 775
 """Its control steps."""
 PERIOD_S = WalkConfig().control_period_s
-JOINTS = [f"{side}_{joint}" for side in "lr" for joint in
-          ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")]  # fmt: skip
-GRAVITY, MASS_KG, FOOT_MASS_KG = 9.81, 57.0, 1.616
-STIFFNESS, FRICTION, COUNTS_PER_TURN = 1001.0, 5.4, 501_923
+JOINTS = [
+    f"{side}_{joint}"
+    for side in "lr"
+    for joint in ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
+]
+GRAVITY = 9.81
+MASS_KG = 57.0
+FOOT_MASS_KG = 1.616
+STIFFNESS = 1001.0
+FRICTION = 5.4
+COUNTS_PER_TURN = 501_923
 SCENARIOS = ["nominal", "spread", "push", "slope", "sensor"]
 INFO_KEYS = {
-    "time_s", "pelvis_roll", "pelvis_pitch", "pelvis_error", "pelvis_height", "zmp_x", "zmp_y", "zmp_reference_x",
-    "zmp_reference_y", "zmp_deviation", "zmp_deviation_x", "zmp_deviation_y", "link_error", "link_error_lowest",
-    "link_error_highest", "deflection", "joint_torque", "servo_torque", "command_rate", "force_left", "force_right",
-    "load_share", "swing", "single_support", "support", "early_touchdown", "clipped", "reward_terms", "termination",
-}  # fmt: skip
+    "time_s",
+    "pelvis_roll",
+    "pelvis_pitch",
+    "pelvis_error",
+    "pelvis_height",
+    "zmp_x",
+    "zmp_y",
+    "zmp_reference_x",
+    "zmp_reference_y",
+    "zmp_deviation",
+    "zmp_deviation_x",
+    "zmp_deviation_y",
+    "link_error",
+    "link_error_lowest",
+    "link_error_highest",
+    "deflection",
+    "joint_torque",
+    "servo_torque",
+    "command_rate",
+    "force_left",
+    "force_right",
+    "load_share",
+    "swing",
+    "single_support",
+    "support",
+    "early_touchdown",
+    "clipped",
+    "reward_terms",
+    "termination",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +101,11 @@ def _three_robots_are_enough() -> Iterator[None]:
 
 def random_actions(steps: int, worlds: int, seed: int = 0, size: float = 0.01) -> Array:
     """Offsets that change at every step, (steps, worlds, 12)."""
-    return np.random.default_rng(seed).uniform(-size, size, (steps, worlds, len(JOINTS))).astype(np.float32)
+    return (
+        np.random.default_rng(seed)
+        .uniform(-size, size, (steps, worlds, len(JOINTS)))
+        .astype(np.float32)
+    )
 
 
 def zeros(*worlds: int) -> Array:
@@ -84,11 +125,15 @@ def walk_worlds(num_envs: int, **arguments: Any) -> ElasticVectorEnv:
     return make_walk_vector(num_envs, **{**SHORT, **arguments})
 
 
-def lean(env: Any, roll: float = 0.0, pitch: float = 0.0, world: int = 0, height_m: float = 0.0) -> None:
+def lean(
+    env: Any, roll: float = 0.0, pitch: float = 0.0, world: int = 0, height_m: float = 0.0
+) -> None:
     """Turn a robot about its pelvis, and lift it."""
     simulation = env.unwrapped.simulation
     simulation.qpos[world, 2] += height_m
-    simulation.qpos[world, 3:7] = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_quat(scalar_first=True)
+    simulation.qpos[world, 3:7] = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_quat(
+        scalar_first=True
+    )
     simulation.qvel[world] = 0.0
 
 
@@ -98,7 +143,8 @@ def break_world(env: Any, world: int = 0, value: float = np.nan) -> None:
 
 
 def wrenches(env: Any) -> Array:
-    """Force and moment of both feet on their legs by MuJoCo's sensors, (num_worlds, 12) [N], [N·m]."""
+    """Force and moment of both feet on their legs by MuJoCo's sensors, (num_worlds, 12) [N],
+    [N·m]."""
     return -np.array(env.unwrapped.simulation.bind("sensordata"))
 
 
@@ -117,9 +163,12 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
 
 
 def row_of(results: Any, world: int) -> Any:
-    """What nested results say of one world, without Gymnasium's masks, as the scalar environment says it."""
+    """What nested results say of one world, without Gymnasium's masks, as the scalar environment
+    says it."""
     if isinstance(results, dict):
-        return {key: row_of(value, world) for key, value in results.items() if not key.startswith("_")}
+        return {
+            key: row_of(value, world) for key, value in results.items() if not key.startswith("_")
+        }
     if isinstance(results, tuple):
         return tuple(row_of(value, world) for value in results)
     return results[world]
@@ -196,9 +245,9 @@ def open_loop() -> Recording:
     return record(make_walk(**SHORT, scenario="ideal"), 0, zeros(NUM_STEPS))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Contracts of Gymnasium and Stable-Baselines3
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scenario", ["nominal", HARD])
@@ -209,12 +258,19 @@ def test_gymnasium_check_env(scenario: str) -> None:
 
 def test_make_and_make_vec_find_the_environments() -> None:
     """Catches a registration that points elsewhere, and arguments that do not arrive."""
-    env = gymnasium.make(ID, step_period=[0.4, 0.6, 0.8], num_steps=2, scenario="ideal", render_mode=None)
+    env = gymnasium.make(
+        ID, step_period=[0.4, 0.6, 0.8], num_steps=2, scenario="ideal", render_mode=None
+    )
     assert isinstance(env.unwrapped, ElasticEnv)
     assert env.unwrapped.task.config.scenario.name == "ideal"
     assert env.unwrapped.task.num_steps == round((2 * 1.8 + 2.0) / PERIOD_S)
     many = gymnasium.make_vec(
-        ID, num_envs=5, vectorization_mode="vector_entry_point", autoreset_mode="SameStep", scenario="soft", **SHORT
+        ID,
+        num_envs=5,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="SameStep",
+        scenario="soft",
+        **SHORT,
     )
     assert isinstance(many.unwrapped, ElasticVectorEnv)
     assert many.num_envs == 5
@@ -232,7 +288,9 @@ def test_spaces_describe_what_the_environment_takes_and_gives(vector: bool) -> N
     assert env.action_space.shape == (*lead, 12)
     assert env.observation_space.shape == (*lead, 95)
     assert env.action_space.dtype == np.float32
-    np.testing.assert_allclose(np.abs([env.action_space.low, env.action_space.high]), 0.3, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.abs([env.action_space.low, env.action_space.high]), 0.3, rtol=1e-6
+    )
     env.action_space.seed(0)
     for _ in range(3):
         assert observation.dtype == np.float64
@@ -247,7 +305,8 @@ def test_spaces_describe_what_the_environment_takes_and_gives(vector: bool) -> N
 
 
 def test_docstring_of_the_module_is_the_table_of_signals() -> None:
-    """Catches a table in the documentation that names, orders or measures the columns otherwise than the code."""
+    """Catches a table in the documentation that names, orders or measures the columns otherwise
+    than the code."""
     task = make_walk(**SHORT).task
     signals = list(task.observation_table)
     rows, info = documented_tables(walk_in_place.__doc__ or "")
@@ -258,15 +317,21 @@ def test_docstring_of_the_module_is_the_table_of_signals() -> None:
         next_column = (last[-1] if last else first) + 1
         described = signals[first:next_column]
         quoted = re.findall(r"`([^`]+)`", names)
-        wanted = [name if i == 0 else f"{quoted[0].split('.')[0]}{name}" for i, name in enumerate(quoted)]
+        wanted = [
+            name if i == 0 else f"{quoted[0].split('.')[0]}{name}" for i, name in enumerate(quoted)
+        ]
         if quoted[0].endswith(".<joint>"):
             wanted = [quoted[0].replace("<joint>", joint) for joint in JOINTS]
         found = [signal.name for signal in described]
         assert wanted == ([found[0], found[-1]] if " to " in names else found), columns
-        assert units.split(", ") == list(dict.fromkeys(signal.unit for signal in described)), columns
+        assert units.split(", ") == list(dict.fromkeys(signal.unit for signal in described)), (
+            columns
+        )
     assert next_column == len(signals) == 95
     assert task.action_table.names == tuple(f"command_offset.{joint}" for joint in JOINTS)
-    assert re.search(rf"\[rad\] in the order of the joints, within ±{task.action_table.signals[0].high}\.", DOC)
+    assert re.search(
+        rf"\[rad\] in the order of the joints, within ±{task.action_table.signals[0].high}\.", DOC
+    )
     assert f"joints are {', '.join(JOINTS[:6])}," in DOC
     env = make_walk(**SHORT)
     env.reset(seed=0)
@@ -280,30 +345,44 @@ def test_groups_of_the_table_are_its_neighbouring_columns() -> None:
     """Catches a group that is cut, shifted, or takes in another whose name begins alike."""
     table = make_walk(**SHORT).task.observation_table
     sizes = {
-        "encoder_angle": 12, "encoder_rate": 12, "imu_attitude": 2, "imu_rate": 3, "wrench": 12, "reference_angle": 12,
-        "reference_rate": 12, "reference_acceleration": 12, "clock": 3, "load_share": 1, "zmp_reference": 2,
+        "encoder_angle": 12,
+        "encoder_rate": 12,
+        "imu_attitude": 2,
+        "imu_rate": 3,
+        "wrench": 12,
+        "reference_angle": 12,
+        "reference_rate": 12,
+        "reference_acceleration": 12,
+        "clock": 3,
+        "load_share": 1,
+        "zmp_reference": 2,
         "last_command": 12,
-    }  # fmt: skip
+    }
     begin = 0
     for name, size in sizes.items():
         assert table.group(name) == slice(begin, begin + size)
         begin += size
     assert begin == len(table)
     assert table.group("wrench.r_fz") == slice(37, 38)
-    with pytest.raises(ConfigurationError, match=r"unknown signal 'encoder'; choose one of: encoder_angle, encoder_ra"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"unknown signal 'encoder'; choose one of: encoder_angle, encoder_ra",
+    ):
         table.group("encoder")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Seeds, copies, and results that belong to the caller
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scenario", ["nominal", HARD])
 def test_same_seed_same_rollout_and_other_seed_another(scenario: str) -> None:
     """Catches randomness outside the seed, and a seed that is ignored."""
     actions = random_actions(20, 1)[:, 0]
-    first, again, other = (record(make_walk(**SHORT, scenario=scenario), seed, actions).results for seed in (3, 3, 4))
+    first, again, other = (
+        record(make_walk(**SHORT, scenario=scenario), seed, actions).results for seed in (3, 3, 4)
+    )
     assert_equal(first, again)
     for a, b in zip(first, other, strict=True):
         assert not np.array_equal(a[0], b[0])
@@ -311,7 +390,8 @@ def test_same_seed_same_rollout_and_other_seed_another(scenario: str) -> None:
 
 def test_episodes_of_one_environment_follow_from_its_first_seed() -> None:
     """Catches a second episode that depends on how the first one ended, or that repeats it."""
-    first, second = [], []
+    first = []
+    second = []
     for steps in (2, 30):
         env = make_walk(**SHORT, scenario=HARD)
         first.append(record(env, 7, random_actions(steps, 1)[:, 0]).results[0])
@@ -335,7 +415,9 @@ def test_results_are_fresh_and_writing_to_them_changes_nothing(vector: bool) -> 
             results.append(env.step(given))
             kept.append(copy.deepcopy(results[-1]))
             if spoil:
-                truth = [value for value in vars(env.truth()).values() if isinstance(value, np.ndarray)]
+                truth = [
+                    value for value in vars(env.truth()).values() if isinstance(value, np.ndarray)
+                ]
                 spoil_arrays([results[-1], given, truth])
         if not spoil:
             assert_equal(results, kept)
@@ -368,13 +450,16 @@ def test_a_deep_copy_goes_on_as_the_original(num_envs: int) -> None:
     assert np.abs(env.truth().theta - start).max(axis=1).min() > 1e-3
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # One world and many
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
-def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(hard_walk: Recording) -> None:
-    """Catches any rule that one of the faces has and the other has not, to the last bit, end and metrics included."""
+def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(
+    hard_walk: Recording,
+) -> None:
+    """Catches any rule that one of the faces has and the other has not, to the last bit, end and
+    metrics included."""
     env = walk_worlds(2, scenario=HARD, autoreset_mode=AutoresetMode.SAME_STEP)
     log = [env.reset(seed=HARD_SEED)]
     log += [env.step(actions) for actions in HARD_ACTIONS]
@@ -391,7 +476,8 @@ def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(har
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario: str) -> None:
-    """Catches a world whose noise, robot or physics depends on its neighbours or on who computes it."""
+    """Catches a world whose noise, robot or physics depends on its neighbours or on who computes
+    it."""
     actions = random_actions(15, 7, seed=2)
     logs = {}
     for num_envs, num_threads in [(7, 1), (7, 2), (1, 1)]:
@@ -411,17 +497,21 @@ class Pair:
 
     def __init__(self, num_envs: int, mode: AutoresetMode, **arguments: Any) -> None:
         self.many = walk_worlds(num_envs, autoreset_mode=mode, **arguments)
-        self.single = SyncVectorEnv([lambda: make_walk(**SHORT, **arguments)] * num_envs, autoreset_mode=mode)
+        self.single = SyncVectorEnv(
+            [lambda: make_walk(**SHORT, **arguments)] * num_envs, autoreset_mode=mode
+        )
 
     def reset(self, **arguments: Any) -> None:
         """Reset both and compare."""
-        expected, result = self.single.reset(**copy.deepcopy(arguments)), self.many.reset(**arguments)
+        expected = self.single.reset(**copy.deepcopy(arguments))
+        result = self.many.reset(**arguments)
         np.testing.assert_array_equal(result[0], expected[0])
         assert_info_of_rows(result[1], expected[1])
 
     def step(self, actions: Array) -> tuple[Any, ...]:
         """Step both and compare, exactly."""
-        expected, result = self.single.step(actions), self.many.step(actions)
+        expected = self.single.step(actions)
+        result = self.many.step(actions)
         for part, (result_part, wanted) in enumerate(zip(result[:4], expected[:4], strict=True)):
             np.testing.assert_array_equal(result_part, wanted, err_msg=f"part {part} of the result")
         assert_info_of_rows(result[4], expected[4])
@@ -437,7 +527,8 @@ class Pair:
 
 
 def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], path: str = "info") -> None:
-    """Everything that the scalar environments say stands in the vector's info, in the row of the same world."""
+    """Everything that the scalar environments say stands in the vector's info, in the row of the
+    same world."""
     for key, values in expected.items():
         if key.startswith("_"):
             continue
@@ -446,15 +537,20 @@ def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], path: st
             assert_info_of_rows(info[key], values, f"{path}[{key!r}]")
             continue
         for row in np.flatnonzero(expected[f"_{key}"]):
-            np.testing.assert_array_equal(info[key][row], values[row], err_msg=f"{path}[{key!r}][{row}]")
+            np.testing.assert_array_equal(
+                info[key][row], values[row], err_msg=f"{path}[{key!r}][{row}]"
+            )
         if f"_{key}" in info:
-            np.testing.assert_array_equal(info[f"_{key}"], expected[f"_{key}"], err_msg=f"{path}['_{key}']")
+            np.testing.assert_array_equal(
+                info[f"_{key}"], expected[f"_{key}"], err_msg=f"{path}['_{key}']"
+            )
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize("scenario", [*SCENARIOS, HARD])
 def test_worlds_that_end_at_different_times_keep_apart(scenario: str, mode: AutoresetMode) -> None:
-    """Catches an end in one world that shows in the results of another: masks of reset, fall and divergence."""
+    """Catches an end in one world that shows in the results of another: masks of reset, fall and
+    divergence."""
     pair = Pair(3, mode, scenario=scenario)
     pair.reset(seed=11)
     ends: list[str] = []
@@ -481,10 +577,12 @@ def test_one_seed_per_world_or_an_error() -> None:
 
 
 def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() -> None:
-    """Catches NaN in what a learner sees, ends without a reason, and a world that starts anew without a word."""
+    """Catches NaN in what a learner sees, ends without a reason, and a world that starts anew
+    without a word."""
     env = walk_worlds(64, autoreset_mode=AutoresetMode.SAME_STEP)
     _, info = env.reset(seed=0)
-    time, qpos = info["time_s"], env.simulation.qpos.copy()
+    time = info["time_s"]
+    qpos = env.simulation.qpos.copy()
     ends = 0
     held = np.repeat(random_actions(6, 64, seed=1, size=0.3), 25, axis=0)
     for actions in np.clip(held + random_actions(150, 64, size=0.3), -0.3, 0.3):
@@ -493,38 +591,50 @@ def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() ->
         assert np.isfinite(observation).all()
         assert np.isfinite(reward).all()
         assert not (terminated & truncated).any()
-        np.testing.assert_allclose(info["time_s"], np.where(done, 0.0, time + PERIOD_S), rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            info["time_s"], np.where(done, 0.0, time + PERIOD_S), rtol=0.0, atol=1e-9
+        )
         moved = np.abs(env.simulation.qpos - qpos)[~done]
         assert moved.max(initial=0.0) < 0.1  # a silent reset would bring a fallen robot up at once
-        assert not {"episode_metrics", "_episode_metrics"} & info.keys()  # of an episode that began, there are none
+        assert (
+            not {"episode_metrics", "_episode_metrics"} & info.keys()
+        )  # of an episode that began, there are none
         assert not (info["clipped"] * done).any()
         if done.any():
             reasons = info["final_info"]["termination"]
             assert np.isin(reasons[terminated], ["fell", "diverged"]).all()
             assert (reasons[~terminated] == "").all()
-            np.testing.assert_array_equal(info["final_info"]["episode_metrics"]["fell"][done], reasons[done] == "fell")
-        time, qpos = info["time_s"], env.simulation.qpos.copy()
+            np.testing.assert_array_equal(
+                info["final_info"]["episode_metrics"]["fell"][done], reasons[done] == "fell"
+            )
+        time = info["time_s"]
+        qpos = env.simulation.qpos.copy()
         ends += int(done.sum())
     assert ends > 16
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Rest
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "scenario", ["ideal", "nominal", "soft", "payload", "spread", "sensor", "backlash", "slope", "ideal+slope"]
+    "scenario",
+    ["ideal", "nominal", "soft", "payload", "spread", "sensor", "backlash", "slope", "ideal+slope"],
 )
 def test_an_episode_starts_in_static_equilibrium(scenario: str) -> None:
-    """Catches a start with slack springs or an empty integrator: while the command stays, nothing may move."""
+    """Catches a start with slack springs or an empty integrator: while the command stays,
+    nothing may move."""
     env = make_walk(**SHORT, scenario=scenario)
     _, info = env.reset(seed=1)
-    start, reference = env.truth(), env.task.assumed_model.plan.q
+    start = env.truth()
+    reference = env.task.assumed_model.plan.q
     weight = (MASS_KG + (5.0 if scenario == "payload" else 0.0)) * GRAVITY
     for k in range(125):
         assert info["force_left"] + info["force_right"] == pytest.approx(weight, abs=0.02)
-        assert vertical_forces(env).sum() == pytest.approx(weight - 2 * FOOT_MASS_KG * GRAVITY, abs=0.02)
+        assert vertical_forces(env).sum() == pytest.approx(
+            weight - 2 * FOOT_MASS_KG * GRAVITY, abs=0.02
+        )
         com = env.simulation.bind("subtree_com")[0, env.simulation.model.body("pelvis").id, :2]
         np.testing.assert_allclose([info["zmp_x"], info["zmp_y"]], com, rtol=0.0, atol=1e-4)
         *_, info = env.step((reference[0] - reference[k + 1]).astype(np.float32))
@@ -532,7 +642,9 @@ def test_an_episode_starts_in_static_equilibrium(scenario: str) -> None:
         assert np.abs(truth.q_dot).max() < 1e-3
         assert np.abs(truth.theta_dot).max() < 1e-3
     for name in ("q", "theta", "pelvis", "ankles"):
-        np.testing.assert_allclose(getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name
+        )
 
 
 def vertical_forces(env: ElasticEnv) -> Array:
@@ -543,14 +655,18 @@ def vertical_forces(env: ElasticEnv) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "factor"), [("ideal", 1.0), ("ideal+soft", 0.7), ("ideal+stiff", 1.3), ("ideal+spread", None)]
+    ("scenario", "factor"),
+    [("ideal", 1.0), ("ideal+soft", 0.7), ("ideal+stiff", 1.3), ("ideal+spread", None)],
 )
 def test_at_rest_every_servo_carries_its_spring(scenario: str, factor: float | None) -> None:
-    """Catches a true stiffness that is not the one of the physics: B θ̈ = 0 needs a servo torque of K (θ − q)."""
+    """Catches a true stiffness that is not the one of the physics: B θ̈ = 0 needs a servo torque
+    of K (θ − q)."""
     env = walk_env(scenario=scenario)
     truth = env.truth()
     torque = np.array(env.simulation.bind("actuator_force")[0])
-    np.testing.assert_allclose(torque, (truth.stiffness * (truth.theta - truth.q))[0], rtol=0.0, atol=5e-3)
+    np.testing.assert_allclose(
+        torque, (truth.stiffness * (truth.theta - truth.q))[0], rtol=0.0, atol=5e-3
+    )
     assert np.abs(torque).max() > 10.0
     assert factor is None or truth.stiffness[0].tolist() == pytest.approx([factor * STIFFNESS] * 12)
 
@@ -559,7 +675,8 @@ def test_before_the_walk_the_weight_is_shared_and_in_single_support_it_is_on_the
     open_loop: Recording,
 ) -> None:
     """Catches left and right exchanged in forces, shares or the sign of y."""
-    left, right = open_loop.info("force_left"), open_loop.info("force_right")
+    left = open_loop.info("force_left")
+    right = open_loop.info("force_right")
     assert left[0] == pytest.approx(right[0], rel=1e-3)
     middle = (LIFT_OFF + TOUCH_DOWN) // 2
     assert abs(right[middle]) < 0.02 * MASS_KG * GRAVITY  # of the foot's acceleration
@@ -573,13 +690,16 @@ def test_before_the_walk_the_weight_is_shared_and_in_single_support_it_is_on_the
     assert ankles[1, 2] > ankles[0, 2] + 0.01
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Measurements
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
-def test_in_ideal_the_observation_is_the_truth_and_the_coming_reference(open_loop: Recording) -> None:
-    """Catches noise, counts or delay where there should be none, columns out of order, and rows off by one."""
+def test_in_ideal_the_observation_is_the_truth_and_the_coming_reference(
+    open_loop: Recording,
+) -> None:
+    """Catches noise, counts or delay where there should be none, columns out of order, and rows
+    off by one."""
     plan = open_loop.env.task.assumed_model.plan
     theta = open_loop.truth("theta")
     coming = np.minimum(np.arange(NUM_STEPS + 1) + 1, NUM_STEPS)
@@ -592,21 +712,30 @@ def test_in_ideal_the_observation_is_the_truth_and_the_coming_reference(open_loo
         "reference_angle": plan.q[coming],
         "reference_rate": plan.q_dot[coming],
         "reference_acceleration": plan.q_ddot[coming],
-        "clock": np.stack([coming * PERIOD_S, np.clip((coming - LIFT_OFF) / 125, 0.0, 1.0), 0.0 * coming], axis=1),
+        "clock": np.stack(
+            [coming * PERIOD_S, np.clip((coming - LIFT_OFF) / 125, 0.0, 1.0), 0.0 * coming], axis=1
+        ),
         "load_share": plan.share[coming, None],
         "zmp_reference": plan.zmp[coming],
         "last_command": plan.q,  # of the control period that ends here; at the start the first row
     }
     for name, values in expected.items():
-        np.testing.assert_allclose(open_loop.group(name), values, rtol=0.0, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(
+            open_loop.group(name), values, rtol=0.0, atol=1e-12, err_msg=name
+        )
     assert sum(values.shape[1] for values in expected.values()) == 95
 
 
 def test_columns_are_constant_only_where_the_walk_has_nothing_to_say(hard_walk: Recording) -> None:
-    """Catches a column that is never filled, or always the same: here the yaws rest and the left foot supports."""
+    """Catches a column that is never filled, or always the same: here the yaws rest and the left
+    foot supports."""
     names = np.array(hard_walk.env.task.observation_table.names)
     constant = set(names[np.ptp(hard_walk.observations, axis=0) == 0.0])
-    yaws = {f"reference_{kind}.{side}_hip_yaw" for kind in ("angle", "rate", "acceleration") for side in "lr"}
+    yaws = {
+        f"reference_{kind}.{side}_hip_yaw"
+        for kind in ("angle", "rate", "acceleration")
+        for side in "lr"
+    }
     assert constant == {*yaws, "clock.support", "zmp_reference.x"}
 
 
@@ -618,7 +747,9 @@ def test_the_last_command_is_reference_plus_offset(hard_walk: Recording) -> None
     )
 
 
-@pytest.mark.parametrize(("roll", "pitch"), [(0.1, 0.0), (-0.2, 0.0), (0.0, 0.15), (0.0, -0.05), (0.1, -0.1)])
+@pytest.mark.parametrize(
+    ("roll", "pitch"), [(0.1, 0.0), (-0.2, 0.0), (0.0, 0.15), (0.0, -0.05), (0.1, -0.1)]
+)
 def test_roll_lifts_the_left_side_and_pitch_lowers_the_front(roll: float, pitch: float) -> None:
     """Catches signs and axes of the pelvis error: x forward, y left, z up."""
     env = walk_env(scenario="ideal")
@@ -628,16 +759,23 @@ def test_roll_lifts_the_left_side_and_pitch_lowers_the_front(roll: float, pitch:
     assert info["pelvis_roll"] == pytest.approx(roll, abs=0.02)
     assert info["pelvis_pitch"] == pytest.approx(pitch, abs=0.02)
     assert -up[0] == pytest.approx(np.sin(info["pelvis_pitch"]), abs=1e-12)
-    assert up[1] == pytest.approx(np.sin(info["pelvis_roll"]) * np.cos(info["pelvis_pitch"]), abs=1e-12)
+    assert up[1] == pytest.approx(
+        np.sin(info["pelvis_roll"]) * np.cos(info["pelvis_pitch"]), abs=1e-12
+    )
     assert info["pelvis_error"] == pytest.approx(np.arccos(up[2]), abs=1e-9)
     assert info["pelvis_height"] == pytest.approx(1.66, abs=0.01)
-    np.testing.assert_allclose(observation[24:26], [info["pelvis_roll"], info["pelvis_pitch"]], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        observation[24:26], [info["pelvis_roll"], info["pelvis_pitch"]], rtol=0.0, atol=1e-15
+    )
 
 
 def test_in_nominal_encoders_count_and_the_other_sensors_have_their_white_noise() -> None:
-    """Catches counts of the wrong size, noise of the wrong size, shared between columns, worlds or steps, and bias."""
-    env, scenario = walk_worlds(16), make_scenario("nominal")
-    observations, errors = [env.reset(seed=0)[0]], []
+    """Catches counts of the wrong size, noise of the wrong size, shared between columns, worlds
+    or steps, and bias."""
+    env = walk_worlds(16)
+    scenario = make_scenario("nominal")
+    observations = [env.reset(seed=0)[0]]
+    errors = []
     thetas = [env.truth().theta]
     for _ in range(60):
         observations.append(env.step(zeros(16))[0])
@@ -663,16 +801,21 @@ def test_in_nominal_encoders_count_and_the_other_sensors_have_their_white_noise(
 
 
 def test_in_sensor_measurements_are_one_control_step_old_and_biased(hard_walk: Recording) -> None:
-    """Catches a delay of two steps or none in any sensor, a bias that wanders, and a rate of other angles."""
+    """Catches a delay of two steps or none in any sensor, a bias that wanders, and a rate of
+    other angles."""
     size = 2.0 * np.pi / COUNTS_PER_TURN
-    theta, encoder = hard_walk.truth("theta"), hard_walk.group("encoder_angle")
+    theta = hard_walk.truth("theta")
+    encoder = hard_walk.group("encoder_angle")
     bias = encoder[1:] - theta[:-1]
     assert np.ptp(bias, axis=0).max() <= size * (1 + 1e-9)
     assert np.abs(bias).max() <= make_scenario("sensor").encoder_bias_rad + size
     assert len(np.unique(np.round(bias[0] / size))) == 12
     assert np.abs(bias.mean(axis=0)).max() > 1e-3
     np.testing.assert_allclose(
-        hard_walk.group("encoder_rate")[1:], np.diff(encoder, axis=0) / PERIOD_S, rtol=0.0, atol=1e-12
+        hard_walk.group("encoder_rate")[1:],
+        np.diff(encoder, axis=0) / PERIOD_S,
+        rtol=0.0,
+        atol=1e-12,
     )
     for name, values, spread in (
         ("imu_attitude", hard_walk.attitude, [0.2e-3] * 2),
@@ -680,18 +823,25 @@ def test_in_sensor_measurements_are_one_control_step_old_and_biased(hard_walk: R
         ("wrench", np.array(hard_walk.wrenches), ([1.0] * 3 + [0.05] * 3) * 2),
     ):
         shown = hard_walk.group(name)
-        np.testing.assert_allclose((shown[1:] - values[:-1]).std(axis=0), spread, rtol=5 / np.sqrt(2 * NUM_STEPS))
-        assert ((shown - values).std(axis=0) > 1.5 * np.array(spread)).any(), name  # without the delay it would not fit
+        np.testing.assert_allclose(
+            (shown[1:] - values[:-1]).std(axis=0), spread, rtol=5 / np.sqrt(2 * NUM_STEPS)
+        )
+        assert ((shown - values).std(axis=0) > 1.5 * np.array(spread)).any(), (
+            name
+        )  # without the delay it would not fit
     tilt_bias = (hard_walk.group("imu_attitude")[1:] - hard_walk.attitude[:-1]).mean(axis=0)
     assert np.abs(tilt_bias).max() <= 2e-3 + 1e-4
     assert np.abs(tilt_bias).min() > 1e-4
 
 
 def test_a_homing_error_turns_the_robot_and_not_its_reading() -> None:
-    """Catches a bias that the servos do not have: they hold what the encoder says, so the robot stands off by it."""
+    """Catches a bias that the servos do not have: they hold what the encoder says, so the robot
+    stands off by it."""
     env = make_walk(**SHORT, scenario="sensor")
     observation, _ = env.reset(seed=2)
-    np.testing.assert_allclose(observation[:12], env.task.assumed_model.plan.q[0], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(
+        observation[:12], env.task.assumed_model.plan.q[0], rtol=0.0, atol=2e-5
+    )
     assert np.abs(env.truth().theta[0] - observation[:12]).max() > 5e-4
 
 
@@ -699,20 +849,25 @@ def test_biases_and_pushes_of_the_worlds_differ() -> None:
     """Catches one bias or push for all worlds, and half the documented width."""
     env = walk_worlds(64, scenario="sensor")
     observation, _ = env.reset(seed=0)
-    bias = observation[:, 24:26] - Rotation.from_matrix(env.truth().pelvis_R).as_euler("ZYX")[:, :0:-1]
+    bias = (
+        observation[:, 24:26] - Rotation.from_matrix(env.truth().pelvis_R).as_euler("ZYX")[:, :0:-1]
+    )
     assert np.abs(bias).max() <= 2e-3 + 5 * 0.2e-3
     assert bias.min() < -0.9 * 2e-3
     assert bias.max() > 0.9 * 2e-3
     assert abs(np.corrcoef(bias.T)[0, 1]) < 0.5
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Scenarios, and what a policy may know of them
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
-def test_the_bank_of_spread_fills_its_interval_and_is_the_same_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a spread that is too narrow, one-sided, one for all joints, or new in every process."""
+def test_the_bank_of_spread_fills_its_interval_and_is_the_same_everywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a spread that is too narrow, one-sided, one for all joints, or new in every
+    process."""
     monkeypatch.setattr(walk_config, "BANK_SIZE", BANK_SIZE)
     bank = robot_bank(make_scenario("spread"))
     factors = np.array([robot.stiffness_factor for robot in bank])
@@ -733,9 +888,12 @@ def stiffness_of(env: Any) -> Array:
 
 @pytest.mark.parametrize("vector", [False, True])
 def test_spread_gives_every_joint_a_stiffness_of_its_own_and_tells_the_truth(vector: bool) -> None:
-    """Catches a stiffness that is drawn and not used, used and not told, or the same for robots and joints."""
+    """Catches a stiffness that is drawn and not used, used and not told, or the same for robots
+    and joints."""
     num = 7 if vector else 1
-    env: Any = walk_worlds(num, scenario="spread") if vector else make_walk(**SHORT, scenario="spread")
+    env: Any = (
+        walk_worlds(num, scenario="spread") if vector else make_walk(**SHORT, scenario="spread")
+    )
     env.reset(seed=0)
     truth = env.truth().stiffness
     springs = [env.task.model.tendon(spring_name(joint)).id for joint in JOINTS]
@@ -743,7 +901,9 @@ def test_spread_gives_every_joint_a_stiffness_of_its_own_and_tells_the_truth(vec
     assert truth.shape == (num, 12)
     assert ((truth >= 0.7 * STIFFNESS) & (truth <= 1.3 * STIFFNESS)).all()
     assert len(np.unique(truth[0])) == 12
-    assert len(np.unique(truth, axis=0)) == (2 if vector else 1)  # the seven draw two of the three in the bank
+    assert len(np.unique(truth, axis=0)) == (
+        2 if vector else 1
+    )  # the seven draw two of the three in the bank
     env.reset(seed=[11] * num if vector else 11)
     np.testing.assert_array_equal(stiffness_of(env)[:, springs], env.truth().stiffness)
 
@@ -759,7 +919,12 @@ def test_payload_is_in_the_plant_and_not_in_the_model() -> None:
 
 def test_friction_is_there_in_nominal_and_not_in_ideal() -> None:
     """Catches a ground with the other's friction; the ground is what an identification knows of."""
-    for scenario, friction in (("ideal", 0.0), ("nominal", FRICTION), ("soft", FRICTION), ("ideal+soft", 0.0)):
+    for scenario, friction in (
+        ("ideal", 0.0),
+        ("nominal", FRICTION),
+        ("soft", FRICTION),
+        ("ideal+soft", 0.0),
+    ):
         env = make_walk(**SHORT, scenario=scenario)
         links = [env.task.model.joint(joint).dofadr[0] for joint in JOINTS]
         assert env.simulation.model.dof_frictionloss[links].tolist() == [friction] * 12, scenario
@@ -768,7 +933,8 @@ def test_friction_is_there_in_nominal_and_not_in_ideal() -> None:
 
 
 def test_a_slope_tilts_the_ground_under_the_soles_and_the_robot_stands_on_it() -> None:
-    """Catches a slope that is drawn and not built, of another angle, or in one direction for all robots."""
+    """Catches a slope that is drawn and not built, of another angle, or in one direction for all
+    robots."""
     env = walk_env(scenario="slope")
     directions = set()
     for seed in range(6):
@@ -790,19 +956,35 @@ def test_backlash_is_a_dead_band_of_every_spring() -> None:
     """Catches a backlash that the physics does not have, or the truth does not tell."""
     env = walk_env(scenario="backlash")
     springs = [env.task.model.tendon(spring_name(joint)).id for joint in JOINTS]
-    np.testing.assert_allclose(env.simulation.model.tendon_lengthspring[springs], [[-1.75e-3 / 2, 1.75e-3 / 2]] * 12)
+    np.testing.assert_allclose(
+        env.simulation.model.tendon_lengthspring[springs], [[-1.75e-3 / 2, 1.75e-3 / 2]] * 12
+    )
     assert env.truth().model.backlash.tolist() == [1.75e-3] * 12
 
 
-@pytest.mark.parametrize("scenario", ["soft", "stiff", "payload", "spread", "backlash", "sensor", "push", "slope"])
+@pytest.mark.parametrize(
+    "scenario", ["soft", "stiff", "payload", "spread", "backlash", "sensor", "push", "slope"]
+)
 def test_the_assumed_model_and_the_reference_do_not_know_the_scenario(scenario: str) -> None:
-    """Catches a compensator, or a plan, that is told the true stiffness, mass, backlash or slope."""
-    env, nominal = make_walk(**SHORT, scenario=scenario), make_walk(**SHORT)
+    """Catches a compensator, or a plan, that is told the true stiffness, mass, backlash or
+    slope."""
+    env = make_walk(**SHORT, scenario=scenario)
+    nominal = make_walk(**SHORT)
     observation, wanted = (e.reset(seed=0)[0] for e in (env, nominal))
     np.testing.assert_array_equal(observation[41:], wanted[41:])
-    assumed, expected = env.assumed_model, nominal.assumed_model
-    for parameter in ("stiffness", "damping", "rotor_inertia", "backlash", "coulomb_friction", "viscous_friction"):
-        np.testing.assert_array_equal(getattr(assumed, parameter), getattr(expected, parameter), err_msg=parameter)
+    assumed = env.assumed_model
+    expected = nominal.assumed_model
+    for parameter in (
+        "stiffness",
+        "damping",
+        "rotor_inertia",
+        "backlash",
+        "coulomb_friction",
+        "viscous_friction",
+    ):
+        np.testing.assert_array_equal(
+            getattr(assumed, parameter), getattr(expected, parameter), err_msg=parameter
+        )
     assert assumed.stiffness.tolist() == [STIFFNESS] * 12
     np.testing.assert_array_equal(assumed.rigid.body_mass, expected.rigid.body_mass)
     np.testing.assert_array_equal(assumed.plan.torque, expected.plan.torque)
@@ -820,11 +1002,13 @@ def test_a_given_stiffness_is_that_of_plant_and_model(stiffness: Any) -> None:
 
 
 def test_a_push_gives_the_robot_its_impulse_once_within_the_walk() -> None:
-    """Catches a push that is missing, too long, vertical, repeated, or outside the walk: 50 N for 0.1 s are 5 N·s."""
+    """Catches a push that is missing, too long, vertical, repeated, or outside the walk: 50 N
+    for 0.1 s are 5 N·s."""
     pushed, calm = (walk_env(scenario=scenario) for scenario in ("ideal+push", "ideal"))
     for env in (pushed, calm):
         lean(env, height_m=100.0)  # where no foot can brace itself; both fall alike
-    forces, momenta = [], []
+    forces = []
+    momenta = []
     for _ in range(WALK_END + 30):
         for env in (pushed, calm):
             env.step(zeros())
@@ -844,8 +1028,10 @@ def test_a_push_gives_the_robot_its_impulse_once_within_the_walk() -> None:
 
 def momentum(env: ElasticEnv) -> Array:
     """Linear momentum of the robot, (3,) [N·s]."""
-    model, data = env.simulation.model, mujoco.MjData(env.simulation.model)
-    data.qpos[:], data.qvel[:] = env.simulation.qpos[0], env.simulation.qvel[0]
+    model = env.simulation.model
+    data = mujoco.MjData(env.simulation.model)
+    data.qpos[:] = env.simulation.qpos[0]
+    data.qvel[:] = env.simulation.qvel[0]
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
     pelvis = model.body("pelvis").id
@@ -892,28 +1078,34 @@ def test_options_of_the_robot_stand_and_walk(arguments: dict[str, Any]) -> None:
         assert not terminated
         assert not truncated
     assert info["pelvis_error"] < 0.05
-    truth, stiffness = env.truth(), env.assumed_model.stiffness
-    rigid, twin = arguments.get("form") == "rigid", "twin_knee" in arguments.get("robot", {})
+    truth = env.truth()
+    stiffness = env.assumed_model.stiffness
+    rigid = arguments.get("form") == "rigid"
+    twin = "twin_knee" in arguments.get("robot", {})
     assert (info["deflection"] == 0.0) == rigid
-    assert stiffness.tolist() == [STIFFNESS * (2 if twin and "knee" in joint else 1) for joint in JOINTS]
+    assert stiffness.tolist() == [
+        STIFFNESS * (2 if twin and "knee" in joint else 1) for joint in JOINTS
+    ]
     wanted_m = 2 * arguments.get("robot", {}).get("hip_half_spacing", 0.105)
     assert truth.ankles[0, 0, 1] - truth.ankles[0, 1, 1] == pytest.approx(wanted_m, abs=5e-3)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Scores
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk: Recording) -> None:
-    """Catches a key that disappears, and a score that is computed from measurements instead of the truth."""
+    """Catches a key that disappears, and a score that is computed from measurements instead of
+    the truth."""
     assert set(hard_walk.results[0][1]) == INFO_KEYS - {"clipped", "reward_terms", "termination"}
     assert all(set(result[4]) == INFO_KEYS for result in hard_walk.results[1:-1])
     assert set(hard_walk.results[-1][4]) == INFO_KEYS | {"episode_metrics"}
     plan = hard_walk.env.task.assumed_model.plan
     q, theta, stiffness = (hard_walk.truth(name)[1:] for name in ("q", "theta", "stiffness"))
     slip = (hard_walk.truth("theta_dot") - hard_walk.truth("q_dot"))[1:]
-    error, offsets = plan.q[1:] - q, HARD_ACTIONS[:, 1].astype(np.float64)
+    error = plan.q[1:] - q
+    offsets = HARD_ACTIONS[:, 1].astype(np.float64)
     zmp = np.stack([hard_walk.info("zmp_x"), hard_walk.info("zmp_y")], axis=1)
 
     def rms(values: Array) -> Array:
@@ -948,24 +1140,36 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
 
 
 def test_zmp_and_forces_are_those_of_the_contacts_of_mujoco() -> None:
-    """Catches levers, frames and signs of the wrenches: the contacts themselves must give the same ZMP and forces."""
+    """Catches levers, frames and signs of the wrenches: the contacts themselves must give the
+    same ZMP and forces."""
     env = walk_env(scenario="ideal")
-    standing, swinging = (0.1, 1e-4), (10.0, 4e-3)  # [N], [m]; the sensors feel the feet's inertia too
+    standing = (0.1, 1e-4)
+    swinging = (10.0, 4e-3)
     for k in range(TOUCH_DOWN + 20):
         *_, info = env.step(zeros())
         if k % 10 == 0 and (k < 50 or k > LIFT_OFF - 40):
-            (force, zmp), (force_n, zmp_m) = contact_forces(env), standing if k < 50 else swinging
-            np.testing.assert_allclose([info["force_left"], info["force_right"]], force, rtol=0.0, atol=force_n)
+            force, zmp = contact_forces(env)
+            force_n, zmp_m = standing if k < 50 else swinging
+            np.testing.assert_allclose(
+                [info["force_left"], info["force_right"]], force, rtol=0.0, atol=force_n
+            )
             np.testing.assert_allclose([info["zmp_x"], info["zmp_y"]], zmp, rtol=0.0, atol=zmp_m)
 
 
 def contact_forces(env: ElasticEnv) -> tuple[Array, Array]:
-    """Vertical force on left and right foot, and the ZMP, from the contacts of the present state."""
-    model, simulation, data = env.task.model, env.simulation, mujoco.MjData(env.task.model)
-    data.qpos[:], data.qvel[:], data.act[:] = simulation.qpos[0], simulation.qvel[0], simulation.act[0]
+    """Vertical force on left and right foot, and the ZMP, from the contacts of the present
+    state."""
+    model = env.task.model
+    simulation = env.simulation
+    data = mujoco.MjData(env.task.model)
+    data.qpos[:] = simulation.qpos[0]
+    data.qvel[:] = simulation.qvel[0]
+    data.act[:] = simulation.act[0]
     data.ctrl[:] = simulation.ctrl[0]
     mujoco.mj_forward(model, data)
-    force, zmp, wrench = np.zeros(2), np.zeros(2), np.zeros(6)
+    force = np.zeros(2)
+    zmp = np.zeros(2)
+    wrench = np.zeros(6)
     for i, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, i, wrench)  # the floor is level: normals are vertical
         force[int(model.geom(contact.geom[1]).name == "r_sole")] += wrench[0]
@@ -986,17 +1190,27 @@ def statistic(name: str, values: Array) -> float:
 
 
 def test_episode_metrics_are_those_of_the_recorded_signals(hard_walk: Recording) -> None:
-    """Catches samples of standing or of the episode before in the scores, and a wrong statistic under a right name."""
+    """Catches samples of standing or of the episode before in the scores, and a wrong statistic
+    under a right name."""
     timing = hard_walk.env.task.assumed_model.plan.timing
-    walking, single, transition = (mask[1:] for mask in (timing.walking, timing.single, timing.transition))
+    walking, single, transition = (
+        mask[1:] for mask in (timing.walking, timing.single, timing.transition)
+    )
     loaded = ~np.isnan(hard_walk.info("zmp_x"))
     end = np.arange(1, NUM_STEPS + 1) == TOUCH_DOWN
     masks = {
-        "scored": walking, "all": np.ones_like(walking), "double": walking & ~single, "single": single,
-        "transition": transition, "loaded": walking & loaded, "unloaded": walking & ~loaded,
-        "double_loaded": walking & ~single & loaded, "single_loaded": single & loaded,
-        "transition_loaded": transition & loaded, "touchdown": end,
-    }  # fmt: skip
+        "scored": walking,
+        "all": np.ones_like(walking),
+        "double": walking & ~single,
+        "single": single,
+        "transition": transition,
+        "loaded": walking & loaded,
+        "unloaded": walking & ~loaded,
+        "double_loaded": walking & ~single & loaded,
+        "single_loaded": single & loaded,
+        "transition_loaded": transition & loaded,
+        "touchdown": end,
+    }
     metrics = dict(hard_walk.results[-1][4]["episode_metrics"])
     assert (metrics.pop("fell"), metrics.pop("diverged")) == (False, False)
     assert set(metrics) == {metric.name for metric in hard_walk.env.task.metrics}
@@ -1009,18 +1223,25 @@ def test_episode_metrics_are_those_of_the_recorded_signals(hard_walk: Recording)
 
 
 def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
-    """Catches a figure under a name that belongs to another signal or unit, and a promised one that is missing."""
+    """Catches a figure under a name that belongs to another signal or unit, and a promised one
+    that is missing."""
     metrics = make_walk(**SHORT).task.metrics
     names = [metric.name for metric in metrics]
     assert len(set(names)) == len(names)
     assert [name for name in names if not re.search("_(rad|rad_s|nm|m|s|share|count)$", name)] == []
     for metric in metrics:
         if metric.signal.startswith(("pelvis", "zmp")) and metric.statistic != "count":
-            phase = {"scored": "", "loaded": ""}.get(metric.over, f"_{metric.over.removesuffix('_loaded')}")
+            phase = {"scored": "", "loaded": ""}.get(
+                metric.over, f"_{metric.over.removesuffix('_loaded')}"
+            )
             unit = "rad" if metric.signal.startswith("pelvis") else "m"
             assert metric.name == f"{metric.signal}{phase}_{metric.statistic}_{unit}"
-            assert metric.over.endswith("loaded") == (unit == "m")  # where there is no ZMP there is no deviation
-    required = {f"pelvis_{angle}_{s}_rad" for angle in ("roll", "pitch", "error") for s in ("rms", "peak")}
+            assert metric.over.endswith("loaded") == (
+                unit == "m"
+            )  # where there is no ZMP there is no deviation
+    required = {
+        f"pelvis_{angle}_{s}_rad" for angle in ("roll", "pitch", "error") for s in ("rms", "peak")
+    }
     required |= {f"zmp_deviation{axis}_{s}_m" for axis in ("", "_x", "_y") for s in ("rms", "peak")}
     required |= {f"link_error_{s}_rad" for s in ("rms", "min", "max")}
     required |= {f"pelvis_error_{phase}_rms_rad" for phase in ("double", "single", "transition")}
@@ -1045,8 +1266,11 @@ def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
     assert {name: described[name] for name in others} == others
 
 
-def test_an_early_touchdown_is_measured_from_the_first_load_on_the_descending_foot(open_loop: Recording) -> None:
-    """Catches earliness of the wrong foot, of lift-off, in steps instead of seconds, or counted at every step."""
+def test_an_early_touchdown_is_measured_from_the_first_load_on_the_descending_foot(
+    open_loop: Recording,
+) -> None:
+    """Catches earliness of the wrong foot, of lift-off, in steps instead of seconds, or counted
+    at every step."""
     rows = np.arange(1, NUM_STEPS + 1)
     descending = (rows > (LIFT_OFF + TOUCH_DOWN) / 2) & (rows < TOUCH_DOWN)
     loaded = open_loop.info("force_right") > 0.05 * MASS_KG * GRAVITY
@@ -1057,14 +1281,21 @@ def test_an_early_touchdown_is_measured_from_the_first_load_on_the_descending_fo
     assert recorded[TOUCH_DOWN - 1] == pytest.approx(early, abs=1e-12)
     assert np.flatnonzero(recorded).tolist() == [TOUCH_DOWN - 1]
     metrics = open_loop.results[-1][4]["episode_metrics"]
-    assert metrics["early_touchdown_mean_s"] == metrics["early_touchdown_max_s"] == pytest.approx(early, abs=1e-12)
+    assert (
+        metrics["early_touchdown_mean_s"]
+        == metrics["early_touchdown_max_s"]
+        == pytest.approx(early, abs=1e-12)
+    )
 
 
 def test_a_robot_that_hangs_is_unloaded_has_no_zmp_and_touches_down_never_early() -> None:
-    """Catches a ZMP made of next to no force, unloaded samples that are not counted, and earliness without contact."""
+    """Catches a ZMP made of next to no force, unloaded samples that are not counted, and
+    earliness without contact."""
     env = walk_env(scenario="ideal")
     lean(env, height_m=1.0)
-    env.simulation.bind("xfrc_applied")[0, env.task.model.body("upper_body").id, 2] = MASS_KG * GRAVITY
+    env.simulation.bind("xfrc_applied")[0, env.task.model.body("upper_body").id, 2] = (
+        MASS_KG * GRAVITY
+    )
     for step in range(1, TOUCH_DOWN + 11):
         *_, terminated, truncated, info = env.step(zeros())
         assert not terminated
@@ -1080,13 +1311,18 @@ def test_a_robot_that_hangs_is_unloaded_has_no_zmp_and_touches_down_never_early(
     assert metrics["unloaded_samples_count"] == step + 1 - WALK_BEGIN
     assert metrics["early_touchdown_mean_s"] == metrics["early_touchdown_max_s"] == 0.0
     assert np.isnan([metrics["zmp_deviation_rms_m"], metrics["zmp_deviation_single_rms_m"]]).all()
-    assert np.isfinite([metrics["pelvis_roll_rms_rad"], metrics["pelvis_roll_single_rms_rad"]]).all()
+    assert np.isfinite(
+        [metrics["pelvis_roll_rms_rad"], metrics["pelvis_roll_single_rms_rad"]]
+    ).all()
     assert metrics["duration_s"] == pytest.approx((step + 1) * PERIOD_S)
 
 
 @pytest.mark.parametrize("scenario", ["nominal", "sensor"])
-def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(scenario: str) -> None:
-    """Catches a term that is missing in info, or computed from another quantity than it is named after."""
+def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(
+    scenario: str,
+) -> None:
+    """Catches a term that is missing in info, or computed from another quantity than it is named
+    after."""
     env = walk_worlds(3, scenario=scenario)
     env.reset(seed=0)
     for actions in random_actions(15, 3):
@@ -1120,14 +1356,21 @@ def test_weights_of_the_reward_can_be_chosen() -> None:
 
 
 def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() -> None:
-    """Catches a factor on the walk itself, on other terms, or at other steps than those that the metrics leave out."""
+    """Catches a factor on the walk itself, on other terms, or at other steps than those that the
+    metrics leave out."""
     logs = []
     for standing in (1.0, 0.25):
         env = walk_worlds(1, scenario="ideal", reward={"standing": standing})
         env.reset(seed=0)
-        logs.append([env.step(np.zeros((1, 12)))[4]["reward_terms"] for _ in range(env.task.num_steps)])
-    whole, less = ({name: np.array([terms[name][0] for terms in log]) for name in log[0]} for log in logs)
-    walking = env.task.plan.timing.walking[np.arange(1, env.task.num_steps + 1).clip(max=env.task.num_steps)]
+        logs.append(
+            [env.step(np.zeros((1, 12)))[4]["reward_terms"] for _ in range(env.task.num_steps)]
+        )
+    whole, less = (
+        {name: np.array([terms[name][0] for terms in log]) for name in log[0]} for log in logs
+    )
+    walking = env.task.plan.timing.walking[
+        np.arange(1, env.task.num_steps + 1).clip(max=env.task.num_steps)
+    ]
     for name, values in less.items():
         factor = np.where(walking, 1.0, 0.25) if name in ("tilt", "zmp") else 1.0
         np.testing.assert_allclose(values, factor * whole[name], rtol=1e-12, err_msg=name)
@@ -1149,9 +1392,9 @@ def test_penalties_never_saturate() -> None:
     assert tilts[1] == pytest.approx(-0.2 * WalkRewardWeights().tilt, rel=0.05)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Ends
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_metrics_of_an_episode_come_once() -> None:
@@ -1171,7 +1414,11 @@ def test_metrics_of_an_episode_come_once() -> None:
 
 def test_friction_is_that_of_the_soles() -> None:
     """Catches the friction of the floor, which MuJoCo takes where it is the larger one."""
-    for options, expected in (({}, 1.0), ({"robot": {"friction": 0.4}}, 0.4), ({"robot": {"friction": 1.3}}, 1.3)):
+    for options, expected in (
+        ({}, 1.0),
+        ({"robot": {"friction": 0.4}}, 0.4),
+        ({"robot": {"friction": 1.3}}, 1.3),
+    ):
         env = make_walk(**SHORT, **options)
         env.reset(seed=0)
         contact = env.unwrapped.simulation._data.contact
@@ -1214,7 +1461,9 @@ def test_a_large_constant_offset_makes_the_robot_fall(sign: float) -> None:
         ({"sink": 0.72}, True),
     ],
 )
-def test_a_fall_is_a_tilt_or_a_height_beyond_its_limit(change: dict[str, float], falls: bool) -> None:
+def test_a_fall_is_a_tilt_or_a_height_beyond_its_limit(
+    change: dict[str, float], falls: bool
+) -> None:
     """Catches limits in other units, of roll alone, or of the wrong height."""
     assert (walk_config.FALL_TILT_RAD, walk_config.FALL_HEIGHT_SHARE) == (0.4, 0.75)
     env = walk_env(scenario="ideal")
@@ -1264,9 +1513,9 @@ def test_divergence_ends_the_episode_with_its_reason(value: float) -> None:
     assert info["termination"] == ""
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Wrong input
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_actions_beyond_the_bounds_act_as_the_bounds_and_are_counted() -> None:
@@ -1285,13 +1534,18 @@ def test_actions_beyond_the_bounds_act_as_the_bounds_and_are_counted() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_action_that_is_not_finite_names_value_bounds_and_shape(value: float) -> None:
     """Catches NaN that reaches the physics, where it would look like a divergence."""
-    env, many = walk_env(), walk_worlds(3)
+    env = walk_env()
+    many = walk_worlds(3)
     many.reset(seed=0)
     action = zeros(3)
     action[2, 4] = value
-    with pytest.raises(ActionError, match=rf"finite, within ±0\.3 rad, shape \(12,\).* got (?s:.*){value}"):
+    with pytest.raises(
+        ActionError, match=rf"finite, within ±0\.3 rad, shape \(12,\).* got (?s:.*){value}"
+    ):
         env.step(action[2])
-    with pytest.raises(ActionError, match=rf"finite, within ±0\.3 rad.* got (?s:.*){value}(?s:.*) in world 2"):
+    with pytest.raises(
+        ActionError, match=rf"finite, within ±0\.3 rad.* got (?s:.*){value}(?s:.*) in world 2"
+    ):
         many.step(action)
 
 
@@ -1307,7 +1561,8 @@ def test_an_action_of_wrong_shape_names_the_right_one(shape: tuple[int, ...]) ->
 
 @pytest.mark.parametrize("shape", [(), (12,), (3,), (12, 3), (2, 12), (3, 11), (3, 12, 1)])
 def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> None:
-    """Catches one action that is silently given to all worlds, and NumPy's error in place of ours."""
+    """Catches one action that is silently given to all worlds, and NumPy's error in place of
+    ours."""
     env = walk_worlds(3)
     env.reset(seed=0)
     with pytest.raises(ActionError) as error:
@@ -1319,11 +1574,26 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"scenario": "nominl"}, r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*slope.*'nominal'"),
+        (
+            {"scenario": "nominl"},
+            r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*slope.*'nominal'",
+        ),
         ({"scenario": "soft+stiff"}, r"'stiff' sets stiffness_scale a second time"),
-        ({"step": 3}, r"unknown argument of elastic_env/WalkInPlace-v0 'step'; choose one of: step_period, num_steps"),
-        ({"step_period": 2.0}, r"one of 24, 3, 1\.6, 1\.1 \[s\], or the three durations.* such as .*; got 2\.0"),
-        ({"step_period": [0.3, 0.5]}, r"three durations of double, single and double support \[s\].*; got \[0\.3, 0\."),
+        (
+            {"step": 3},
+            (
+                r"unknown argument of elastic_env/WalkInPlace-v0 'step'; choose one of:"
+                r" step_period, num_steps"
+            ),
+        ),
+        (
+            {"step_period": 2.0},
+            r"one of 24, 3, 1\.6, 1\.1 \[s\], or the three durations.* such as .*; got 2\.0",
+        ),
+        (
+            {"step_period": [0.3, 0.5]},
+            r"three durations of double, single and double support \[s\].*; got \[0\.3, 0\.",
+        ),
         ({"step_period": "fast"}, r"one of 24, 3, 1\.6, 1\.1 \[s\].*; got 'fast'"),
         (
             {"step_period": [0.3, 0.501, 0.3]},
@@ -1336,29 +1606,67 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         ),
         ({"num_steps": 0}, r"Gait\.num_steps must be a whole number >= 1 and <= 1000, got 0"),
         ({"num_steps": 1.5}, r"Gait\.num_steps must be a whole number >= 1 and <= 1000, got 1\.5"),
-        ({"gait": {"hip_height_m": 0.75}}, r"foot is out of reach at 0\.000 s: 0\.6500 m.*at most 0\.6 m; lower hip_h"),
+        (
+            {"gait": {"hip_height_m": 0.75}},
+            r"foot is out of reach at 0\.000 s: 0\.6500 m.*at most 0\.6 m; lower hip_h",
+        ),
         (
             {"gait": {"lift": 0.1}},
-            r"unknown parameter of gait beside step_period and num_steps 'lift'; choose .*Did you mean 'lift_m'",
+            (
+                r"unknown parameter of gait beside step_period and num_steps 'lift'; choose .*Did"
+                r" you mean 'lift_m'"
+            ),
         ),
-        ({"gait": {"lift_m": 0.5}}, r"too much of joint 'r_\w+' at .* s: it allows .* rad, the plan needs .* rad; use"),
-        ({"gait": 3.0}, r"gait must be a mapping of lift_m, hip_height_m, transfer, got 3\.0; see also step_period"),
-        ({"robot": {"hip": 1}}, r"unknown parameter of Thormang 'hip'; choose one of: hip_half_spacing, twin_knee"),
+        (
+            {"gait": {"lift_m": 0.5}},
+            r"too much of joint 'r_\w+' at .* s: it allows .* rad, the plan needs .* rad; use",
+        ),
+        (
+            {"gait": 3.0},
+            (
+                r"gait must be a mapping of lift_m, hip_height_m, transfer, got 3\.0; see also"
+                r" step_period"
+            ),
+        ),
+        (
+            {"robot": {"hip": 1}},
+            r"unknown parameter of Thormang 'hip'; choose one of: hip_half_spacing, twin_knee",
+        ),
         ({"robot": {"friction": -1.0}}, r"Thormang\.friction must be a finite number > 0, got -1"),
         ({"robot": "mk1"}, r"robot must be a Thormang or a mapping of its parameters, got 'mk1'"),
         ({"reward": {"tlit": 1.0}}, r"'tlit'.*Did you mean 'tilt'"),
-        ({"reward": 2.0}, r"reward must be a WalkRewardWeights or a mapping of its parameters, got 2.0"),
+        (
+            {"reward": 2.0},
+            r"reward must be a WalkRewardWeights or a mapping of its parameters, got 2.0",
+        ),
         ({"joint": 1001}, r"joint must be a ElasticJoint or a mapping of its parameters, got 1001"),
-        ({"joint": {"servo": None}}, r"a servo is needed on every joint, but there is none on: l_hip_yaw, .*r_ankle_r"),
-        ({"stiffness": [1, 2, 3]}, r"one number or 12 of them \[N·m/rad\].*l_hip_yaw, .*, got an array of shape \(3,"),
-        ({"stiffness": -5.0}, r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got -5"),
-        ({"stiffness": [*[1001.0] * 11, np.nan]}, r"ElasticJoint\.stiffness must be a finite.* \[N·m/rad\], got nan"),
-        ({"stiffness": "no/such.json"}, r"number \[N·m/rad\] or an identification file, found no file no/such"),
+        (
+            {"joint": {"servo": None}},
+            r"a servo is needed on every joint, but there is none on: l_hip_yaw, .*r_ankle_r",
+        ),
+        (
+            {"stiffness": [1, 2, 3]},
+            r"one number or 12 of them \[N·m/rad\].*l_hip_yaw, .*, got an array of shape \(3,",
+        ),
+        (
+            {"stiffness": -5.0},
+            r"ElasticJoint\.stiffness must be a finite number > 0 \[N·m/rad\], got -5",
+        ),
+        (
+            {"stiffness": [*[1001.0] * 11, np.nan]},
+            r"ElasticJoint\.stiffness must be a finite.* \[N·m/rad\], got nan",
+        ),
+        (
+            {"stiffness": "no/such.json"},
+            r"number \[N·m/rad\] or an identification file, found no file no/such",
+        ),
         ({"form": "series"}, r"form must be 'tendon' or 'rigid', got 'series'"),
         ({"render_mode": "ascii"}, r"unknown render mode 'ascii'; choose one of: rgb_array, human"),
     ],
 )
-def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any], message: str) -> None:
+def test_a_wrong_argument_names_itself_and_what_exists(
+    arguments: dict[str, Any], message: str
+) -> None:
     """Catches an argument that is ignored, and an error that sends the user into the source."""
     with pytest.raises(ConfigurationError, match=message):
         make_walk(**{**SHORT, **arguments})
@@ -1367,14 +1675,22 @@ def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any]
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"autoreset_mode": "Next"}, r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled"),
+        (
+            {"autoreset_mode": "Next"},
+            r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled",
+        ),
         ({"num_envs": 0}, r"num_envs must be a whole number >= 1, got 0"),
         ({"num_threads": -1}, r"num_threads must be a whole number >= 0, 0 for all, got -1"),
         ({"num_threads": "x"}, r"num_threads must be a whole number >= 0, 0 for all, got 'x'"),
-        ({"render_mode": "human"}, r"unknown render mode of a vector environment 'human'; choose one of: rgb_array"),
+        (
+            {"render_mode": "human"},
+            r"unknown render mode of a vector environment 'human'; choose one of: rgb_array",
+        ),
     ],
 )
-def test_a_wrong_argument_of_the_vector_environment_names_itself(arguments: dict[str, Any], message: str) -> None:
+def test_a_wrong_argument_of_the_vector_environment_names_itself(
+    arguments: dict[str, Any], message: str
+) -> None:
     """Catches the same for the arguments that only many worlds have."""
     with pytest.raises(ConfigurationError, match=message):
         make_walk_vector(**{**SHORT, **arguments})
@@ -1383,7 +1699,9 @@ def test_a_wrong_argument_of_the_vector_environment_names_itself(arguments: dict
 def test_a_robot_too_soft_to_stand_says_so() -> None:
     """Catches an episode that begins in a fall."""
     env = make_walk(**SHORT, stiffness=100.0)
-    with pytest.raises(ValueError, match=r"the robot does not stand: pelvis at .* m \(planned 0\.660 m\).*too soft"):
+    with pytest.raises(
+        ValueError, match=r"the robot does not stand: pelvis at .* m \(planned 0\.660 m\).*too soft"
+    ):
         env.reset(seed=0)
 
 
@@ -1391,7 +1709,11 @@ def test_defaults_are_those_of_the_paper() -> None:
     """Catches a default that drifts: the robot, the gait and the control rate."""
     config = make_walk().task.config
     gait = config.gait
-    assert (gait.double_support_s, gait.single_support_s, gait.last_double_support_s) == (1.1, 0.8, 1.1)
+    assert (gait.double_support_s, gait.single_support_s, gait.last_double_support_s) == (
+        1.1,
+        0.8,
+        1.1,
+    )
     assert gait.num_steps == 4
     assert config.scenario.name == "nominal"
     assert config.robot.hip_half_spacing == 0.105

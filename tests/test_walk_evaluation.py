@@ -1,4 +1,5 @@
-"""Evaluating a walk: the error of the local frame against Eq. 1, records, tables, figures, sweeps, and the commands."""
+"""Evaluating a walk: the error of the local frame against Eq. 1, records, tables, figures,
+sweeps, and the commands."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -27,10 +28,23 @@ from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import make_vector_env
-from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
+from train.evaluate.support_changes import (
+    SupportChanges,
+    com_jump,
+    frame_error,
+    support_changes,
+    tilt,
+)
 from train.figures.chart import intervals, sweep_chart
 from train.figures.colours import policy_colours
-from train.figures.comparison_figures import by_option, by_reference, draw_pelvis, draw_sweep, draw_zmp, figure_name
+from train.figures.comparison_figures import (
+    by_option,
+    by_reference,
+    draw_pelvis,
+    draw_sweep,
+    draw_zmp,
+    figure_name,
+)
 from train.learn.train_config import TrainConfig
 from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
@@ -55,7 +69,9 @@ def made_up(condition: Condition, *episodes: tuple[str, float]) -> Evaluation:
     """An evaluation whose metrics all have one value, with the termination of every episode."""
     names = [column.metric for column in condition.environment.columns]
     names += [column.metric for _, columns in condition.environment.splits for column in columns]
-    return Evaluation(condition, [{"termination": end, **dict.fromkeys(names, value)} for end, value in episodes])
+    return Evaluation(
+        condition, [{"termination": end, **dict.fromkeys(names, value)} for end, value in episodes]
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -84,7 +100,9 @@ def model() -> WalkerModel:
 @pytest.fixture(scope="module")
 def fallen() -> Evaluation:
     """A walk without any control, which ends in a fall."""
-    return evaluate(walk("zero", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1)
+    return evaluate(
+        walk("zero", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1
+    )
 
 
 # The local frame at the support changes.
@@ -92,14 +110,19 @@ def fallen() -> Evaluation:
 
 @pytest.mark.parametrize("foot", [LEFT, RIGHT])
 @pytest.mark.parametrize("theta", [0.05, -0.02])
-def test_frame_error_of_a_hip_roll_deflection_is_equation_1(model: WalkerModel, foot: int, theta: float) -> None:
-    """Catches a wrong sign, foot or axes: the pelvis rolls by θ over an upright leg, and no encoder shows it."""
+def test_frame_error_of_a_hip_roll_deflection_is_equation_1(
+    model: WalkerModel, foot: int, theta: float
+) -> None:
+    """Catches a wrong sign, foot or axes: the pelvis rolls by θ over an upright leg, and no
+    encoder shows it."""
     biped = model.biped
-    seen, true = np.zeros((1, 12)), np.zeros((1, 12))
+    seen = np.zeros((1, 12))
+    true = np.zeros((1, 12))
     true[0, 6 * foot + HIP_ROLL] = -theta
     attitude = np.array([[theta, 0.0]])
     e = frame_error(local_frame(biped, seen, attitude), local_frame(biped, true, attitude), foot)
-    L, half = biped.leg.reach + biped.ankle_height, theta / 2.0
+    L = biped.leg.reach + biped.ankle_height
+    half = theta / 2.0
     expected = L * np.array([0.0, 2.0 * np.sin(half) * np.cos(half), 2.0 * np.sin(half) ** 2])
     np.testing.assert_allclose(e, [expected], rtol=0.0, atol=1e-12)
     assert np.linalg.norm(expected) == pytest.approx(2.0 * L * abs(np.sin(half)), rel=1e-12)
@@ -114,12 +137,17 @@ def test_com_jumps_by_what_the_distance_of_the_feet_is_wrong(model: WalkerModel)
     assert not com_jump(LocalFrame(com, soles[None]), footholds, LEFT, RIGHT).any()
     soles[RIGHT] += wrong
     frame = LocalFrame(com, soles[None])
-    np.testing.assert_allclose(com_jump(frame, footholds, LEFT, RIGHT), [-wrong], rtol=0.0, atol=1e-15)
-    np.testing.assert_allclose(com_jump(frame, footholds, RIGHT, LEFT), [wrong], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        com_jump(frame, footholds, LEFT, RIGHT), [-wrong], rtol=0.0, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        com_jump(frame, footholds, RIGHT, LEFT), [wrong], rtol=0.0, atol=1e-15
+    )
 
 
 def test_support_changes_are_those_between_the_steps(model: WalkerModel) -> None:
-    """Catches the beginning and the end of the walk taken for a change, and one that is a step late."""
+    """Catches the beginning and the end of the walk taken for a change, and one that is a step
+    late."""
     timing = model.plan.timing
     (change,) = support_changes(timing)
     assert timing.time[change - 1] == pytest.approx(1.0 + 1.1)  # standing, and the first step
@@ -128,23 +156,34 @@ def test_support_changes_are_those_between_the_steps(model: WalkerModel) -> None
 
 def test_tilt_leaves_the_heading_out() -> None:
     """Catches an error of the frame that is the pelvis' heading, which no policy can know."""
-    roll, pitch, yaw = 0.03, -0.02, 0.4
-    heading = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    roll = 0.03
+    pitch = -0.02
+    yaw = 0.4
+    heading = np.array(
+        [[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+    )
     R = heading @ rotation_y(np.array([pitch]))[0] @ rotation_x(np.array([roll]))[0]
     np.testing.assert_allclose(tilt(R[None]), [[roll, pitch]], atol=1e-15)
 
 
 def test_figures_of_the_support_changes_are_taken_at_the_changes_alone(model: WalkerModel) -> None:
     """Catches samples of other steps, worlds mixed up, and a mean that is the largest."""
-    theta, change = np.array([0.01, 0.03]), int(support_changes(model.plan.timing)[0])
+    theta = np.array([0.01, 0.03])
+    change = int(support_changes(model.plan.timing)[0])
     observation = np.zeros((2, len(model.observation_table)))
-    observation[:, model.observation_table.group("imu_attitude")] = np.stack([theta, np.zeros(2)], axis=-1)
+    observation[:, model.observation_table.group("imu_attitude")] = np.stack(
+        [theta, np.zeros(2)], axis=-1
+    )
     true = np.zeros((2, 12))
     true[:, 6 * RIGHT + HIP_ROLL] = -theta
     truth = SimpleNamespace(q=true, pelvis_R=rotation_x(theta))
     changes = SupportChanges(model)
     assert changes.metrics(0) == {}
-    for step, estimate in ((change - 1, true + 0.1), (change, np.zeros((2, 12))), (change + 1, true + 0.1)):
+    for step, estimate in (
+        (change - 1, true + 0.1),
+        (change, np.zeros((2, 12))),
+        (change + 1, true + 0.1),
+    ):
         changes.take(step, estimate, observation, truth)
     L = model.biped.leg.reach + model.biped.ankle_height
     for world in (0, 1):
@@ -159,9 +198,13 @@ def test_figures_of_the_support_changes_are_taken_at_the_changes_alone(model: Wa
 
 
 def test_a_rigid_robot_knows_its_frame_and_an_elastic_one_does_not() -> None:
-    """Catches an error that is there without elasticity, options of a policy that do not reach the environment."""
+    """Catches an error that is there without elasticity, options of a policy that do not reach
+    the environment."""
     rigid = PolicySpec(name="zero", label="rigid", env_options={"form": "rigid"})
-    cells = [walk(spec=rigid, reference=TWO_STEPS, scenario="ideal"), walk("input", TWO_STEPS, scenario="ideal")]
+    cells = [
+        walk(spec=rigid, reference=TWO_STEPS, scenario="ideal"),
+        walk("input", TWO_STEPS, scenario="ideal"),
+    ]
     stiff, elastic = (evaluate(cell, num_threads=1).episodes[0] for cell in cells)
     assert stiff["policy"] == "rigid"
     assert max(stiff[f"frame_error_{part}_m"] for part in ("mean", "max", "y_mean")) < 1e-9
@@ -172,10 +215,12 @@ def test_a_rigid_robot_knows_its_frame_and_an_elastic_one_does_not() -> None:
 
 
 def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
-    """Catches metrics of another world, a reference without its number, and signals out of step with their time."""
+    """Catches metrics of another world, a reference without its number, and signals out of step
+    with their time."""
     cell = walk("input_output", episodes=2, seed=3)
     result = evaluate(cell, num_threads=1)
-    record, trace = result.episodes[0], result.trace
+    record = result.episodes[0]
+    trace = result.trace
     named = {
         "reference": "0.3+0.5+0.3 s num_steps=1",
         "step_period_s": 1.1,
@@ -185,7 +230,9 @@ def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
     }
     assert {key: record[key] for key in named} == named
     scored = (trace["time_s"] > 1.0 + 1e-9) & (trace["time_s"] < 2.1 + 1e-9)
-    assert record["pelvis_roll_rms_rad"] == pytest.approx(np.sqrt(np.mean(trace["pelvis_roll"][scored] ** 2)), rel=1e-9)
+    assert record["pelvis_roll_rms_rad"] == pytest.approx(
+        np.sqrt(np.mean(trace["pelvis_roll"][scored] ** 2)), rel=1e-9
+    )
     task = make_vector_env(cell, 1).unwrapped.task
     assert {metric.name for metric in task.metrics} <= record.keys()
     assert "frame_error_mean_m" not in record  # one step, no change of the support foot
@@ -207,7 +254,13 @@ def test_the_error_of_the_imu_is_that_of_roll_and_pitch_in_the_walk() -> None:
 class Blind:
     """A policy that commands nothing and estimates nothing."""
 
-    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ):
         """No offset."""
         return np.zeros((len(observation), 12)), state
 
@@ -219,8 +272,12 @@ def blind(env: Any) -> Blind:
 
 def test_a_policy_without_estimate_has_no_error_of_it() -> None:
     """Catches a protocol that asks for more than `predict`."""
-    record = evaluate(walk(f"{__name__}:blind", TWO_STEPS, scenario="ideal"), num_threads=1).episodes[0]
-    assert [name for name in record if name.startswith(("frame", "com_jump", "link_estimate"))] == []
+    record = evaluate(
+        walk(f"{__name__}:blind", TWO_STEPS, scenario="ideal"), num_threads=1
+    ).episodes[0]
+    assert [
+        name for name in record if name.startswith(("frame", "com_jump", "link_estimate"))
+    ] == []
     assert record["pelvis_roll_rms_rad"] > 0.0
 
 
@@ -242,8 +299,11 @@ def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
 
 
 def test_a_fall_of_all_says_when(fallen: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a policy of which nothing is known but that it fell, a mean of the times, and one of some that fell."""
-    several, some = (made_up(walk(p, episodes=3), *[(end, 0.1) for end in ends]) for p, ends in FALLS.items())
+    """Catches a policy of which nothing is known but that it fell, a mean of the times, and one
+    of some that fell."""
+    several, some = (
+        made_up(walk(p, episodes=3), *[(end, 0.1) for end in ends]) for p, ends in FALLS.items()
+    )
     for cell in (several, some):
         for episode, time in zip(cell.episodes, (3.42, 3.31, 9.0), strict=True):
             episode["duration_s"] = time
@@ -260,7 +320,10 @@ def test_a_fall_of_all_says_when(fallen: Evaluation, capsys: pytest.CaptureFixtu
     ]
     print_summary([several, some], Console(width=100))
     assert notes[0] in capsys.readouterr().out.splitlines()
-    assert f"* {notes[0]}" in write_summary([several, some], Path("summary.md")).read_text().splitlines()
+    assert (
+        f"* {notes[0]}"
+        in write_summary([several, some], Path("summary.md")).read_text().splitlines()
+    )
     assert "failed:" not in write_summary([some], Path("summary.md")).read_text()
 
 
@@ -272,20 +335,31 @@ def test_tables_say_median_worst_and_falls() -> None:
     cell = made_up(walk("input", episodes=4), ("", 0.002), ("fell", 9.0), ("", 0.004), ("", 0.003))
     text = write_summary([cell], Path("summary.md")).read_text()
     first, second = (
-        line for line in text.splitlines() if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
+        line
+        for line in text.splitlines()
+        if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
     )
     assert first.count("3.00 (4.00)") == 5  # roll, pitch and IMU
     assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
     assert first.endswith("| 1/4 |")
     assert second.endswith("| 1/4 |")
     assert "9000" not in text
-    for word in ("pelvis", "double", "single", "transition", "e mean [mm]", "COM jump [mm]", "early [ms]"):
+    for word in (
+        "pelvis",
+        "double",
+        "single",
+        "transition",
+        "e mean [mm]",
+        "COM jump [mm]",
+        "early [ms]",
+    ):
         assert word.lower() in text.lower()
 
 
 @pytest.mark.parametrize("width", [100, 72])
 def test_the_table_fits_its_terminal(width: int) -> None:
-    """Catches names cut short, numbers broken over lines, and a lack of room that hides what policies are judged by."""
+    """Catches names cut short, numbers broken over lines, and a lack of room that hides what
+    policies are judged by."""
     cells = [
         made_up(walk(policy, [0.8, 0.6, 0.8], scenario="ideal+soft"), ("", 0.0876))
         for policy in ("uncompensated", "input_output")
@@ -300,7 +374,9 @@ def test_the_table_fits_its_terminal(width: int) -> None:
     assert set(row[4:-1]) <= {"87.60", "87.6", "88"}
     assert any("ZMP" in line for line in lines if "no room" not in line)
     assert any("summary.md" in line for line in lines) == (width < 100)
-    assert any("Eq. 1" in line for line in lines) == (width == 100)  # the legend is of what is shown
+    assert any("Eq. 1" in line for line in lines) == (
+        width == 100
+    )  # the legend is of what is shown
 
 
 # Figures.
@@ -308,7 +384,9 @@ def test_the_table_fits_its_terminal(width: int) -> None:
 
 def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
     """Catches empty pictures, and a fall that breaks the scale or the drawing."""
-    upright = evaluate(walk("input_output", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1)
+    upright = evaluate(
+        walk("input_output", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1
+    )
     for draw in (draw_pelvis, draw_zmp):
         with Image.open(draw([fallen, upright], Path(f"{draw.__name__}.png"))) as image:
             pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
@@ -322,8 +400,13 @@ def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
 
 def test_intervals_are_where_a_mask_is_true() -> None:
     """Catches a shade that is a sample short, or missing at the ends."""
-    mask, time = np.array([1.0, 0.0, 1.0, 1.0, 0.0, 1.0]), 0.1 * np.arange(6)
-    assert intervals(mask, time) == [(0.0, 0.0), (pytest.approx(0.2), pytest.approx(0.3)), (0.5, 0.5)]
+    mask = np.array([1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+    time = 0.1 * np.arange(6)
+    assert intervals(mask, time) == [
+        (0.0, 0.0),
+        (pytest.approx(0.2), pytest.approx(0.3)),
+        (0.5, 0.5),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -340,7 +423,9 @@ def test_intervals_are_where_a_mask_is_true() -> None:
         ("pelvis", [0.8, 0.6, 0.8], "nominal", "pelvis_0.8+0.6+0.8_s_nominal"),
     ],
 )
-def test_figures_have_the_numbers_of_the_paper(kind: str, reference: Any, scenario: str, name: str) -> None:
+def test_figures_have_the_numbers_of_the_paper(
+    kind: str, reference: Any, scenario: str, name: str
+) -> None:
     """Catches a picture that claims to be the paper's and is not."""
     assert figure_name(kind, Evaluation(walk(reference=reference, scenario=scenario))) == name
 
@@ -348,19 +433,26 @@ def test_figures_have_the_numbers_of_the_paper(kind: str, reference: Any, scenar
 def test_references_that_differ_stay_apart_and_say_each_parameter_once() -> None:
     """Catches a number of steps that is named twice, and two gaits of one name."""
     walks = [{"step_period": 3, "num_steps": 1, "form": form} for form in ("tendon", "rigid")]
-    cells = CompareConfig(name="x", env="walker", references=[*walks, 3], policies=["zero"]).conditions()  # type: ignore[list-item]
+    cells = CompareConfig(
+        name="x", env="walker", references=[*walks, 3], policies=["zero"]
+    ).conditions()  # type: ignore[list-item]
     names = ["3 s num_steps=1 form=tendon", "3 s num_steps=1 form=rigid", "3 s"]
     assert [cell.reference_name for cell in cells] == names
 
 
 def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
-    """Catches values in the order of the configuration, a level that is a curve, and falls averaged in."""
+    """Catches values in the order of the configuration, a level that is a curve, and falls
+    averaged in."""
     config = CompareConfig(
-        name="s", env="walker", sweep={"option": "stiffness_scale", "values": [2.0, 0.5, 1.0]},
+        name="s",
+        env="walker",
+        sweep={"option": "stiffness_scale", "values": [2.0, 0.5, 1.0]},
         policies=[{"name": "input"}, {"name": "oracle", "level": True}],
-    )  # fmt: skip
+    )
     cells = config.conditions()
-    assert [cell.policy_options for cell in cells] == [{"stiffness_scale": x} for x in (2.0, 0.5, 1.0)] + [{}]
+    assert [cell.policy_options for cell in cells] == [
+        {"stiffness_scale": x} for x in (2.0, 0.5, 1.0)
+    ] + [{}]
     ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
     played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
     points = by_option(played)
@@ -372,14 +464,18 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     assert (input_curve.dash, level.dash) == ("solid", "dot")
     (failing,) = chart.failing
     assert (failing.x, failing.is_all) == ([0.5, 1.0], [True, False])
-    with Image.open(draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))) as image:
+    with Image.open(
+        draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))
+    ) as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
 
 def test_references_are_swept_by_their_step_period() -> None:
     """Catches a list of durations that has no place on the axis."""
     references = [3, [0.8, 0.6, 0.8], {"step_period": 24, "num_steps": 2}]
-    points = by_reference([made_up(walk(reference=reference), ("", 0.01)) for reference in references])
+    points = by_reference(
+        [made_up(walk(reference=reference), ("", 0.01)) for reference in references]
+    )
     chart = sweep_chart(points, [walk().environment.overview], "", policy_colours(list(points)))
     (curve,) = chart.panels[0].curves
     np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
@@ -390,18 +486,23 @@ def test_references_are_swept_by_their_step_period() -> None:
 
 @pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
 def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
-    """Catches a scenario, a base or a setting that does not exist, and a scenario that is to be held out."""
+    """Catches a scenario, a base or a setting that does not exist, and a scenario that is to be
+    held out."""
     config = load_yaml(path, TrainConfig)
     assert config.name == path.stem
     assert not {"stiff", "push", "slope"} & set(config.scenarios)
     assert len(config.seeds) >= 5
     for scenario in config.scenarios:
-        env = make_vector_env(config.condition(scenario, config.base), 2, 1, AutoresetMode.SAME_STEP)
+        env = make_vector_env(
+            config.condition(scenario, config.base), 2, 1, AutoresetMode.SAME_STEP
+        )
         assert ResidualVectorWrapper(env, config.base, **config.settings.model_dump()).num_envs == 2
 
 
 @pytest.mark.parametrize("path", COMPARISONS, ids=lambda path: path.stem)
-def test_configurations_that_come_with_it_are_valid(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_configurations_that_come_with_it_are_valid(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a name or a duration that does not exist."""
     monkeypatch.chdir(Path(__file__).parents[1])  # where the paths of residuals begin
     config = load_yaml(path, CompareConfig)
@@ -412,7 +513,11 @@ def test_configurations_that_come_with_it_are_valid(path: Path, monkeypatch: pyt
 def test_cells_of_a_scenario_have_their_own_number_of_episodes() -> None:
     """Catches five episodes of the same, where nothing is random."""
     config = CompareConfig(
-        name="c", env="walker", scenarios=["ideal", "soft"], episodes=5, scenario_episodes={"ideal": 1}
+        name="c",
+        env="walker",
+        scenarios=["ideal", "soft"],
+        episodes=5,
+        scenario_episodes={"ideal": 1},
     )
     assert {cell.scenario: cell.episodes for cell in config.conditions()} == {"ideal": 1, "soft": 5}
     assert {cell.reference for cell in config.conditions()} == {3}
@@ -420,8 +525,16 @@ def test_cells_of_a_scenario_have_their_own_number_of_episodes() -> None:
 
 def test_what_a_reference_says_goes_before_the_options_of_all() -> None:
     """Catches the number of steps of one motion that reaches all the others."""
-    cell = walk(reference={"step_period": 24, "num_steps": 2}, env_options={"num_steps": 4, "stiffness": 900})
-    assert cell.arguments == {"scenario": "nominal", "step_period": 24, "num_steps": 2, "stiffness": 900}
+    cell = walk(
+        reference={"step_period": 24, "num_steps": 2},
+        env_options={"num_steps": 4, "stiffness": 900},
+    )
+    assert cell.arguments == {
+        "scenario": "nominal",
+        "step_period": 24,
+        "num_steps": 2,
+        "stiffness": 900,
+    }
     assert walk(reference=3, env_options={"num_steps": 4}).arguments["num_steps"] == 4
 
 
@@ -429,7 +542,8 @@ def test_what_a_reference_says_goes_before_the_options_of_all() -> None:
 def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches files that are lost or not named, and figures with policies that they should not show."""
+    """Catches files that are lost or not named, and figures with policies that they should not
+    show."""
     drawn: list[list[str]] = []
     for name in ("pelvis", "zmp"):
         draw = train.figures.comparison_figures._FIGURES[name]
@@ -440,21 +554,40 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
 
         monkeypatch.setitem(train.figures.comparison_figures._FIGURES, name, record)
     content = {
-        "name": "walks", "env": "walker", "references": [SHORT], "scenarios": ["ideal"],
-        "policies": ["zero", "input", {"name": "zero", "label": "rigid", "env_options": {"form": "rigid"}}],
+        "name": "walks",
+        "env": "walker",
+        "references": [SHORT],
+        "scenarios": ["ideal"],
+        "policies": [
+            "zero",
+            "input",
+            {"name": "zero", "label": "rigid", "env_options": {"form": "rigid"}},
+        ],
         "figure_policies": ["input", "rigid"],
-    }  # fmt: skip
+    }
     Path("walks.yaml").write_text(yaml.safe_dump(content))
     main(["compare", "walks.yaml", "--jobs", "1"])
     assert drawn == [["input", "rigid"]] * 2
     stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
     reports = {"statistics.csv", "report.html", "report.md"}
-    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"} | reports
+    files = {
+        "episodes.csv",
+        "summary.md",
+        "overview.png",
+        f"pelvis_{stem}",
+        f"zmp_{stem}",
+    } | reports
     folder = Path("runs/walks")
-    assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json", ".lock"}
+    assert {path.name for path in folder.iterdir()} == files | {
+        "config.yaml",
+        "metadata.json",
+        ".lock",
+    }
     printed = capsys.readouterr().out
     assert [name for name in files if f"runs/walks/{name}" not in printed] == []
-    assert load_yaml(folder / "config.yaml", CompareConfig) == load_yaml("walks.yaml", CompareConfig)
+    assert load_yaml(folder / "config.yaml", CompareConfig) == load_yaml(
+        "walks.yaml", CompareConfig
+    )
     assert "0/1" in next(line for line in printed.splitlines() if "rigid" in line)
 
 
@@ -468,7 +601,19 @@ def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_play_films_a_walk() -> None:
     """Catches a film of the testbed alone."""
-    main(["play", "--env", "walker", "--reference", COMMAND_SHORT, "--video", "x.gif", "--max-s", "0.1"])
+    main(
+        [
+            "play",
+            "--env",
+            "walker",
+            "--reference",
+            COMMAND_SHORT,
+            "--video",
+            "x.gif",
+            "--max-s",
+            "0.1",
+        ]
+    )
     with Image.open("x.gif") as film:
         assert film.info["duration"] == 40
 
@@ -487,7 +632,13 @@ def test_play_of_a_fall_keeps_the_film(capsys: pytest.CaptureFixture[str]) -> No
 class Leaning(Blind):
     """A policy that falls at once."""
 
-    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ):
         """As far as the command goes, in every joint."""
         return np.full(12, 0.3), state
 
@@ -498,14 +649,18 @@ def leaning(env: Any) -> Leaning:
 
 
 def test_raw_stepping_walks_as_the_environment_does() -> None:
-    """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
+    """Catches a benchmark that compares unequal work: the raw worlds must end where the
+    environment's end, exactly."""
     loop = VectorLoop("walker", 3, 1, "input_wrench", residual=True)
     inside = loop.env.unwrapped
     raw = RawWorlds(loop, threads=2)
     loop.run(300)
     raw.run(300)
-    data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    for state, qpos, qvel in zip(raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+    data = mujoco.MjData(inside.task.model)
+    kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    for state, qpos, qvel in zip(
+        raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True
+    ):
         mujoco.mj_setState(inside.task.model, data, state, kind)
         np.testing.assert_array_equal(data.qpos, qpos)
         np.testing.assert_array_equal(data.qvel, qvel)

@@ -1,4 +1,5 @@
-"""The walk as a table: kinematics and inverse dynamics by MuJoCo, the ZMP of the cart-table, statics, errors."""
+"""The walk as a table: kinematics and inverse dynamics by MuJoCo, the ZMP of the cart-table,
+statics, errors."""
 
 import copy
 import re
@@ -17,10 +18,24 @@ from elastic_env.joint.dynamixel import SERVO
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import make_gait
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
-from elastic_env.motion.walk_plan import WalkPlan, derivatives, plan_walk, require_feasible, swing_height, with_torque
+from elastic_env.motion.walk_plan import (
+    WalkPlan,
+    derivatives,
+    plan_walk,
+    require_feasible,
+    swing_height,
+    with_torque,
+)
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
-from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG_JOINTS, SIDES, SOLE_HALF_SIZE_M, Thormang, biped
+from elastic_env.robots.thormang.model import (
+    ANKLE_HEIGHT_M,
+    LEG_JOINTS,
+    SIDES,
+    SOLE_HALF_SIZE_M,
+    Thormang,
+    biped,
+)
 from tests.legs import holding_torque
 
 PERIOD_S = 0.004
@@ -33,7 +48,9 @@ SERVOS = (SERVO,) * 12
 def planned(step_period: float, transfer: str = "smooth") -> WalkPlan:
     """Two steps of a named gait, one of the slow one."""
     num_steps = 1 if step_period == 24.0 else 2
-    return plan_walk(make_gait(step_period, num_steps=num_steps, transfer=transfer), ROBOT, PERIOD_S)
+    return plan_walk(
+        make_gait(step_period, num_steps=num_steps, transfer=transfer), ROBOT, PERIOD_S
+    )
 
 
 def some_rows(plan: WalkPlan, count: int = 60) -> list[int]:
@@ -43,30 +60,38 @@ def some_rows(plan: WalkPlan, count: int = 60) -> list[int]:
     return sorted({*spread.tolist(), *(edges[:, None] + [-1, 0, 1, 2]).ravel().tolist()})
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Kinematics
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("step_period", NAMED)
 def test_feet_and_center_of_mass_are_where_the_plan_says(step_period: float) -> None:
-    """Catches soles that are not flat or not in their place, and a pelvis that follows the pendulum's path itself."""
-    plan, model = planned(step_period), ROBOT.rigid
-    data, at = mujoco.MjData(model), JointAddresses.of(model, LEG_JOINTS)
+    """Catches soles that are not flat or not in their place, and a pelvis that follows the
+    pendulum's path itself."""
+    plan = planned(step_period)
+    model = ROBOT.rigid
+    data = mujoco.MjData(model)
+    at = JointAddresses.of(model, LEG_JOINTS)
     preview = PreviewConfig(com_height_m=plan.com_height, period_s=PERIOD_S)
     com = follow_zmp(preview, plan.zmp, np.zeros(2)).com
     np.testing.assert_array_equal(plan.com, com)
     for row in some_rows(plan):
-        data.qpos[:3], data.qpos[at.q] = plan.pelvis[row], plan.q[row]
+        data.qpos[:3] = plan.pelvis[row]
+        data.qpos[at.q] = plan.q[row]
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(data.body("pelvis").subtree_com[:2], com[row], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            data.body("pelvis").subtree_com[:2], com[row], rtol=0.0, atol=1e-9
+        )
         for side, prefix in enumerate(SIDES):
-            foot, sole = data.body(f"{prefix}_foot"), data.geom(f"{prefix}_sole")
+            foot = data.body(f"{prefix}_foot")
+            sole = data.geom(f"{prefix}_sole")
             np.testing.assert_allclose(foot.xpos, plan.ankles[row, side], rtol=0.0, atol=1e-9)
             np.testing.assert_allclose(foot.xmat, np.eye(3).ravel(), rtol=0.0, atol=1e-9)
             height = sole.xpos[2] - model.geom(f"{prefix}_sole").size[2]
             assert height == pytest.approx(plan.ankles[row, side, 2] - ANKLE_HEIGHT_M, abs=1e-9)
-    data.qpos[:3], data.qpos[at.q] = plan.pelvis[0], plan.q[0]
+    data.qpos[:3] = plan.pelvis[0]
+    data.qpos[at.q] = plan.q[0]
     mujoco.mj_forward(model, data)
     assert plan.com_height == pytest.approx(data.body("pelvis").subtree_com[2], abs=1e-9)
     assert plan.omega == pytest.approx(np.sqrt(9.81 / plan.com_height), rel=1e-12)
@@ -75,12 +100,16 @@ def test_feet_and_center_of_mass_are_where_the_plan_says(step_period: float) -> 
 
 @pytest.mark.parametrize("step_period", NAMED)
 def test_the_pelvis_keeps_its_height_and_the_stance_foot_its_place(step_period: float) -> None:
-    """Catches a pelvis that bobs, feet that are set down elsewhere, and the wrong foot in the air."""
+    """Catches a pelvis that bobs, feet that are set down elsewhere, and the wrong foot in the
+    air."""
     plan = planned(step_period)
     np.testing.assert_array_equal(plan.pelvis[:, 2], 0.66)
     np.testing.assert_array_equal(plan.ankles[..., 0], 0.0)
-    np.testing.assert_array_equal(plan.ankles[..., 1], np.tile([0.105, -0.105], (plan.num_steps + 1, 1)))
-    rows, timing = np.arange(plan.num_steps + 1), plan.timing
+    np.testing.assert_array_equal(
+        plan.ankles[..., 1], np.tile([0.105, -0.105], (plan.num_steps + 1, 1))
+    )
+    rows = np.arange(plan.num_steps + 1)
+    timing = plan.timing
     lift = plan.ankles[..., 2] - ANKLE_HEIGHT_M
     np.testing.assert_allclose(lift[rows, timing.support], 0.0, rtol=0.0, atol=1e-15)
     swinging = lift[rows, 1 - timing.support]
@@ -89,7 +118,8 @@ def test_the_pelvis_keeps_its_height_and_the_stance_foot_its_place(step_period: 
 
 @pytest.mark.parametrize("step_period", NAMED)
 def test_the_swing_foot_is_lifted_without_speed_at_both_ends(step_period: float) -> None:
-    """Catches another height than the gait's, a foot that is thrown up or stamps, and a late apex."""
+    """Catches another height than the gait's, a foot that is thrown up or stamps, and a late
+    apex."""
     plan = planned(step_period)
     single = round(plan.gait.single_support_s / PERIOD_S)
     begin = round((1.0 + plan.gait.double_support_s) / PERIOD_S)
@@ -104,7 +134,8 @@ def test_the_swing_foot_is_lifted_without_speed_at_both_ends(step_period: float)
 
 
 def test_swing_height_has_a_smooth_start_and_end() -> None:
-    """Catches a lift whose speed or acceleration jumps, or that does not reach its height halfway."""
+    """Catches a lift whose speed or acceleration jumps, or that does not reach its height
+    halfway."""
     h = 1e-3
     ends = swing_height(np.array([0.0, h, 2.0 * h, 1.0 - 2.0 * h, 1.0 - h, 1.0, 0.5]))
     np.testing.assert_array_equal(ends[[0, 5, 6]], [0.0, 0.0, 1.0])
@@ -116,7 +147,8 @@ def test_swing_height_has_a_smooth_start_and_end() -> None:
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3), st.sampled_from([0.004, 0.01]))
 def test_derivatives_are_exact_for_parabolas(coefficients: list[float], period_s: float) -> None:
-    """Catches one-sided differences, a missing square of the period, and a time axis that is not the first."""
+    """Catches one-sided differences, a missing square of the period, and a time axis that is not
+    the first."""
     path = np.polynomial.Polynomial(coefficients)
     time = np.arange(40) * period_s
     first, second = derivatives(np.stack([path(time), time], axis=1), period_s)
@@ -133,17 +165,20 @@ def test_rates_integrate_to_the_path(step_period: float) -> None:
     plan = planned(step_period)
     for path, rate in ((plan.q, plan.q_dot), (plan.q_dot, plan.q_ddot), (plan.com, plan.com_dot)):
         moved = np.cumsum((rate[1:] + rate[:-1]) / 2.0 * PERIOD_S, axis=0)
-        np.testing.assert_allclose(moved, path[1:] - path[0], rtol=0.0, atol=2e-3 * np.abs(rate).max())
+        np.testing.assert_allclose(
+            moved, path[1:] - path[0], rtol=0.0, atol=2e-3 * np.abs(rate).max()
+        )
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # ZMP
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("step_period", NAMED)
 def test_the_cart_table_keeps_its_zmp_within_a_millimetre(step_period: float) -> None:
-    """Catches a preview that comes late or has a wrong unit: below 1 mm rms, the acceleration by differences."""
+    """Catches a preview that comes late or has a wrong unit: below 1 mm rms, the acceleration by
+    differences."""
     plan = planned(step_period)
     acceleration = np.gradient(plan.com_dot, PERIOD_S, axis=0)
     error = (plan.com - plan.com_height / 9.81 * acceleration - plan.zmp)[plan.timing.walking]
@@ -152,37 +187,50 @@ def test_the_cart_table_keeps_its_zmp_within_a_millimetre(step_period: float) ->
     np.testing.assert_allclose(plan.com[-1], plan.zmp[-1], rtol=0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize(("step_period", "bound"), [(24.0, 2e-4), (3.0, 0.003), (1.6, 0.007), (1.1, 0.01)])
-def test_the_zmp_of_the_motion_is_near_its_reference_and_in_the_sole(step_period: float, bound: float) -> None:
+@pytest.mark.parametrize(
+    ("step_period", "bound"), [(24.0, 2e-4), (3.0, 0.003), (1.6, 0.007), (1.1, 0.01)]
+)
+def test_the_zmp_of_the_motion_is_near_its_reference_and_in_the_sole(
+    step_period: float, bound: float
+) -> None:
     """Catches legs whose mass the plan forgets, and a walk that a rigid robot could not do."""
     plan = planned(step_period)
     error = (plan.zmp_of_motion - plan.zmp)[plan.timing.walking]
     rms = np.sqrt((error**2).sum(axis=1).mean())
     assert bound / 20.0 < rms < bound
     single = plan.timing.single
-    from_ankle = plan.zmp_of_motion - plan.ankles[np.arange(plan.num_steps + 1), plan.timing.support, :2]
+    from_ankle = (
+        plan.zmp_of_motion - plan.ankles[np.arange(plan.num_steps + 1), plan.timing.support, :2]
+    )
     assert (np.abs(from_ankle[single]) < SOLE_HALF_SIZE_M).all()
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # Torques
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def balance(plan: WalkPlan, robot: Biped, row: int) -> tuple[Array, Array, Array]:
-    """Joint torques of a row by MuJoCo's inverse dynamics, what is left of its balance, and the ZMP of the motion.
+    """Joint torques of a row by MuJoCo's inverse dynamics, what is left of its balance, and the ZMP
+    of the motion.
 
     The force that the free pelvis lacks comes from the ground, shared by the planned share.
     """
     model = copy.copy(robot.rigid)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    data, at = mujoco.MjData(model), JointAddresses.of(model, LEG_JOINTS)
+    data = mujoco.MjData(model)
+    at = JointAddresses.of(model, LEG_JOINTS)
     h = PERIOD_S
     before, now, after = (plan.pelvis[np.clip(row + i, 0, plan.num_steps)] for i in (-1, 0, 1))
-    data.qpos[:3], data.qvel[:3], data.qacc[:3] = now, (after - before) / (2 * h), (after - 2 * now + before) / h**2
-    data.qpos[at.q], data.qvel[at.q_dot], data.qacc[at.q_dot] = plan.q[row], plan.q_dot[row], plan.q_ddot[row]
+    data.qpos[:3] = now
+    data.qvel[:3] = (after - before) / (2 * h)
+    data.qacc[:3] = (after - 2 * now + before) / h**2
+    data.qpos[at.q] = plan.q[row]
+    data.qvel[at.q_dot] = plan.q_dot[row]
+    data.qacc[at.q_dot] = plan.q_ddot[row]
     mujoco.mj_inverse(model, data)
-    force, moment = data.qfrc_inverse[:3].copy(), data.qfrc_inverse[3:6].copy()
+    force = data.qfrc_inverse[:3].copy()
+    moment = data.qfrc_inverse[3:6].copy()
     about_origin = moment + np.cross(now, force)
     zmp = np.array([-about_origin[1], about_origin[0]]) / force[2]
     spin = about_origin[2] - np.cross([*zmp, 0.0], force)[2]
@@ -201,7 +249,8 @@ WALKS = [*((step_period, "smooth") for step_period in NAMED), (3.0, "ramp")]
 
 @pytest.mark.parametrize(("step_period", "transfer"), WALKS)
 def test_torques_are_those_of_mujocos_inverse_dynamics(step_period: float, transfer: str) -> None:
-    """Catches a lost Coriolis or inertia term, forces on the wrong foot, and ones that do not balance the pelvis."""
+    """Catches a lost Coriolis or inertia term, forces on the wrong foot, and ones that do not
+    balance the pelvis."""
     plan = planned(step_period, transfer)
     for row in some_rows(plan)[1:-1]:
         torque, unbalanced, zmp = balance(plan, ROBOT, row)
@@ -211,8 +260,10 @@ def test_torques_are_those_of_mujocos_inverse_dynamics(step_period: float, trans
 
 
 def test_the_same_motion_of_a_heavier_robot_needs_its_torques() -> None:
-    """Catches a payload that changes the motion, or whose torques are those of the robot without it."""
-    plan, loaded = planned(1.6), biped(Thormang(torso_load_kg=5.0))
+    """Catches a payload that changes the motion, or whose torques are those of the robot without
+    it."""
+    plan = planned(1.6)
+    loaded = biped(Thormang(torso_load_kg=5.0))
     heavier = with_torque(plan, loaded, PERIOD_S)
     for name in ("q", "q_dot", "q_ddot", "zmp", "com", "pelvis", "ankles", "share"):
         np.testing.assert_array_equal(getattr(heavier, name), getattr(plan, name), err_msg=name)
@@ -229,26 +280,35 @@ def test_the_same_motion_of_a_heavier_robot_needs_its_torques() -> None:
 
 @pytest.mark.parametrize(("step_period", "transfer"), WALKS)
 def test_the_load_goes_from_foot_to_foot_with_the_zmp(step_period: float, transfer: str) -> None:
-    """Catches a foot in the air that still carries, and a share that is measured along another way than the ZMP's."""
-    plan, timing = planned(step_period, transfer), planned(step_period, transfer).timing
+    """Catches a foot in the air that still carries, and a share that is measured along another
+    way than the ZMP's."""
+    plan = planned(step_period, transfer)
+    timing = planned(step_period, transfer).timing
     left = plan.zmp[timing.single & (timing.support == 0)][0]
     between = np.stack([left, left * [1.0, -1.0]])  # where the ZMP is in single support
     np.testing.assert_allclose(plan.share, load_share(plan.zmp, between), rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(plan.share[timing.single], timing.support[timing.single], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        plan.share[timing.single], timing.support[timing.single], rtol=0.0, atol=1e-12
+    )
     np.testing.assert_allclose(plan.share[[0, -1]], 0.5, rtol=0.0, atol=1e-12)
 
 
 def holding(plan: WalkPlan, row: int) -> Array:
-    """Torque that would hold a row at rest, the weight at the ZMP of the motion, shared as planned."""
+    """Torque that would hold a row at rest, the weight at the ZMP of the motion, shared as
+    planned."""
     feet = plan.ankles[row, :, :2]
-    points = np.pad(contact_points(plan.zmp_of_motion[row], plan.share[row], feet), ((0, 0), (0, 1)))
+    points = np.pad(
+        contact_points(plan.zmp_of_motion[row], plan.share[row], feet), ((0, 0), (0, 1))
+    )
     force = shares(plan.share[row])[:, None] * [0.0, 0.0, 57.0 * 9.81]
-    gravity, legs = np.array([0.0, 0.0, -9.81]), plan.q[row].reshape(2, 6)
+    gravity = np.array([0.0, 0.0, -9.81])
+    legs = plan.q[row].reshape(2, 6)
     return holding_torque(ROBOT.chains, legs, gravity, force, points - plan.pelvis[row]).ravel()
 
 
 def test_at_rest_the_torque_is_the_holding_torque() -> None:
-    """Catches a static part that is another one than the compensators': standing exactly, slowly walking nearly."""
+    """Catches a static part that is another one than the compensators': standing exactly, slowly
+    walking nearly."""
     plan = planned(24.0)
     for row in (0, plan.num_steps):
         np.testing.assert_allclose(plan.torque[row], holding(plan, row), rtol=0.0, atol=1e-9)
@@ -261,16 +321,17 @@ def test_at_rest_the_torque_is_the_holding_torque() -> None:
 
 @pytest.mark.parametrize(("step_period", "transfer"), WALKS)
 def test_no_torque_jumps(step_period: float, transfer: str) -> None:
-    """Catches a load that changes feet at once: at most 2 N·m a control period on any joint, 4 with the ramp."""
+    """Catches a load that changes feet at once: at most 2 N·m a control period on any joint, 4
+    with the ramp."""
     plan = planned(step_period, transfer)
     jumps = np.abs(np.diff(plan.torque, axis=0))
     assert jumps.max() <= {"smooth": 2.0, "ramp": 4.0}[transfer]
     assert jumps.max() > 0.05
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # What cannot be walked
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def feasible(plan: WalkPlan, **limits: float) -> None:
@@ -284,17 +345,20 @@ def test_the_named_gaits_can_be_walked(step_period: float) -> None:
     feasible(planned(step_period))
 
 
-def complaint(values: Array, plan: WalkPlan, limit: str, needs: str, bound: float, decimals: int = 3) -> str:
+def complaint(
+    values: Array, plan: WalkPlan, limit: str, needs: str, bound: float, decimals: int = 3
+) -> str:
     """The message about the largest of some values, (T, 12)."""
     row, joint = np.unravel_index(int(np.argmax(values)), values.shape)
     return re.escape(
-        f"the walk asks too much of joint '{LEG_JOINTS[joint]}' at {row * PERIOD_S:.3f} s: it allows {limit}, "
-        f"the plan needs {bound:.{decimals}f} {needs}; use longer durations"
+        f"the walk asks too much of joint '{LEG_JOINTS[joint]}' at {row * PERIOD_S:.3f} s: it"
+        f" allows {limit}, the plan needs {bound:.{decimals}f} {needs}; use longer durations"
     )
 
 
 def test_too_little_torque_is_an_error_that_names_joint_and_time() -> None:
-    """Catches a walk that lets the stance hip fall, and the message of another joint or of the first excess."""
+    """Catches a walk that lets the stance hip fall, and the message of another joint or of the
+    first excess."""
     plan = planned(3.0)
     needed = np.abs(plan.torque)
     message = complaint(needed, plan, "at most 60.000 N·m", "N·m", needed.max())
@@ -339,19 +403,35 @@ def test_an_angle_out_of_range_is_an_error_that_names_joint_and_time(
 def test_durations_that_are_too_short_are_an_error() -> None:
     """Catches a step within the blink of an eye that is planned and only fails on the robot."""
     plan = plan_walk(make_gait((0.02, 0.04, 0.02), num_steps=2), ROBOT, PERIOD_S)
-    with pytest.raises(ConfigurationError, match=r"knee' at .* a speed of at most 3\.470 rad/s, the plan needs 15\.6"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"knee' at .* a speed of at most 3\.470 rad/s, the plan needs 15\.6",
+    ):
         feasible(plan)
 
 
 @pytest.mark.parametrize(
     ("hip_height", "message"),
     [
-        (0.75, r"the left foot is out of reach at 0\.000 s: 0\.6500 m from the hip to the ankle, at most 0\.6 m"),
-        (0.69, r"the right foot is out of reach at \d\.\d{3} s: 0\.60\d\d m from the hip to the ankle, at most 0\.6 m"),
+        (
+            0.75,
+            (
+                r"the left foot is out of reach at 0\.000 s: 0\.6500 m from the hip to the ankle,"
+                r" at most 0\.6 m"
+            ),
+        ),
+        (
+            0.69,
+            (
+                r"the right foot is out of reach at \d\.\d{3} s: 0\.60\d\d m from the hip to the"
+                r" ankle, at most 0\.6 m"
+            ),
+        ),
     ],
 )
 def test_a_foot_out_of_reach_is_an_error_that_says_when(hip_height: float, message: str) -> None:
-    """Catches straight knees that pull the pelvis down, and a message about a foot that does reach the ground."""
+    """Catches straight knees that pull the pelvis down, and a message about a foot that does
+    reach the ground."""
     with pytest.raises(ConfigurationError, match=message + "; lower hip_height_m"):
         plan_walk(make_gait(3, num_steps=4, hip_height_m=hip_height), ROBOT, PERIOD_S)
 
@@ -368,7 +448,8 @@ def test_a_foot_out_of_reach_is_an_error_that_says_when(hip_height: float, messa
 def test_advice_for_a_foot_out_of_reach_names_what_helps(
     gait: dict[str, float], hip_half_spacing: float, advice: str
 ) -> None:
-    """Catches advice to lower the hips of a robot whose foot is lifted above them, or whose hips are far apart."""
+    """Catches advice to lower the hips of a robot whose foot is lifted above them, or whose hips
+    are far apart."""
     robot = biped(Thormang(hip_half_spacing=hip_half_spacing))
     with pytest.raises(ConfigurationError, match=f"; lower {advice}$"):
         plan_walk(make_gait(3, num_steps=4, **gait), robot, PERIOD_S)
@@ -383,15 +464,19 @@ def test_a_foot_just_out_of_reach_is_seen_to_be() -> None:
 
 
 def test_a_plan_is_computed_once() -> None:
-    """Catches a plan for every environment, and one that is shared although gait, robot or period differ."""
+    """Catches a plan for every environment, and one that is shared although gait, robot or
+    period differ."""
     plan = planned(1.1)
     assert plan_walk(make_gait(1.1, num_steps=2), biped(Thormang()), PERIOD_S) is plan
     assert plan_walk(make_gait(1.1, num_steps=1), ROBOT, PERIOD_S) is not plan
-    other = plan_walk(make_gait(1.1, num_steps=2), biped(Thormang(hip_half_spacing=0.072)), PERIOD_S)
+    other = plan_walk(
+        make_gait(1.1, num_steps=2), biped(Thormang(hip_half_spacing=0.072)), PERIOD_S
+    )
     np.testing.assert_array_equal(other.ankles[:, 0, 1], 0.072)
     coarse = plan_walk(make_gait(1.1, num_steps=2), ROBOT, 0.01)
     assert coarse.num_steps == 420
     with pytest.raises(
-        ConfigurationError, match=r"double_support_s must be a multiple of the control period of 0\.007"
+        ConfigurationError,
+        match=r"double_support_s must be a multiple of the control period of 0\.007",
     ):
         plan_walk(make_gait(1.1, num_steps=2), ROBOT, 0.007)

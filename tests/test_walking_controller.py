@@ -1,4 +1,5 @@
-"""The walking controller on observations made by hand: signs, limits, time constants, its local frame, its memory."""
+"""The walking controller on observations made by hand: signs, limits, time constants, its local
+frame, its memory."""
 
 from dataclasses import replace
 from functools import cache
@@ -30,7 +31,8 @@ FORGETFUL = GAINS.replace(force_difference_decay_s=0.1)
 """Gains with which a force difference settles within a second."""
 AT_ONCE = {"ramp_s": PERIOD_S}
 """Argument with which the feedback acts in full from the first step on."""
-KNEE, ANKLES = [3, 9], [4, 5, 10, 11]
+KNEE = [3, 9]
+ANKLES = [4, 5, 10, 11]
 
 
 @cache
@@ -43,7 +45,8 @@ def model(step_period: float = 3.0, scenario: str = "ideal") -> WalkerModel:
 
 
 def sensed(walker: WalkerModel, row: int) -> Array:
-    """Foot wrenches on plan at the end of a control period, (12,): the ground's force less the weight of the foot."""
+    """Foot wrenches on plan at the end of a control period, (12,): the ground's force less the
+    weight of the foot."""
     share = walker.plan.share[row]
     feet = [walker.biped.rigid.body(f"{side}_foot").mass[0] * 9.81 for side in "lr"]
     wrench = np.zeros((2, 2, 3))
@@ -52,8 +55,10 @@ def sensed(walker: WalkerModel, row: int) -> Array:
 
 
 def observed(walker: WalkerModel, row: int, **changed: Any) -> Array:
-    """What a rigid robot exactly on plan observes at the end of control period `row`, (m,), some groups changed."""
-    plan, table = walker.plan, walker.observation_table
+    """What a rigid robot exactly on plan observes at the end of control period `row`, (m,), some
+    groups changed."""
+    plan = walker.plan
+    table = walker.observation_table
     coming = row + 1
     groups = {
         "encoder_angle": plan.q[row],
@@ -73,28 +78,36 @@ def observed(walker: WalkerModel, row: int, **changed: Any) -> Array:
 
 
 def lacking(left_n: float, walker: WalkerModel) -> Array:
-    """Wrenches of a standing robot whose left foot carries too little, and whose right foot as much too much."""
+    """Wrenches of a standing robot whose left foot carries too little, and whose right foot as
+    much too much."""
     wrench = sensed(walker, 0)
     wrench[[2, 8]] += [-0.5 * left_n, 0.5 * left_n]
     return wrench
 
 
 def held(policy: Any, observation: Array, steps: int) -> tuple[Array, Any]:
-    """Action and state after an observation, (m,) or (num_worlds, m), has been shown for a number of steps."""
-    state, action = None, np.zeros(0)
+    """Action and state after an observation, (m,) or (num_worlds, m), has been shown for a
+    number of steps."""
+    state = None
+    action = np.zeros(0)
     for step in range(steps):
         action, state = policy.predict(observation, state, step == 0)
     return action.astype(np.float64), state
 
 
-def shifted_pelvis(walker: WalkerModel, row: int, shift: Array, swing_foot: Array | None = None) -> tuple[Array, Array]:
-    """Joint angles with the pelvis moved off the plan while the feet stay, the swing foot elsewhere if asked.
+def shifted_pelvis(
+    walker: WalkerModel, row: int, shift: Array, swing_foot: Array | None = None
+) -> tuple[Array, Array]:
+    """Joint angles with the pelvis moved off the plan while the feet stay, the swing foot elsewhere
+    if asked.
 
     Returns:
-        q, (12,) [rad], and the center of mass by Pinocchio with the support foot where it is planned, (2,) [m].
+        q, (12,) [rad], and the center of mass by Pinocchio with the support foot where it is
+        planned, (2,) [m].
     """
     plan = walker.plan
-    pelvis, ankles = plan.pelvis[row] + shift, plan.ankles[row].copy()
+    pelvis = plan.pelvis[row] + shift
+    ankles = plan.ankles[row].copy()
     if swing_foot is not None:
         ankles[1 - plan.timing.support[row]] += swing_foot
     q = walker.biped.joint_angles(pelvis, ankles)
@@ -109,7 +122,8 @@ def single_support(walker: WalkerModel, side: int) -> int:
 
 
 def zmp_shift(action: Array, walker: WalkerModel, row: int) -> Array:
-    """The ZMP shift that ankle offsets stand for, (..., 2) [m]: K a over the load, (p_x f_z, −p_y f_z)."""
+    """The ZMP shift that ankle offsets stand for, (..., 2) [m]: K a over the load, (p_x f_z,
+    −p_y f_z)."""
     share = walker.plan.share[row + 1]
     load = np.array([1.0 - share, share]) * WEIGHT_N
     stance = int(np.argmax(load))
@@ -117,13 +131,17 @@ def zmp_shift(action: Array, walker: WalkerModel, row: int) -> Array:
     return torque * [1.0, -1.0] / load[stance]
 
 
-# ------------------------------------------------------------------------------------------------------- local frame
+# --------------------------------------------------------------------------------------------------
+# local frame
 
 
 def test_local_frame_is_the_kinematics_of_mujoco() -> None:
-    """Catches a transposed attitude, roll and pitch in the wrong order, a sole that is not below its tilted ankle."""
-    generator, biped = np.random.default_rng(1), model().biped
-    q, attitude = generator.uniform(-0.6, 0.6, (20, 12)), generator.uniform(-0.4, 0.4, (20, 2))
+    """Catches a transposed attitude, roll and pitch in the wrong order, a sole that is not below
+    its tilted ankle."""
+    generator = np.random.default_rng(1)
+    biped = model().biped
+    q = generator.uniform(-0.6, 0.6, (20, 12))
+    attitude = generator.uniform(-0.4, 0.4, (20, 2))
     frame = local_frame(biped, q, attitude)
     data = mujoco.MjData(biped.rigid)
     for i in range(20):
@@ -135,7 +153,9 @@ def test_local_frame_is_the_kinematics_of_mujoco() -> None:
         mujoco.mj_comPos(biped.rigid, data)
         com = data.body("pelvis").subtree_com
         feet = [data.body(f"{side}_foot") for side in "lr"]
-        soles = np.array([foot.xpos - ANKLE_HEIGHT_M * foot.xmat.reshape(3, 3)[:, 2] for foot in feet])
+        soles = np.array(
+            [foot.xpos - ANKLE_HEIGHT_M * foot.xmat.reshape(3, 3)[:, 2] for foot in feet]
+        )
         np.testing.assert_allclose(frame.soles[i], soles, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(frame.com[i], com, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(frame.com_from_soles[i], com - soles, rtol=0.0, atol=1e-12)
@@ -143,12 +163,15 @@ def test_local_frame_is_the_kinematics_of_mujoco() -> None:
 
 @pytest.mark.parametrize("side", [0, 1], ids=["left", "right"])
 def test_error_of_the_local_frame_is_equation_1(side: int) -> None:
-    """Catches a local frame that does not follow the joints: e = (0, 2L sin θ/2 cos θ/2, 2L sin² θ/2).
+    """Catches a local frame that does not follow the joints: e = (0, 2L sin θ/2 cos θ/2, 2L sin²
+    θ/2).
 
-    The straight leg hangs down, L from hip to sole; its motor shows a hip roll of θ that the link does not have.
-    e leads from the support foot to where the motor's angles put it; y is left, and θ > 0 puts the foot to the left.
+    The straight leg hangs down, L from hip to sole; its motor shows a hip roll of θ that the link
+    does not have. e leads from the support foot to where the motor's angles put it; y is left, and
+    θ > 0 puts the foot to the left.
     """
-    length, zero = LEG.reach + ANKLE_HEIGHT_M, np.zeros((1, 2))
+    length = LEG.reach + ANKLE_HEIGHT_M
+    zero = np.zeros((1, 2))
     for theta in (-0.09, -0.03, 0.02, 0.06):
         q = np.zeros((1, 12))
         encoder = q.copy()
@@ -160,19 +183,24 @@ def test_error_of_the_local_frame_is_equation_1(side: int) -> None:
         np.testing.assert_array_equal(shown[1 - side], true[1 - side])
 
 
-# ------------------------------------------------------------------------------------------------- nothing to correct
+# -------------------------------------------------------------------------------------------------
+# nothing to correct
 
 
 def test_a_robot_that_stands_as_planned_is_left_alone() -> None:
-    """Catches a bias of the forces, of the local frame or of the world's origin: no offset while it stands."""
+    """Catches a bias of the forces, of the local frame or of the world's origin: no offset while
+    it stands."""
     walker = model()
     action, _ = held(WalkingController(walker, **AT_ONCE), observed(walker, 0), 400)
     np.testing.assert_allclose(action, 0.0, rtol=0.0, atol=1e-9)
 
 
 def test_forces_that_follow_the_plan_ask_for_no_leg_difference() -> None:
-    """Catches forces of one control step compared with the load share of another, which looks like a lack of force."""
-    walker, state, hips = model(1.1), None, []
+    """Catches forces of one control step compared with the load share of another, which looks
+    like a lack of force."""
+    walker = model(1.1)
+    state = None
+    hips = []
     controller = WalkingController(walker, **AT_ONCE)
     for row in range(walker.plan.num_steps - 1):
         action, state = controller.predict(observed(walker, row), state, row == 0)
@@ -181,18 +209,25 @@ def test_forces_that_follow_the_plan_ask_for_no_leg_difference() -> None:
 
 
 def test_on_plan_only_half_a_sample_of_lag_is_fed_back() -> None:
-    """Catches a COM in the wrong frame or of another row, a wrong ω, filters of other time constants.
+    """Catches a COM in the wrong frame or of another row, a wrong ω, filters of other time
+    constants.
 
-    Closed form from the plan alone: first-order filters on the velocity's deviation and on the ZMP shift.
+    Closed form from the plan alone: first-order filters on the velocity's deviation and on the ZMP
+    shift.
     """
     walker = model(1.1)
-    plan, last = walker.plan, walker.plan.num_steps - 1
-    com, com_dot, omega = plan.com[:last, 1], plan.com_dot[:last, 1], np.sqrt(9.81 / plan.com_height)
+    plan = walker.plan
+    last = walker.plan.num_steps - 1
+    com = plan.com[:last, 1]
+    com_dot = plan.com_dot[:last, 1]
+    omega = np.sqrt(9.81 / plan.com_height)
     velocity = low_pass(np.diff(com, prepend=com[0]) / PERIOD_S - com_dot, GAINS.velocity_filter_s)
     shift = low_pass(GAINS.dcm * velocity / omega, GAINS.zmp_filter_s)
     share = plan.share[1 : last + 1]
     expected = -np.stack([1.0 - share, share], axis=1) * shift[:, None] * WEIGHT_N / 1001.0
-    controller, state, rolls = WalkingController(walker, **AT_ONCE), None, []
+    controller = WalkingController(walker, **AT_ONCE)
+    state = None
+    rolls = []
     for row in range(last):
         action, state = controller.predict(observed(walker, row), state, row == 0)
         rolls.append(action[[5, 11]])
@@ -206,27 +241,37 @@ def low_pass(values: Array, time_constant_s: float) -> Array:
     return lfilter([a], [1.0, a - 1.0], values)
 
 
-# ------------------------------------------------------------------------------------------------- force difference
+# -------------------------------------------------------------------------------------------------
+# force difference
 
 
 @pytest.mark.parametrize("lack", [60.0, -60.0])
 def test_the_leg_that_carries_too_little_grows(lack: float) -> None:
-    """Catches the sign of force difference control: a left foot that lacks force gets a straighter knee."""
+    """Catches the sign of force difference control: a left foot that lacks force gets a
+    straighter knee."""
     walker = model()
-    action, _ = held(WalkingController(walker, **AT_ONCE), observed(walker, 0, wrench=lacking(lack, walker)), 100)
+    action, _ = held(
+        WalkingController(walker, **AT_ONCE), observed(walker, 0, wrench=lacking(lack, walker)), 100
+    )
     left, right = action[KNEE]
     assert np.sign(lack) * left < -1e-3
     assert np.sign(lack) * right > 1e-3
 
 
-@pytest.mark.parametrize("leg", [LEG, LegGeometry(thigh=0.36, shank=0.24)], ids=["equal links", "long thigh"])
+@pytest.mark.parametrize(
+    "leg", [LEG, LegGeometry(thigh=0.36, shank=0.24)], ids=["equal links", "long thigh"]
+)
 @pytest.mark.parametrize("side", [None, 0, 1], ids=["standing", "left", "right"])
-def test_half_the_difference_goes_to_each_leg_along_hip_and_ankle(side: int | None, leg: LegGeometry) -> None:
-    """Catches a leg that tilts its sole or moves its ankle aside, and a length other than z/2, also of a bent leg.
+def test_half_the_difference_goes_to_each_leg_along_hip_and_ankle(
+    side: int | None, leg: LegGeometry
+) -> None:
+    """Catches a leg that tilts its sole or moves its ankle aside, and a length other than z/2, also
+    of a bent leg.
 
     A small lack of 1 N for long makes z = k T 1 N; the lengths follow from forward kinematics.
     """
-    walker, lack = model(), 1.0
+    walker = model()
+    lack = 1.0
     row = 0 if side is None else single_support(walker, side)
     observation = observed(walker, row, wrench=sensed(walker, row) + np.eye(12)[2] * -lack)
     built_so = replace(walker, biped=replace(walker.biped, leg=leg))
@@ -244,10 +289,14 @@ def test_half_the_difference_goes_to_each_leg_along_hip_and_ankle(side: int | No
 
 
 def test_the_difference_grows_and_leaks_with_its_time_constant() -> None:
-    """Catches a gain per step instead of per second, and a leak that is missing or of another time constant."""
-    walker, controller = model(), WalkingController(model(), com_feedback=False, **AT_ONCE)
+    """Catches a gain per step instead of per second, and a leak that is missing or of another
+    time constant."""
+    walker = model()
+    controller = WalkingController(model(), com_feedback=False, **AT_ONCE)
     steps = round(GAINS.force_difference_decay_s / PERIOD_S)
-    lack, right = (observed(walker, 0, wrench=wrench) for wrench in (lacking(30.0, walker), sensed(walker, 0)))
+    lack, right = (
+        observed(walker, 0, wrench=wrench) for wrench in (lacking(30.0, walker), sensed(walker, 0))
+    )
     after_t, _ = held(controller, lack, steps)
     settled, state = held(controller, lack, 8 * steps)
     for _ in range(steps):
@@ -263,49 +312,69 @@ def test_the_difference_stays_within_its_limit(sign: float) -> None:
     controller = WalkingController(walker, com_feedback=False, gains=FORGETFUL, **AT_ONCE)
     small, _ = held(controller, observed(walker, 0, wrench=lacking(30.0, walker)), 300)
     z = FORGETFUL.force_difference * FORGETFUL.force_difference_decay_s * 30.0
-    largest, state = held(controller, observed(walker, 0, wrench=lacking(sign * 2000.0, walker)), 300)
-    np.testing.assert_allclose(largest, sign * GAINS.force_difference_limit_m / z * small, rtol=1e-4, atol=1e-9)
+    largest, state = held(
+        controller, observed(walker, 0, wrench=lacking(sign * 2000.0, walker)), 300
+    )
+    np.testing.assert_allclose(
+        largest, sign * GAINS.force_difference_limit_m / z * small, rtol=1e-4, atol=1e-9
+    )
     leaked, _ = controller.predict(observed(walker, 0), state)
     np.testing.assert_allclose(
-        leaked[KNEE], (1.0 - PERIOD_S / FORGETFUL.force_difference_decay_s) * largest[KNEE], rtol=1e-5
+        leaked[KNEE],
+        (1.0 - PERIOD_S / FORGETFUL.force_difference_decay_s) * largest[KNEE],
+        rtol=1e-5,
     )
 
 
-# ---------------------------------------------------------------------------------- feedback of the center of mass
+# ---------------------------------------------------------------------------------- feedback of the
+# center of mass
 
 
 @pytest.mark.parametrize("side", [0, 1], ids=["left", "right"])
-@pytest.mark.parametrize("swing_foot", [None, [0.03, 0.04, 0.02]], ids=["foot on plan", "foot elsewhere"])
+@pytest.mark.parametrize(
+    "swing_foot", [None, [0.03, 0.04, 0.02]], ids=["foot on plan", "foot elsewhere"]
+)
 def test_zmp_shift_is_proportional_to_the_dcm_error_over_the_support_foot(
     side: int, swing_foot: list[float] | None
 ) -> None:
     """Catches a sign or gain of Δp = k (ξ − ξ_ref), and a local frame that hangs on the swing foot.
 
-    The robot is frozen off its plan, so that ξ is the COM, here by Pinocchio and with the support foot on its place.
+    The robot is frozen off its plan, so that ξ is the COM, here by Pinocchio and with the support
+    foot on its place.
     """
-    walker, row = model(), single_support(model(), side)
+    walker = model()
+    row = single_support(model(), side)
     plan = walker.plan
     q, com = shifted_pelvis(walker, row, np.array([0.02, -0.01, 0.0]), swing_foot)
     observation = observed(walker, row, encoder_angle=q)
     action, _ = held(WalkingController(walker, **AT_ONCE), observation, 400)
     error = com - plan.com[row] - plan.com_dot[row] / np.sqrt(9.81 / plan.com_height)
-    np.testing.assert_allclose(zmp_shift(action, walker, row), GAINS.dcm * error, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(
+        zmp_shift(action, walker, row), GAINS.dcm * error, rtol=0.0, atol=1e-7
+    )
     assert error[0] > 0.01
     others = np.delete(np.arange(12), ANKLES[2 * side : 2 * side + 2])
-    np.testing.assert_allclose(action[others], 0.0, rtol=0.0, atol=1e-9)  # only the ankle that carries
+    np.testing.assert_allclose(
+        action[others], 0.0, rtol=0.0, atol=1e-9
+    )  # only the ankle that carries
 
 
 def test_ankles_wind_by_the_torque_that_moves_the_force() -> None:
-    """Catches a sign or a lever: K a must be the static torque of the force at the shifted point less that before.
+    """Catches a sign or a lever: K a must be the static torque of the force at the shifted point
+    less that before.
 
     The COM stands ahead of its plan and to its left, and the feet carry alike.
     """
     walker = model()
     q, com = shifted_pelvis(walker, 0, np.array([0.015, 0.01, 0.0]))
-    action, _ = held(WalkingController(walker, **AT_ONCE), observed(walker, 0, encoder_angle=q), 400)
+    action, _ = held(
+        WalkingController(walker, **AT_ONCE), observed(walker, 0, encoder_angle=q), 400
+    )
     shift = [*GAINS.dcm * (com - walker.plan.com[0]), 0.0]
-    chains, legs = walker.biped.chains, walker.plan.q[1].reshape(2, 6)
-    force, gravity = np.tile([0.0, 0.0, WEIGHT_N / 2.0], (2, 1)), np.array([0.0, 0.0, -9.81])
+    chains = walker.biped.chains
+    legs = walker.plan.q[1].reshape(2, 6)
+    force = np.tile([0.0, 0.0, WEIGHT_N / 2.0], (2, 1))
+    gravity = np.array([0.0, 0.0, -9.81])
     _, points = chains.com_and_feet(legs, (0.0, 0.0, -ANKLE_HEIGHT_M))
     moved = holding_torque(chains, legs, gravity, force, points + np.array(shift))
     change = (moved - holding_torque(chains, legs, gravity, force, points)).ravel()
@@ -315,21 +384,28 @@ def test_ankles_wind_by_the_torque_that_moves_the_force() -> None:
 
 
 def test_zmp_shift_stays_within_its_limit() -> None:
-    """Catches a limit that is left out or that one axis lacks: a robot that leans forward and to its right."""
-    walker, row, limit = model(), single_support(model(), 0), GAINS.zmp_limit_m
+    """Catches a limit that is left out or that one axis lacks: a robot that leans forward and to
+    its right."""
+    walker = model()
+    row = single_support(model(), 0)
+    limit = GAINS.zmp_limit_m
     observation = observed(walker, row, imu_attitude=[0.35, 0.4])
     action, _ = held(WalkingController(walker, **AT_ONCE), observation, 400)
     np.testing.assert_allclose(zmp_shift(action, walker, row), [limit, -limit], rtol=0.0, atol=1e-8)
 
 
 def test_velocity_of_the_center_of_mass_is_fed_back() -> None:
-    """Catches a velocity left out, of the wrong sign, or not over ω: the COM drifts steadily, its plan stands still.
+    """Catches a velocity left out, of the wrong sign, or not over ω: the COM drifts steadily, its
+    plan stands still.
 
     The filter of the ZMP shift lags behind the drift by its time constant.
     """
-    walker, controller = model(), WalkingController(model(), **AT_ONCE)
+    walker = model()
+    controller = WalkingController(model(), **AT_ONCE)
     drift = 2e-4  # of the pelvis in a control period [m]
-    state, action, path = None, np.zeros(12), []
+    state = None
+    action = np.zeros(12)
+    path = []
     for step in range(100):
         q, com = shifted_pelvis(walker, 0, np.array([drift * step, 0.0, 0.0]))
         action, state = controller.predict(observed(walker, 0, encoder_angle=q), state, step == 0)
@@ -342,12 +418,17 @@ def test_velocity_of_the_center_of_mass_is_fed_back() -> None:
 
 
 def test_a_change_of_the_support_foot_is_no_velocity() -> None:
-    """Catches a COM velocity across two local frames: feet 0.02 m too far apart shift the frame, and nothing moves."""
+    """Catches a COM velocity across two local frames: feet 0.02 m too far apart shift the frame,
+    and nothing moves."""
     walker = model()
     plan = walker.plan
-    q = walker.biped.joint_angles(plan.pelvis[0], plan.ankles[0] + [[0.0, 0.01, 0.0], [0.0, -0.01, 0.0]])
+    q = walker.biped.joint_angles(
+        plan.pelvis[0], plan.ankles[0] + [[0.0, 0.01, 0.0], [0.0, -0.01, 0.0]]
+    )
     coming = [plan.timing.time[1], 0.0]
-    left, right = (observed(walker, 0, encoder_angle=q, clock=[*coming, support]) for support in (0, 1))
+    left, right = (
+        observed(walker, 0, encoder_angle=q, clock=[*coming, support]) for support in (0, 1)
+    )
     controller = WalkingController(walker, **AT_ONCE)
     before, state = held(controller, left, 400)
     shifts = []
@@ -357,13 +438,16 @@ def test_a_change_of_the_support_foot_is_no_velocity() -> None:
     jump = (
         GAINS.dcm * 0.02
     )  # the COM is 0.01 m left of the plan over the right foot, 0.01 m right of it over the left one
-    assert shifts[0] == pytest.approx(jump * (1.0 - np.exp(-PERIOD_S / GAINS.zmp_filter_s)), rel=1e-4)
+    assert shifts[0] == pytest.approx(
+        jump * (1.0 - np.exp(-PERIOD_S / GAINS.zmp_filter_s)), rel=1e-4
+    )
     assert shifts[-1] == pytest.approx(jump, rel=1e-4)
     assert np.max(shifts) <= shifts[-1] + 1e-9
 
 
 def test_com_feedback_switches_the_ankles_off_and_nothing_else() -> None:
-    """Catches a switch that also stops force difference control or friction, or that leaves some of the feedback."""
+    """Catches a switch that also stops force difference control or friction, or that leaves some
+    of the feedback."""
     walker = model(scenario="nominal")
     row = single_support(walker, 0)
     q, _ = shifted_pelvis(walker, row, np.array([0.02, -0.01, 0.0]))
@@ -381,52 +465,72 @@ def test_com_feedback_switches_the_ankles_off_and_nothing_else() -> None:
 
 
 def test_feedback_grows_over_the_ramp() -> None:
-    """Catches feedback that starts with a jump: by half of it after half the time, in full after all of it."""
+    """Catches feedback that starts with a jump: by half of it after half the time, in full after
+    all of it."""
     walker = model()
     q, _ = shifted_pelvis(walker, 0, np.array([0.02, -0.01, 0.0]))
     observation = observed(walker, 0, encoder_angle=q, wrench=lacking(50.0, walker))
     for steps, share in ((1, 0.0), (50, 0.5), (100, 1.0), (150, 1.0)):
-        slow, fast = (held(WalkingController(walker, ramp_s=ramp), observation, steps)[0] for ramp in (0.4, PERIOD_S))
+        slow, fast = (
+            held(WalkingController(walker, ramp_s=ramp), observation, steps)[0]
+            for ramp in (0.4, PERIOD_S)
+        )
         np.testing.assert_allclose(slow, share * fast, rtol=1e-6, atol=1e-7)
 
 
-# ---------------------------------------------------------------------------------------------------------- friction
+# --------------------------------------------------------------------------------------------------
+# friction
 
 
 def test_friction_is_wound_against_in_the_direction_of_the_plan() -> None:
-    """Catches a sign, a rate of the encoder for that of the plan, a ramp: F/K tanh(rate / 0.01 rad/s) at once."""
+    """Catches a sign, a rate of the encoder for that of the plan, a ramp: F/K tanh(rate / 0.01
+    rad/s) at once."""
     rates = np.linspace(-0.05, 0.05, 12)
     walker = model(scenario="nominal")
-    action, _ = held(WalkingController(walker), observed(walker, 0, reference_rate=rates, encoder_rate=-rates), 1)
+    action, _ = held(
+        WalkingController(walker), observed(walker, 0, reference_rate=rates, encoder_rate=-rates), 1
+    )
     np.testing.assert_allclose(action, 5.4 / 1001.0 * np.tanh(rates / 0.01), rtol=0.0, atol=1e-9)
 
 
 def test_a_robot_without_friction_needs_no_feedforward() -> None:
     """Catches friction of the paper's servo where the scenario has none."""
     walker = model()
-    action, _ = held(WalkingController(walker), observed(walker, 0, reference_rate=np.linspace(-0.05, 0.05, 12)), 1)
+    action, _ = held(
+        WalkingController(walker),
+        observed(walker, 0, reference_rate=np.linspace(-0.05, 0.05, 12)),
+        1,
+    )
     np.testing.assert_allclose(action, 0.0, rtol=0.0, atol=1e-12)
 
 
-# ------------------------------------------------------------------------------------------------------------ memory
+# --------------------------------------------------------------------------------------------------
+# memory
 
 
 def episodes(walker: WalkerModel, num_worlds: int, steps: int) -> Array:
-    """Observations of worlds in different phases and off their plans in different ways, (steps, num_worlds, m)."""
+    """Observations of worlds in different phases and off their plans in different ways, (steps,
+    num_worlds, m)."""
     generator = np.random.default_rng(3)
     begin = generator.integers(0, 800, num_worlds)
     rows = [[observed(walker, int(row) + step) for row in begin] for step in range(steps)]
-    observations, table = np.array(rows), walker.observation_table
-    observations[..., table.group("encoder_angle")] += generator.uniform(-0.02, 0.02, (num_worlds, 12))
+    observations = np.array(rows)
+    table = walker.observation_table
+    observations[..., table.group("encoder_angle")] += generator.uniform(
+        -0.02, 0.02, (num_worlds, 12)
+    )
     observations[..., table.group("wrench")] += generator.uniform(-50.0, 50.0, (num_worlds, 12))
     return observations
 
 
 def test_rows_are_the_single_worlds_exactly() -> None:
-    """Catches memory that leaks between worlds, and formulas that depend on the size of the batch."""
+    """Catches memory that leaks between worlds, and formulas that depend on the size of the
+    batch."""
     walker = model(scenario="nominal")
-    controller, observations = WalkingController(walker, ramp_s=0.1), episodes(walker, 3, 40)
-    state, actions = None, []
+    controller = WalkingController(walker, ramp_s=0.1)
+    observations = episodes(walker, 3, 40)
+    state = None
+    actions = []
     for step, rows in enumerate(observations):
         action, state = controller.predict(rows, state, np.full(3, step == 0))
         actions.append(action)
@@ -439,9 +543,11 @@ def test_rows_are_the_single_worlds_exactly() -> None:
 
 
 def test_episode_start_clears_its_rows_and_no_others() -> None:
-    """Catches memory that survives a new episode, and a new episode that clears the memory of its neighbours."""
+    """Catches memory that survives a new episode, and a new episode that clears the memory of
+    its neighbours."""
     walker = model(scenario="nominal")
-    controller, observations = WalkingController(walker, ramp_s=0.1), episodes(walker, 3, 30)
+    controller = WalkingController(walker, ramp_s=0.1)
+    observations = episodes(walker, 3, 30)
     state: Any = None
     for step, rows in enumerate(observations):
         _, state = controller.predict(rows, state, np.full(3, step == 0))
@@ -455,9 +561,11 @@ def test_episode_start_clears_its_rows_and_no_others() -> None:
 def test_predict_changes_neither_state_nor_observation() -> None:
     """Catches memory written in place: the same state must give the same action again."""
     walker = model(scenario="nominal")
-    controller, observations = WalkingController(walker, **AT_ONCE), episodes(walker, 2, 2)
+    controller = WalkingController(walker, **AT_ONCE)
+    observations = episodes(walker, 2, 2)
     _, state = controller.predict(observations[0], None, np.ones(2, dtype=np.bool_))
-    kept, before = state.copy(), observations[1].copy()
+    kept = state.copy()
+    before = observations[1].copy()
     again = [controller.predict(observations[1], state)[0] for _ in range(2)]
     np.testing.assert_array_equal(again[0], again[1])
     np.testing.assert_array_equal(state, kept)
@@ -485,4 +593,6 @@ def test_the_controller_takes_motors_for_links() -> None:
     """Catches an uncompensated policy that is credited with an estimate it does not make."""
     walker = model()
     observation = observed(walker, 500, encoder_angle=np.arange(12.0))
-    np.testing.assert_array_equal(WalkingController(walker).link_estimate(observation, None), np.arange(12.0))
+    np.testing.assert_array_equal(
+        WalkingController(walker).link_estimate(observation, None), np.arange(12.0)
+    )

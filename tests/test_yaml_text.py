@@ -34,7 +34,8 @@ LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     ],
 )
 def test_what_is_beyond_the_limits_is_refused_at_once(text: str, message: str) -> None:
-    """Catches gigabytes from 400 bytes, a RecursionError, integers that cannot be printed, and keys that are lost."""
+    """Catches gigabytes from 400 bytes, a RecursionError, integers that cannot be printed, and
+    keys that are lost."""
     began = time.process_time()
     with pytest.raises(yaml.YAMLError, match=message):
         parse_yaml(text)
@@ -43,15 +44,18 @@ def test_what_is_beyond_the_limits_is_refused_at_once(text: str, message: str) -
 
 @pytest.mark.parametrize("text", ["2001-99-99", "2001-01-01", "2001-01-01 10:00:00"])
 def test_dates_are_text(text: str) -> None:
-    """Catches YAML's dates, which are no configuration's, and a traceback for those of no calendar."""
+    """Catches YAML's dates, which are no configuration's, and a traceback for those of no
+    calendar."""
     assert parse_yaml(f"a: {text}") == {"a": text}
 
 
 def test_what_is_within_the_limits_is_read() -> None:
     """Catches limits that take aliases, merges and nesting with them."""
     assert parse_yaml("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]") == {
-        "a": {"x": 1, "y": 2}, "b": {"x": 1, "y": 3}, "c": [{"x": 1, "y": 2}] * 2,
-    }  # fmt: skip
+        "a": {"x": 1, "y": 2},
+        "b": {"x": 1, "y": 3},
+        "c": [{"x": 1, "y": 2}] * 2,
+    }
     depth = DEEPEST_NESTING - 1
     assert parse_yaml("[" * depth + "1" + "]" * depth) is not None
 
@@ -75,16 +79,37 @@ def test_a_star_without_quotes_gets_its_cure(text: str, cure: str) -> None:
     assert f"put the pattern in quotes: {cure}\n" in f"{said.value}"
 
 
-NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1, max_size=200) | (
+NAMES = st.text(
+    st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1, max_size=200
+) | (
     st.sampled_from(
-        ["0", "no", "null", "~", "1e3", "-1E-3", "0x1f", "1_0", ".inf", "2020-01-01", "<<", "=", 'x"y', "#"]
+        [
+            "0",
+            "no",
+            "null",
+            "~",
+            "1e3",
+            "-1E-3",
+            "0x1f",
+            "1_0",
+            ".inf",
+            "2020-01-01",
+            "<<",
+            "=",
+            'x"y',
+            "#",
+        ]
     )
 )
 
 
-@given(names=st.lists(NAMES, min_size=1, max_size=4, unique=True), number=st.floats(1e-9, 1e12) | st.just(math.inf))
+@given(
+    names=st.lists(NAMES, min_size=1, max_size=4, unique=True),
+    number=st.floats(1e-9, 1e12) | st.just(math.inf),
+)
 def test_names_and_numbers_are_read_as_they_were_written(names: list[str], number: float) -> None:
-    """Catches a name without quotes that is read as a number or a truth value, and one that ends its line."""
+    """Catches a name without quotes that is read as a number or a truth value, and one that ends
+    its line."""
     content = {name: {"stiffness": number} for name in names}
     lines = [yaml_line(name, own, f"± 2 % beside {names[0]}") for name, own in content.items()]
     assert parse_yaml("\n".join(["# a head", *lines])) == content

@@ -21,9 +21,12 @@ STEPS = 500
 def vector(scenario: str = "nominal") -> Any:
     """Two worlds of the walker at 3 s."""
     return gymnasium.make_vec(
-        "elastic_env/WalkInPlace-v0", num_envs=2, vectorization_mode="vector_entry_point", scenario=scenario,
+        "elastic_env/WalkInPlace-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        scenario=scenario,
         num_threads=1,
-    )  # fmt: skip
+    )
 
 
 class Recorder(Zero):
@@ -40,17 +43,21 @@ class Recorder(Zero):
 
 
 def standing(env: Any) -> Array:
-    """Observations of two worlds that stand; the ground's forces act off the planned ZMP, in the second one not."""
+    """Observations of two worlds that stand; the ground's forces act off the planned ZMP, in the
+    second one not."""
     observation, _ = env.reset(seed=0)
     rows = np.array(observation, dtype=np.float64)
-    table, biped = env.unwrapped.task.observation_table, env.unwrapped.task.assumed_model.biped
-    half, (x, y) = biped.weight / 2.0, OFFSET_M
+    table = env.unwrapped.task.observation_table
+    biped = env.unwrapped.task.assumed_model.biped
+    half = biped.weight / 2.0
+    x, y = OFFSET_M
     feet = FootSensors.of_biped(biped)
     wrench = np.zeros((2, 2, 2, 3))
     for foot in range(2):
         mass_n = -feet.weight[foot, 2]
         wrench[:, foot, 0, 2] = half - mass_n  # what the ankle carries
-        # the ground pushes up at (x, y) from the ankle, and the foot's own weight pulls down at its center
+        # the ground pushes up at (x, y) from the ankle, and the foot's own weight pulls down at its
+        # center
         wrench[0, foot, 1] = [y * half, -x * half, 0.0]
         wrench[:, foot, 1, :2] += np.array([-feet.com[foot, 1], feet.com[foot, 0]]) * mass_n
     rows[:, table.group("wrench")] = wrench.reshape(2, -1)
@@ -59,12 +66,14 @@ def standing(env: Any) -> Array:
 
 
 def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
-    """Catches a wrong sign, a foot that weighs nothing, a rate per step in place of per second, and no limit."""
+    """Catches a wrong sign, a foot that weighs nothing, a rate per step in place of per second,
+    and no limit."""
     env = vector()
     model = env.unwrapped.task.assumed_model
     recorder = Recorder(model.observation_table)
     policy = ZmpOffset(recorder, model, ZmpOffsetGains(time_constant_s=2.0, limit_m=0.008))
-    rows, state = standing(env), None
+    rows = standing(env)
+    state = None
     for step in range(STEPS):
         _, state = policy.predict(rows, state, np.full(2, step == 0))
     time_s = np.arange(1, STEPS + 1) * model.control_period_s
@@ -73,8 +82,12 @@ def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
     shifts = np.array(recorder.shifts)
     np.testing.assert_allclose(shifts[:, 0], expected, atol=1e-12)
     np.testing.assert_allclose(shifts[:, 1], 0.0, atol=1e-12)
-    policy.predict(rows, state, np.array([True, False]), inputs=PolicyInputs(zmp=np.full((2, 2), 0.01)))
-    np.testing.assert_allclose(recorder.shifts[-1][0], 0.01 - OFFSET_M * time_s[0] / 2.0, atol=1e-12)
+    policy.predict(
+        rows, state, np.array([True, False]), inputs=PolicyInputs(zmp=np.full((2, 2), 0.01))
+    )
+    np.testing.assert_allclose(
+        recorder.shifts[-1][0], 0.01 - OFFSET_M * time_s[0] / 2.0, atol=1e-12
+    )
     np.testing.assert_allclose(recorder.shifts[-1][1], 0.01, atol=1e-12)
 
 
@@ -85,7 +98,9 @@ def test_on_a_slope_the_mean_error_of_the_zmp_goes() -> None:
         env = vector("slope")
         policy = baselines.make("adaptive_posture", env, zmp_offset=offset)
         observation, _ = env.reset(seed=3)
-        state, start, deviations = None, np.ones(2, dtype=np.bool_), []
+        state = None
+        start = np.ones(2, dtype=np.bool_)
+        deviations = []
         for _ in range(1500):
             action, state = policy.predict(observation, state, start)
             observation, *_, info = env.step(action)

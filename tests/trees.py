@@ -1,4 +1,5 @@
-"""Robots with several hinges on which formulas for one joint would fail, and MuJoCo's gravity torque for them."""
+"""Robots with several hinges on which formulas for one joint would fail, and MuJoCo's gravity
+torque for them."""
 
 from collections.abc import Sequence
 
@@ -10,7 +11,8 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 from elastic_env.world.robot_model import RobotModel
 
-# A trunk with two hinges whose anchors are off the body's origin; an arm with one more, and a leg of two bodies. Frames
+# A trunk with two hinges whose anchors are off the body's origin; an arm with one more, and a leg
+# of two bodies. Frames
 # are turned, references differ from zero, gravity is tilted, and a body without joints rides along.
 TREE = """<mujoco>
   <option gravity="1.1 -0.7 -9.6"/>
@@ -56,7 +58,9 @@ def tree() -> RobotModel:
 def pendulum(mass_scale: float = 1.0) -> RobotModel:
     """The paper's testbed, with its mass scaled."""
     joint = ElasticJoint(stiffness=1001.0, rotor_inertia=0.839)
-    return RobotModel({JOINT: joint}, rigid_spec(Pendulum().with_mass_scaled(mass_scale)).compile(), 0.004)
+    return RobotModel(
+        {JOINT: joint}, rigid_spec(Pendulum().with_mass_scaled(mass_scale)).compile(), 0.004
+    )
 
 
 def bias_of_mujoco(model: RobotModel, q: Array) -> Array:

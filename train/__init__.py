@@ -1,4 +1,7 @@
-"""Evaluation, comparison and training. The wrappers for agents, which are in `baselines`, are here by name too."""
+"""Evaluation, comparison and training.
+
+The wrappers for agents, which are in `baselines`, are here by name too.
+"""
 
 from typing import TYPE_CHECKING, Any
 

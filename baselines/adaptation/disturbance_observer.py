@@ -1,36 +1,39 @@
-r"""Disturbance observer of a joint with an IMU on its link: what torque the model lacks, led by as a deflection.
+r"""Disturbance observer of a joint with an IMU on its link: what torque the model lacks, led by as
+a deflection.
 
-The link obeys :math:`I \ddot q + \tau_g(q) + d = \tau_J`. Encoder and IMU show the deflection δ, so the model says how
-much torque reaches the link and how much its motion needs. What is missing is the disturbance d, behind a first-order
-filter of time constant T [Nakao1987], [Ohnishi1996]:
+The link obeys :math:`I \ddot q + \tau_g(q) + d = \tau_J`. Encoder and IMU show the deflection δ, so
+the model says how much torque reaches the link and how much its motion needs. What is missing is
+the disturbance d, behind a first-order filter of time constant T [Nakao1987], [Ohnishi1996]:
 
 .. math:: \dot{\hat d} = \frac{1}{T} \big(K \delta + D \dot\delta - \tau_g(q) - I \ddot q - \hat d\big)
 
-I q̈ is the change of the momentum over a control period. It needs q̇ alone, and the filter sums it up [DeLuca2003].
-Deflection and link angle, their rates and the friction pass one and the same further filter. What is behind it obeys
-the same equation, so that a motion without disturbance leaves nothing. The command leads by d̂/K more.
+I q̈ is the change of the momentum over a control period. It needs q̇ alone, and the filter sums it
+up [DeLuca2003]. Deflection and link angle, their rates and the friction pass one and the same
+further filter. What is behind it obeys the same equation, so that a motion without disturbance
+leaves nothing. The command leads by d̂/K more.
 
-d is what another K, another load and what is left of friction do. In motion the friction of the model is taken as
-known. At rest it may be anything up to F: else the estimate winds up against a link that sticks. Where K and load are
-as assumed, d does not depend on the command, and there is no loop. For a K that is wrong by ΔK there is
-one, which is strongest at the resonance ω of link and spring. Its gain there is
+d is what another K, another load and what is left of friction do. In motion the friction of the
+model is taken as known. At rest it may be anything up to F: else the estimate winds up against a
+link that sticks. Where K and load are as assumed, d does not depend on the command, and there is no
+loop. For a K that is wrong by ΔK there is one, which is strongest at the resonance ω of link and
+spring. Its gain there is
 
 .. math:: \frac{1}{\omega T} \frac{K}{D \omega} \frac{\Delta K}{K}, \quad
           \text{below 1 for} \quad T > \frac{I}{D} \frac{\Delta K}{K}
 
-The bound is 0.12 s on the testbed for a K that is 0.3 below the assumed one. The default T is 0.3 s: thirty samples of
-an IMU at 100 Hz, and 75 control periods.
+The bound is 0.12 s on the testbed for a K that is 0.3 below the assumed one. The default T is 0.3
+s: thirty samples of an IMU at 100 Hz, and 75 control periods.
 
-The IMU has an offset. Where the model says that the joint starts without load, encoder and IMU must agree, and their
-difference is averaged before the observer begins. What disturbs the joint there from the start is not seen.
+The IMU has an offset. Where the model says that the joint starts without load, encoder and IMU must
+agree, and their difference is averaged before the observer begins. What disturbs the joint there
+from the start is not seen.
 
-[Nakao1987] M. Nakao, K. Ohnishi, K. Miyachi, "A Robust Decentralized Joint Control Based on Interference Estimation",
-IEEE Int. Conf. Robotics and Automation.
-[Ohnishi1996] K. Ohnishi, M. Shibata, T. Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans.
-Mechatronics 1(1).
-[DeLuca2003] A. De Luca, R. Mattone, "Actuator Failure Detection and Isolation Using Generalized Momenta", IEEE Int.
-Conf. Robotics and Automation.
-"""
+[Nakao1987] M. Nakao, K. Ohnishi, K. Miyachi, "A Robust Decentralized Joint Control Based on
+Interference Estimation", IEEE Int. Conf. Robotics and Automation. [Ohnishi1996] K. Ohnishi, M.
+Shibata, T. Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans. Mechatronics
+1(1). [DeLuca2003] A. De Luca, R. Mattone, "Actuator Failure Detection and Isolation Using
+Generalized Momenta", IEEE Int. Conf. Robotics and Automation.
+"""  # noqa: E501
 
 from typing import Any, NamedTuple
 
@@ -58,14 +61,19 @@ _UNLOADED_RAD = 1e-3
 class ObserverGains(Model):
     """How fast a disturbance is observed, and how much of it."""
 
-    time_constant_s: float = quantity("s", 0.3, gt=0, description="T, with which the estimate follows")
-    rate_filter_s: float = quantity(
-        "s", 0.03, gt=0, description="time constant of the filter that all measurements pass"
-    )
-    limit_nm: float = quantity("N·m", 30.0, gt=0, description="largest disturbance that is compensated")
+    time_constant_s: float = quantity("s", 0.3, gt=0)
+    """T, with which the estimate follows [s]."""
+    rate_filter_s: float = quantity("s", 0.03, gt=0)
+    """Time constant of the filter that all measurements pass [s]."""
+    limit_nm: float = quantity("N·m", 30.0, gt=0)
+    """Largest disturbance that is compensated [N·m]."""
     friction: bool = True
-    """The model's Coulomb friction is known, and no disturbance. It must be as in the policy inside."""
-    zero_s: float = quantity("s", 0.5, ge=0, description="time in which the IMU is zeroed at the start, 0 for never")
+    """The model's Coulomb friction is known, and no disturbance.
+
+    It must be as in the policy inside.
+    """
+    zero_s: float = quantity("s", 0.5, ge=0)
+    """Time in which the IMU is zeroed at the start, 0 for never [s]."""
 
 
 class JointObservation(NamedTuple):
@@ -95,7 +103,9 @@ class JointObservation(NamedTuple):
 
 
 class ObserverMemory(NamedTuple):
-    """Control steps since the start of the episode, (num_worlds, 1), what is kept of the joints, and of the policy."""
+    """Control steps since the start of the episode, (num_worlds, 1), what is kept of the joints,
+    and of the policy.
+    """
 
     steps: IntArray
     joints: JointObservation
@@ -116,7 +126,11 @@ class DisturbanceObserver(PolicyAround):
     """
 
     def __init__(
-        self, policy: Policy, model: RobotModel, gains: ObserverGains | None = None, ramp_s: float = STAND_S
+        self,
+        policy: Policy,
+        model: RobotModel,
+        gains: ObserverGains | None = None,
+        ramp_s: float = STAND_S,
     ) -> None:
         table = model.observation_table
         super().__init__(policy, table, model.control_period_s)
@@ -154,10 +168,14 @@ class DisturbanceObserver(PolicyAround):
             rate=zero,
             disturbance=zero,
         )
-        return ObserverMemory(np.zeros((len(rows), 1), dtype=np.int64), joints, self.policy.begin(rows))
+        return ObserverMemory(
+            np.zeros((len(rows), 1), dtype=np.int64), joints, self.policy.begin(rows)
+        )
 
     @override
-    def act(self, rows: Array, memory: ObserverMemory, inputs: PolicyInputs) -> tuple[Array, ObserverMemory]:
+    def act(
+        self, rows: Array, memory: ObserverMemory, inputs: PolicyInputs
+    ) -> tuple[Array, ObserverMemory]:
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
@@ -178,7 +196,8 @@ class DisturbanceObserver(PolicyAround):
         q_ref_dot = self.view.motion(rows).q_dot
         is_zeroing = steps <= self._zero_steps
         offset = was.offset + is_zeroing * (self._disagreement(theta, imu) - was.offset) / steps
-        # between two samples of the IMU the encoder goes on: the deflection is known where both are new
+        # between two samples of the IMU the encoder goes on: the deflection is known where both are
+        # new
         is_new = (imu != was.imu) | is_zeroing
         deflection = np.where(is_new, theta - imu - offset, was.deflection)
         friction = presliding_friction(was.friction, q_ref_dot * self._dt, self._coulomb)
@@ -200,9 +219,13 @@ class DisturbanceObserver(PolicyAround):
         missing = np.where(is_zeroing, 0.0, passed - needed - rubs)
         disturbance = was.disturbance + self._follow_share * (missing - was.disturbance)
         disturbance = np.clip(disturbance, -gains.limit_nm, gains.limit_nm)
-        return JointObservation(offset, imu, deflection, friction, delta, q, known, q_dot, disturbance)
+        return JointObservation(
+            offset, imu, deflection, friction, delta, q, known, q_dot, disturbance
+        )
 
     def _disagreement(self, theta: Array, imu: Array) -> Array:
-        """By how much the IMU shows too little, where there is no load that bends the joint, else 0 [rad]."""
+        """By how much the IMU shows too little, where there is no load that bends the joint,
+        else 0 [rad].
+        """
         q = self._static.link_angle(theta)
         return np.where(np.abs(theta - q) < _UNLOADED_RAD, q - imu, 0.0)

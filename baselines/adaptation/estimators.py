@@ -7,11 +7,13 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 | `EncoderEstimator` | also link encoders | (1 + r_j) (1 + μ) joint by joint |
 | `LinkEncoderEstimator` | encoders on motors and links of a robot on a fixed base | 1 + r_j joint by joint |
 
-ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the feet. Without torque
-sensors ρ of pitch is left out: friction hides the bending there. Joints without a link encoder have r_j = 0. r_j is by
-the regression of `baselines.estimation.joint_stiffness`. The expected deflection is :math:`h = K^{-1} (\tau + \tau_F)`
-with the Coulomb friction, and with the torque of the measured foot wrenches, or of the motion on a fixed base.
-"""
+ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the
+feet. Without torque sensors ρ of pitch is left out: friction hides the bending there. Joints
+without a link encoder have r_j = 0. r_j is by the regression of
+`baselines.estimation.joint_stiffness`. The expected deflection is :math:`h = K^{-1} (\tau +
+\tau_F)` with the Coulomb friction, and with the torque of the measured foot wrenches, or of the
+motion on a fixed base.
+"""  # noqa: E501
 
 from abc import abstractmethod
 from typing import Any, NamedTuple, Protocol
@@ -24,7 +26,11 @@ from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.joint_stiffness import RegressionMemory, StiffnessPrior, StiffnessRegression
+from baselines.estimation.joint_stiffness import (
+    RegressionMemory,
+    StiffnessPrior,
+    StiffnessRegression,
+)
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
@@ -38,7 +44,9 @@ _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
 _PRIOR_LOADS = 5.0
 """Number of measurements that the assumed load counts for."""
 ARM_PRIOR = StiffnessPrior(own=0.3, noise_rad=0.005)
-"""Joints of an arm are less alike than those of two legs, and no foot sensors add errors of their own."""
+"""Joints of an arm are less alike than those of two legs, and no foot sensors add errors of
+their own.
+"""
 
 
 class Estimator(Protocol):
@@ -54,14 +62,17 @@ class Estimator(Protocol):
 
 
 class EstimatorMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the observer."""
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the
+    observer.
+    """
 
     loads: Array
     observer: Any
 
 
 class LegEstimator(Estimator):
-    """r of each leg by motors, foot sensors and IMU, and joint torques where there are any; see the module.
+    """r of each leg by motors, foot sensors and IMU, and joint torques where there are any; see the
+    module.
 
     Args:
         model: Assumed walker.
@@ -88,7 +99,9 @@ class LegEstimator(Estimator):
 
 
 class EncoderEstimator(Estimator):
-    """r of each joint by link encoders; joints that have none take part in the load alone. See the module.
+    """r of each joint by link encoders; joints that have none take part in the load alone.
+
+    See the module.
 
     Args:
         model: Assumed walker.
@@ -116,9 +129,13 @@ class EncoderEstimator(Estimator):
         q = theta - deflection
         friction = self._regression.friction(q, memory.observer)
         h = theta - self._compensator.at(rows).link_angle(theta) + friction / self._stiffness
-        error, observer = self._regression.add(h, deflection, friction, q, memory.observer, measured=has)
+        error, observer = self._regression.add(
+            h, deflection, friction, q, memory.observer, measured=has
+        )
         force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
-        load, loads = mean_load(memory.loads, force.sum(axis=1, keepdims=True) / self._carried - 1.0)
+        load, loads = mean_load(
+            memory.loads, force.sum(axis=1, keepdims=True) / self._carried - 1.0
+        )
         return (1.0 + has * error) * (1.0 + load) - 1.0, EstimatorMemory(loads, observer)
 
 
@@ -131,7 +148,9 @@ class LinkEncoderEstimator(Estimator):
         prior: What is known of r before it is measured.
     """
 
-    def __init__(self, model: RobotModel, sensors: DeflectionSensors, prior: StiffnessPrior = ARM_PRIOR) -> None:
+    def __init__(
+        self, model: RobotModel, sensors: DeflectionSensors, prior: StiffnessPrior = ARM_PRIOR
+    ) -> None:
         self._sensors = sensors
         self._regression = StiffnessRegression(model, prior)
         self._view = ObservationView(model.observation_table, model.control_period_s)
@@ -149,13 +168,17 @@ class LinkEncoderEstimator(Estimator):
         motion = self._view.motion(rows)
         q = self._view.theta(rows) - deflection
         friction = self._regression.friction(q, memory)
-        torque = self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot) + self._viscous * motion.q_dot
+        torque = (
+            self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
+            + self._viscous * motion.q_dot
+        )
         h = (torque + friction) / self._stiffness
         return self._regression.add(h, deflection, friction, q, memory, measured=self._sensors.has)
 
 
 def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
-    """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of measurements.
+    """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of
+    measurements.
 
     Args:
         memory: Number and sum, (num_worlds, 2).

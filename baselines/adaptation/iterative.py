@@ -1,7 +1,9 @@
-"""A policy whose offsets are learned from trial to trial on the robot itself, see `iterative_learning`.
+"""A policy whose offsets are learned from trial to trial on the robot itself, see
+`iterative_learning`.
 
-It needs no simulation, no model beside that of its base, and no truth: the trials are episodes of the environment that
-it is given, which may be hardware. What it has learned is a table of offsets over the time of an episode.
+It needs no simulation, no model beside that of its base, and no truth: the trials are episodes of
+the environment that it is given, which may be hardware. What it has learned is a table of offsets
+over the time of an episode.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +45,9 @@ class LearnedOffsets(PolicyAround):
         tables: What was learned, for every world or for all of them alike, (num_worlds or 1, T, k).
     """
 
-    def __init__(self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float) -> None:
+    def __init__(
+        self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float
+    ) -> None:
         super().__init__(policy, model.observation_table, model.control_period_s)
         self._signals = signals
         self._ramp = Ramp(model, ramp_s)
@@ -57,7 +61,9 @@ class LearnedOffsets(PolicyAround):
         return self._signals.names
 
     def play(self, tables: Array) -> None:
-        """Take other offsets, (num_worlds or 1, T, k); row t acts in the period that ends t periods after the start."""
+        """Take other offsets, (num_worlds or 1, T, k); row t acts in the period that ends t
+        periods after the start.
+        """
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
         self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
         self.tables = tables
@@ -67,13 +73,18 @@ class LearnedOffsets(PolicyAround):
         return LearnedMemory(np.zeros(len(rows), dtype=np.int64), self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs) -> tuple[Array, LearnedMemory]:
+    def act(
+        self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs
+    ) -> tuple[Array, LearnedMemory]:
         """After the last row of the table its offsets stay."""
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
-            raise ElasticError(f"the offsets were learned in {tables} worlds, one each, and are played in {len(rows)}")
+            raise ElasticError(
+                f"the offsets were learned in {tables} worlds, one each, and are played in"
+                f" {len(rows)}"
+            )
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
         return (action + offsets).astype(np.float32), LearnedMemory(steps, inner)
@@ -112,12 +123,15 @@ class IterativeLearner(LearnedOffsets):
         ramp_s: Time in which the offsets grow from zero [s].
     """
 
-    def __init__(self, policy: Policy, model: RobotModel, signals: LearnedSignals, trials: int, ramp_s: float) -> None:
+    def __init__(
+        self, policy: Policy, model: RobotModel, signals: LearnedSignals, trials: int, ramp_s: float
+    ) -> None:
         super().__init__(policy, model, signals, ramp_s)
         self.trials = trials
 
     def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] | None = None) -> None:
-        """Learn in an environment, on the robots that its `reset(seed=seed)` draws; what was learned before is dropped.
+        """Learn in an environment, on the robots that its `reset(seed=seed)` draws; what was
+        learned before is dropped.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.
@@ -144,7 +158,9 @@ class IterativeLearner(LearnedOffsets):
         known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
         errors = limit_surprise(trial.error, known, surprise)
         pairs = zip(tables, errors, strict=True)
-        following = np.stack([update(table, error, gains, self._period_s, trial.number) for table, error in pairs])
+        following = np.stack(
+            [update(table, error, gains, self._period_s, trial.number) for table, error in pairs]
+        )
         failed = trial.failed[:, None, None]
         return np.where(failed, _RETREAT * tables, following), np.where(failed, before, errors)
 
@@ -166,7 +182,10 @@ class Stage:
         self._robots = [seed + world for world in range(self.num_worlds)]
 
     def trial(self, policy: Policy, signals: LearnedSignals, number: int) -> Trial:
-        """Play an episode in every world. Its noise depends on the robot's seed and the number of the trial alone."""
+        """Play an episode in every world.
+
+        Its noise depends on the robot's seed and the number of the trial alone.
+        """
         n = self.num_worlds
         seen = self._reset([_seed_of_noise(robot, number) for robot in self._robots])
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
@@ -176,14 +195,18 @@ class Stage:
         state = None
         start = np.ones(n, dtype=np.bool_)
         for step in range(1, self.num_steps + 1):
-            action, state = policy.predict(seen, state=state, episode_start=start, deterministic=True)
+            action, state = policy.predict(
+                seen, state=state, episode_start=start, deterministic=True
+            )
             asked = seen
             seen, terminated, truncated, info = self._step(action)
             start = terminated | truncated
             running = ~over & ~terminated
             error[running, step] = signals.error(asked, seen, info)[running]
             for world in np.flatnonzero(start & ~over).tolist():
-                metrics[world] = {name: float(value) for name, value in self._metrics_of(info, world)}
+                metrics[world] = {
+                    name: float(value) for name, value in self._metrics_of(info, world)
+                }
             failed = failed | (terminated & ~over)
             over = over | start
             if over.all():
@@ -196,7 +219,9 @@ class Stage:
         return self._env.reset(seed=seeds, options={"robot_seed": self._robots})[0]
 
     def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Mapping[str, Any]]:
-        seen, _, terminated, truncated, info = self._env.step(action[0] if self._is_scalar else action)
+        seen, _, terminated, truncated, info = self._env.step(
+            action[0] if self._is_scalar else action
+        )
         if self._is_scalar:
             return seen[None], np.array([terminated]), np.array([truncated]), info
         return seen, terminated, truncated, info
@@ -208,6 +233,8 @@ class Stage:
 
 
 def _seed_of_noise(robot: int, number: int) -> int:
-    """Seed of a trial's noise, other than that of any other trial and of the robot's own episode."""
+    """Seed of a trial's noise, other than that of any other trial and of the robot's own
+    episode.
+    """
     sequence = np.random.SeedSequence([robot, number])
     return int(sequence.generate_state(1, np.uint64)[0] >> 1)

@@ -1,27 +1,30 @@
-r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at the same time.
+r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at
+the same time.
 
 .. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
 
-u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j. γ is the learning
-gain. It may fall as 1 / (1 + j/n), which averages the noise of later trials [Saab2001]. A share λ is forgotten, so
-that noise does not add up where the plant hardly answers. The lead ℓ makes up for the delay from an offset to its
-effect. Q is a low-pass filter without phase shift, which stops learning where the delay is not known well enough
-[Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where, at all frequencies,
+u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j.
+γ is the learning gain. It may fall as 1 / (1 + j/n), which averages the noise of later trials
+[Saab2001]. A share λ is forgotten, so that noise does not add up where the plant hardly answers.
+The lead ℓ makes up for the delay from an offset to its effect. Q is a low-pass filter without phase
+shift, which stops learning where the delay is not known well enough [Longman2000, Elci2002]. With a
+plant e = d − P u the error shrinks from trial to trial where, at all frequencies,
 
 .. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
 
-[Bristow2006]; the wrong sign of γ diverges. With Q = 1, λ = 0 and P = p it is e_j = (1 − γ p)^j e_0.
+[Bristow2006]; the wrong sign of γ diverges. With Q = 1, λ = 0 and P = p it is e_j = (1 − γ p)^j
+e_0.
 
-A push in one trial is no error of the robot. So an error may shrink by any amount from one trial to the next, but it
-counts as grown, or as turned over, by no more than a surprise.
+A push in one trial is no error of the robot. So an error may shrink by any amount from one trial to
+the next, but it counts as grown, or as turned over, by no more than a surprise.
 
-[Bristow2006] D. A. Bristow, M. Tharayil, A. G. Alleyne, "A Survey of Iterative Learning Control", IEEE Control Systems
-Magazine 26(3).
-[Longman2000] R. W. Longman, "Iterative Learning Control and Repetitive Control for Engineering Practice", International
-Journal of Control 73(10).
-[Saab2001] S. S. Saab, "A Discrete-Time Stochastic Learning Control Algorithm", IEEE Trans. Automatic Control 46(6).
-[Elci2002] H. Elci, R. W. Longman, M. Q. Phan, J.-N. Juang, R. Ugoletti, "Simple Learning Control Made Practical by
-Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and Systems I 49(6).
+[Bristow2006] D. A. Bristow, M. Tharayil, A. G. Alleyne, "A Survey of Iterative Learning Control",
+IEEE Control Systems Magazine 26(3). [Longman2000] R. W. Longman, "Iterative Learning Control and
+Repetitive Control for Engineering Practice", International Journal of Control 73(10). [Saab2001] S.
+S. Saab, "A Discrete-Time Stochastic Learning Control Algorithm", IEEE Trans. Automatic Control
+46(6). [Elci2002] H. Elci, R. W. Longman, M. Q. Phan, J.-N. Juang, R. Ugoletti, "Simple Learning
+Control Made Practical by Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and
+Systems I 49(6).
 """
 
 from collections.abc import Sequence
@@ -37,17 +40,28 @@ _ORDER = 2  # of the filter, which acts twice
 class ChannelGains(Model):
     """How one error, in its own unit, corrects its offset."""
 
-    gain: float = quantity("offset/error", ge=0, description="learning gain γ")
-    lead_s: float = quantity("s", ge=0, le=1, description="lead ℓ: delay from an offset to its effect")
-    cutoff_hz: float = quantity("Hz", gt=0, le=100, description="frequency at which Q halves the amplitude")
-    surprise: float = quantity("error", gt=0, description="by how much an error can grow from trial to trial")
-    limit: float = quantity("offset", gt=0, description="largest offset")
-    forgetting: float = quantity("1", 0.0, ge=0, lt=1, description="share λ of the offset that is forgotten")
-    halved_after: float | None = quantity("trials", None, gt=0, description="trials n that halve γ; None keeps it")
+    gain: float = quantity("offset/error", ge=0)
+    """Learning gain γ [offset/error]."""
+    lead_s: float = quantity("s", ge=0, le=1)
+    """Lead ℓ: delay from an offset to its effect [s]."""
+    cutoff_hz: float = quantity("Hz", gt=0, le=100)
+    """Frequency at which Q halves the amplitude [Hz]."""
+    surprise: float = quantity("error", gt=0)
+    """By how much an error can grow from trial to trial [error]."""
+    limit: float = quantity("offset", gt=0)
+    """Largest offset [offset]."""
+    forgetting: float = quantity("1", 0.0, ge=0, lt=1)
+    """Share λ of the offset that is forgotten [1]."""
+    halved_after: float | None = quantity("trials", None, gt=0)
+    """Trials n that halve γ; None keeps it [trials]."""
 
     def gain_of(self, trial: int) -> float:
         """Learning gain of a trial, 0 for the first."""
-        return self.gain if self.halved_after is None else self.gain / (1.0 + trial / self.halved_after)
+        return (
+            self.gain
+            if self.halved_after is None
+            else self.gain / (1.0 + trial / self.halved_after)
+        )
 
 
 def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
@@ -58,7 +72,9 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
         cutoff_hz: Where the amplitude is halved [Hz].
         period_s: Time between rows [s].
     """
-    from scipy import signal  # here: it takes half a second to load, and most programs need none of it
+    from scipy import (
+        signal,
+    )  # here: it takes half a second to load, and most programs need none of it
 
     sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
     longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends
@@ -67,7 +83,9 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
 
 def lead_error(error: Array, steps: int) -> Array:
     """Error that comes some steps later, at every step, (T, ...); its last value behind the end."""
-    return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[: len(error)]
+    return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[
+        : len(error)
+    ]
 
 
 def limit_surprise(error: Array, before: Array, surprise: float | Array) -> Array:
@@ -83,7 +101,9 @@ def limit_surprise(error: Array, before: Array, surprise: float | Array) -> Arra
     return np.clip(np.nan_to_num(error), low, high)
 
 
-def update(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0) -> Array:
+def update(
+    table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0
+) -> Array:
     """Offsets of the next trial, see the module.
 
     Args:
@@ -97,5 +117,7 @@ def update(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: 
     for column, own in enumerate(gains):
         leading = lead_error(error[:, column], round(own.lead_s / period_s))
         wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * leading
-        following[:, column] = np.clip(zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit)
+        following[:, column] = np.clip(
+            zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit
+        )
     return following

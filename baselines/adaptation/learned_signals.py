@@ -1,4 +1,5 @@
-r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the joints correct them.
+r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the
+joints correct them.
 
 | robot | error, by sensors alone | correction |
 |---|---|---|
@@ -6,8 +7,9 @@ r"""Signals that are learned from trial to trial: which measured errors, and whi
 | walker | planned less measured ZMP | another ZMP of the plan, see `baselines.walking.zmp_shift` |
 | joints | q_ref − q by link encoders, or by the IMU of the only link | the offset of the joint |
 
-A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll itself. The ZMP and
-the links follow their offsets, so their error is what was asked less what was measured.
+A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll
+itself. The ZMP and the links follow their offsets, so their error is what was asked less what was
+measured.
 """
 
 from abc import abstractmethod
@@ -30,20 +32,33 @@ from elastic_env.world.robot_model import RobotModel, WalkerModel
 LINK_IMU = "link_angle_imu"
 _LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP
 
-_ZMP = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0)
+_ZMP = ChannelGains(
+    gain=0.6,
+    lead_s=0.26,
+    cutoff_hz=2.0,
+    surprise=0.006,
+    limit=0.06,
+    forgetting=0.1,
+    halved_after=3.0,
+)
 
 
 class LearningGains(Model):
     """How the offsets of `iterative` are learned."""
 
-    trials: int = quantity("1", 10, ge=1, le=1000, description="trials, such as walks, that it learns from")
-    attitude: ChannelGains = ChannelGains(gain=2.0, lead_s=0.032, cutoff_hz=6.0, surprise=1.5e-3, limit=0.08)
+    trials: int = quantity("1", 10, ge=1, le=1000)
+    """Trials, such as walks, that it learns from [1]."""
+    attitude: ChannelGains = ChannelGains(
+        gain=2.0, lead_s=0.032, cutoff_hz=6.0, surprise=1.5e-3, limit=0.08
+    )
     """Walker: hip angle per tilt of the pelvis [1], in rad."""
     zmp_x: ChannelGains = _ZMP
     """Walker: forward shift of the planned ZMP per deviation of the ZMP [1], in m."""
     zmp_y: ChannelGains = _ZMP
     """Walker: the same to the left."""
-    joint: ChannelGains = ChannelGains(gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2)
+    joint: ChannelGains = ChannelGains(
+        gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2
+    )
     """Robots on a fixed base: offset per error of the link [1], in rad."""
 
 
@@ -60,7 +75,8 @@ class LearnedSignals(Protocol):
         """Errors measured after a control step, (num_worlds, k); nan where nothing was measured.
 
         Args:
-            asked: Observations before the step, whose reference is that of its end, (num_worlds, m).
+            asked: Observations before the step, whose reference is that of its end, (num_worlds,
+                m).
             seen: Observations after it.
             info: What the environment says of it.
         """
@@ -91,7 +107,9 @@ class WalkSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        """Tilt, and error of the ZMP as if the feet were flat where they are planned, (num_worlds, 4)."""
+        """Tilt, and error of the ZMP as if the feet were flat where they are planned,
+        (num_worlds, 4).
+        """
         return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
 
     def measured_zmp(self, seen: Array) -> Array:
@@ -126,13 +144,15 @@ class JointSignals(LearnedSignals):
         self._encoder = table.group(LINK_ENCODER) if has_encoders else None
         if self._encoder is None and len(joints) > 1:
             raise ConfigurationError(
-                f"learning the offsets of {len(joints)} joints needs their links measured; make the environment with "
-                f"sensors=[{LINK_ENCODER!r}]"
+                f"learning the offsets of {len(joints)} joints needs their links measured; make the"
+                f" environment with sensors=[{LINK_ENCODER!r}]"
             )
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        link = np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
+        link = (
+            np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
+        )
         return asked[:, self._reference] - link
 
     @override
@@ -142,4 +162,6 @@ class JointSignals(LearnedSignals):
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
     """Signals that are learned of a robot."""
-    return WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)
+    return (
+        WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)
+    )

@@ -1,7 +1,8 @@
 """Learned offsets of `iterative` as a folder: `iterative.json` and `offsets.safetensors`.
 
-The table has a row for every control step of the motion and a column for every learned signal, in SI units. Loading it
-runs no code from it. It plays in an environment of the same robot, motion and control period alone.
+The table has a row for every control step of the motion and a column for every learned signal, in
+SI units. Loading it runs no code from it. It plays in an environment of the same robot, motion and
+control period alone.
 """
 
 from pathlib import Path
@@ -36,7 +37,8 @@ class TableDescription(Model):
     """Learned signals with their unit, one per column."""
     motion: dict[str, Any]
     """Gait or reference, which has to be that of the environment."""
-    control_period_s: float = quantity("s", gt=0, description="time between rows")
+    control_period_s: float = quantity("s", gt=0)
+    """Time between rows [s]."""
     scenario: Title
     """That it was learned in."""
     training: dict[str, Any] = {}
@@ -79,8 +81,8 @@ def read_table_description(folder: Path) -> TableDescription:
         TableDescription,
         what="table",
         missing=lambda why: (
-            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed ({why}), "
-            "as `elastic iterate` writes it"
+            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed"
+            f" ({why}), as `elastic iterate` writes it"
         ),
         within=folder,
     )
@@ -95,7 +97,9 @@ def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
     description = read_table_description(folder)
     tensors, _ = read_tensors(folder / OFFSETS)
     if set(tensors) != {_TENSOR}:
-        raise ConfigurationError(f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {shown(sorted(tensors))}")
+        raise ConfigurationError(
+            f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {shown(sorted(tensors))}"
+        )
     table = np.asarray(tensors[_TENSOR], dtype=np.float64)
     try:
         _require_table(description, table)
@@ -108,7 +112,9 @@ def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
 def _require_table(description: TableDescription, table: Array) -> None:
     k = len(description.signals)
     if table.ndim != 2 or table.shape[1] != k or len(table) < 2:
-        raise ConfigurationError(f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}")
+        raise ConfigurationError(
+            f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}"
+        )
     if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST:
         raise ConfigurationError(f"offsets must be finite and within ±{_LARGEST:g} rad or m")
 
@@ -123,13 +129,15 @@ def _require_same(folder: Path, description: TableDescription, table: Array, env
     )
     for what, learned, given in pairs:
         if learned != given:
-            raise ConfigurationError(f"{folder} was learned with the {what} {learned!r}, the environment has {given!r}")
+            raise ConfigurationError(
+                f"{folder} was learned with the {what} {learned!r}, the environment has {given!r}"
+            )
     motion = motion_of(env)
     for key in {**motion, **description.motion}:
         learned = description.motion.get(key)
         given = motion.get(key)
         if learned != given:
             raise ConfigurationError(
-                f"{folder} was learned for a motion with {key} {shown(learned)}, the environment has {shown(given)}; "
-                "learn it anew: offsets of one motion are wrong in another"
+                f"{folder} was learned for a motion with {key} {shown(learned)}, the environment"
+                f" has {shown(given)}; learn it anew: offsets of one motion are wrong in another"
             )

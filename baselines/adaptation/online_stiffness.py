@@ -1,10 +1,12 @@
-"""A compensated policy whose model of the joints is corrected while the robot walks, as adaptive control does.
+"""A compensated policy whose model of the joints is corrected while the robot walks, as adaptive
+control does.
 
 The deflection that is compensated, and seen, is (1 + r) times that of the model. An estimator of
-`baselines.adaptation.estimators` says r every tenth of a second, and a first-order filter smooths it: the command must
-change more slowly than what it is estimated from [Spong1995].
+`baselines.adaptation.estimators` says r every tenth of a second, and a first-order filter smooths
+it: the command must change more slowly than what it is estimated from [Spong1995].
 
-[Spong1995] M. W. Spong, "Adaptive Control of Flexible Joint Manipulators: Comments on Two Papers", Automatica 31(4).
+[Spong1995] M. W. Spong, "Adaptive Control of Flexible Joint Manipulators: Comments on Two Papers",
+Automatica 31(4).
 """
 
 from typing import Any, NamedTuple
@@ -22,9 +24,12 @@ from elastic_env.world.robot_model import RobotModel
 class AdaptationGains(Model):
     """How fast the model of the joints is corrected."""
 
-    period_s: float = quantity("s", 0.1, gt=0, description="time between two estimates")
-    filter_s: float = quantity("s", 0.08, gt=0, description="time constant of the correction's filter")
-    limit: float = quantity("1", 1.0, gt=0, lt=10, description="largest correction of the deflection")
+    period_s: float = quantity("s", 0.1, gt=0)
+    """Time between two estimates [s]."""
+    filter_s: float = quantity("s", 0.08, gt=0)
+    """Time constant of the correction's filter [s]."""
+    limit: float = quantity("1", 1.0, gt=0, lt=10)
+    """Largest correction of the deflection [1]."""
 
 
 class StiffnessMemory(NamedTuple):
@@ -46,7 +51,8 @@ class StiffnessMemory(NamedTuple):
 
 
 class OnlineStiffness(PolicyAround):
-    """A compensated policy whose model of the joints is corrected by what is measured, see the module.
+    """A compensated policy whose model of the joints is corrected by what is measured, see the
+    module.
 
     Args:
         policy: The policy that is corrected; it has the input `deflection`.
@@ -56,7 +62,11 @@ class OnlineStiffness(PolicyAround):
     """
 
     def __init__(
-        self, policy: Policy, model: RobotModel, estimator: Estimator, gains: AdaptationGains | None = None
+        self,
+        policy: Policy,
+        model: RobotModel,
+        estimator: Estimator,
+        gains: AdaptationGains | None = None,
     ) -> None:
         super().__init__(policy, model.observation_table, model.control_period_s)
         gains = gains or AdaptationGains()
@@ -69,10 +79,14 @@ class OnlineStiffness(PolicyAround):
     def begin(self, rows: Array) -> StiffnessMemory:
         wait = np.zeros(len(rows), dtype=np.int64)
         zero = np.zeros((len(rows), self.view.num_joints))
-        return StiffnessMemory(wait, zero, zero, self._estimator.begin(len(rows)), self.policy.begin(rows))
+        return StiffnessMemory(
+            wait, zero, zero, self._estimator.begin(len(rows)), self.policy.begin(rows)
+        )
 
     @override
-    def act(self, rows: Array, memory: StiffnessMemory, inputs: PolicyInputs) -> tuple[Array, StiffnessMemory]:
+    def act(
+        self, rows: Array, memory: StiffnessMemory, inputs: PolicyInputs
+    ) -> tuple[Array, StiffnessMemory]:
         """The input `deflection` r' comes on top, (1 + r) (1 + r') δ."""
         wait = memory.wait - 1
         target = memory.target

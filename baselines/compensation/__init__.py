@@ -1,1 +1,3 @@
-"""The analytic compensators: gravity torque, output and input compensation (Eqs. 1 to 6), the oracle."""
+"""The analytic compensators: gravity torque, output and input compensation (Eqs. 1 to 6), the
+oracle.
+"""

@@ -42,17 +42,19 @@ class CompensatedMemory(NamedTuple):
 class Compensated(PolicyAround):
     """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
 
-    The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
-    angle and rate where the observation has the encoder's; the compensator's offset for q_d is added to its action.
-    The compensation grows from zero in the first `ramp_s` of an episode, while the reference stands.
+    The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees
+    the estimated link angle and rate where the observation has the encoder's; the compensator's
+    offset for q_d is added to its action. The compensation grows from zero in the first `ramp_s` of
+    an episode, while the reference stands.
 
     Args:
-        policy: Anything with `predict`; its state may be anything. One that does not read joint rates can say so by an
-            attribute `reads_rates = False`, which saves their estimate.
-        compensator: Where the motor has to lead, and where the link is: an object with the attributes and methods of
-            `baselines.compensation.compensators.Compensator`.
+        policy: Anything with `predict`; its state may be anything. One that does not read joint
+            rates can say so by an attribute `reads_rates = False`, which saves their estimate.
+        compensator: Where the motor has to lead, and where the link is: an object with the
+            attributes and methods of `baselines.compensation.compensators.Compensator`.
         ramp_s: Duration of the ramp.
-        corrects_policy: Whether the input `deflection` also reaches the policy, as one that winds springs needs it.
+        corrects_policy: Whether the input `deflection` also reaches the policy, as one that winds
+            springs needs it.
     """
 
     def __init__(
@@ -85,7 +87,9 @@ class Compensated(PolicyAround):
         return CompensatedMemory(steps, motion.q.copy(), memory, self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs) -> tuple[Array, CompensatedMemory]:
+    def act(
+        self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs
+    ) -> tuple[Array, CompensatedMemory]:
         """It takes the input `deflection`, r: what is compensated, and seen, is (1 + r) δ.
 
         The contact forces that load the joints act where the inputs shift the ZMP.
@@ -102,11 +106,19 @@ class Compensated(PolicyAround):
             links = links - compensator.modelled * correction * (theta - links)
             if not self._corrects_policy:
                 inputs = inputs._replace(deflection=None)
-        rates = compensator.link_rate(theta, self.view.theta_dot(rows)) if self.policy.reads_rates else None
-        action, inner = self.policy.act(self.view.with_links(rows, links, rates), memory.inner, inputs)
+        rates = (
+            compensator.link_rate(theta, self.view.theta_dot(rows))
+            if self.policy.reads_rates
+            else None
+        )
+        action, inner = self.policy.act(
+            self.view.with_links(rows, links, rates), memory.inner, inputs
+        )
         wanted = action.astype(np.float64)
         motion = self.view.motion(rows)
-        offset, own = compensator.offset(Motion(motion.q + wanted, motion.q_dot, motion.q_ddot), own)
+        offset, own = compensator.offset(
+            Motion(motion.q + wanted, motion.q_dot, motion.q_ddot), own
+        )
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, own)
         steps = memory.steps + 1

@@ -1,7 +1,9 @@
-r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and from the full joint torque.
+r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and from the full joint
+torque.
 
-An input compensator says by how much the motor side has to lead so that the link is where it should be; an output
-compensator says where the link is when the motor encoder shows θ. All work on (..., n) arrays.
+An input compensator says by how much the motor side has to lead so that the link is where it should
+be; an output compensator says where the link is when the motor encoder shows θ. All work on (...,
+n) arrays.
 
 [Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 """
@@ -32,8 +34,11 @@ from elastic_env.world.robot_model import RobotModel
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 
 
-def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0) -> Array:
-    r"""Eq. 9, θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way: the offset that brings the link to θ_d.
+def input_offset(
+    q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0
+) -> Array:
+    r"""Eq. 9, θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way: the offset that
+    brings the link to θ_d.
 
     .. math:: u - q = \left(K^{-1} + k_p^{-1}\right) \tau_g(q)
 
@@ -41,7 +46,8 @@ def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel, serv
         q_desired: Link angle to reach, θ_d, (..., n) [rad].
         stiffness: K, (n,) [N·m/rad].
         gravity: τ_g of the assumed model.
-        servo_compliance: 1/k_p of servos without an integrator, 0 of servos that hold their angle [rad/(N·m)].
+        servo_compliance: 1/k_p of servos without an integrator, 0 of servos that hold their angle
+            [rad/(N·m)].
 
     Returns:
         (..., n) [rad].
@@ -72,19 +78,24 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
 
 
 def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
-    """Eq. 10 solved by Newton-Raphson from q = θ; arguments and errors as `taylor_link_angle`, residual below 1e-12."""
+    """Eq. 10 solved by Newton-Raphson from q = θ; arguments and errors as `taylor_link_angle`,
+    residual below 1e-12.
+    """
     return static_link_angle(theta, stiffness, gravity.gravity_torque, gravity.gravity_gradient)
 
 
 class Compensator(Protocol):
-    """An input offset for a motion, and a link angle for an encoder angle: what `baselines.Compensated` needs.
+    """An input offset for a motion, and a link angle for an encoder angle: what
+    `baselines.Compensated` needs.
 
     `memory` has one row per world: an array, or a named tuple of arrays.
     """
 
     model: RobotModel
     modelled: float | Array = 1.0
-    """1 where its link angles follow from the model, 0 where sensors show them; a number, or (n,) [1]."""
+    """1 where its link angles follow from the model, 0 where sensors show them; a number, or
+    (n,) [1].
+    """
 
     @abstractmethod
     def at(self, rows: Array) -> "Compensator":
@@ -96,11 +107,15 @@ class Compensator(Protocol):
 
     @abstractmethod
     def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
-        """Command offset for the coming control period, (num_worlds, n) [rad], and the new memory."""
+        """Command offset for the coming control period, (num_worlds, n) [rad], and the new
+        memory.
+        """
 
     @abstractmethod
     def deflection(self, offset: Array, memory: Any) -> Array:
-        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n) [rad]."""
+        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n)
+        [rad].
+        """
 
     @abstractmethod
     def link_angle(self, theta: Array, memory: Any) -> Array:
@@ -116,15 +131,21 @@ class GravityCompensator(Compensator):
 
     Args:
         model: Assumed robot.
-        output: "taylor" for Eq. 12, "newton" for Eq. 10, "wrench" for Eq. 12 with the torque of the measured foot
-            wrenches (walker), "none" to leave the encoder as it is.
+        output: "taylor" for Eq. 12, "newton" for Eq. 10, "wrench" for Eq. 12 with the torque of the
+            measured foot wrenches (walker), "none" to leave the encoder as it is.
         method: How the gravity torque is computed; None for the robot's default.
 
     Raises:
-        ConfigurationError: Unknown output method or gravity method, or one that the robot does not have.
+        ConfigurationError: Unknown output method or gravity method, or one that the robot does not
+            have.
     """
 
-    def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
+    def __init__(
+        self,
+        model: RobotModel,
+        output: OutputMethod = "taylor",
+        method: GravityMethod | None = None,
+    ) -> None:
         require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
         self.stiffness = model.stiffness
@@ -170,7 +191,9 @@ class GravityCompensator(Compensator):
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """The derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇, at the estimated link angle, (num_worlds, n) [rad/s]."""
+        """The derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇, at the estimated link angle,
+        (num_worlds, n) [rad/s].
+        """
         if self._output == "none":
             return theta_dot
         q = self.link_angle(theta)
@@ -196,9 +219,10 @@ class DriveMemory(NamedTuple):
 class DynamicCompensator(Compensator):
     r"""Deflection from the full joint torque of the motion, and the inverse of the servo.
 
-    The link's inverse dynamics give τ_J; the transmission with its damping, K δ + D δ̇ = τ_J, gives δ; the rotor and the
-    servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e that the motion θ = q + δ needs. The command is
-    θ + e, taken at the middle of the control period over which it is held.
+    The link's inverse dynamics give τ_J; the transmission with its damping, K δ + D δ̇ = τ_J, gives
+    δ; the rotor and the servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e that
+    the motion θ = q + δ needs. The command is θ + e, taken at the middle of the control period over
+    which it is held.
 
     Args:
         model: Assumed robot, with a servo on every joint.
@@ -256,11 +280,15 @@ class DynamicCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: DriveMemory) -> tuple[Array, DriveMemory]:
-        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the memory for the next step.
+        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the memory for the
+        next step.
 
         The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
         """
-        torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot) + self._viscous * motion.q_dot
+        torque = (
+            self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
+            + self._viscous * motion.q_dot
+        )
         friction = memory.friction
         if self._coulomb is not None:
             friction = presliding_friction(friction, motion.q_dot * self._dt, self._coulomb)
@@ -270,7 +298,9 @@ class DynamicCompensator(Compensator):
         rate = (deflection - memory.deflection) / self._dt
         theta_dot = motion.q_dot + rate
         theta_ddot = motion.q_ddot + (rate - memory.rate) / self._dt
-        error, windup = servo_error(theta_dot, theta_ddot, torque, memory.windup, self._drives, self._dt)
+        error, windup = servo_error(
+            theta_dot, theta_ddot, torque, memory.windup, self._drives, self._dt
+        )
         offset = deflection + error - 0.5 * self._dt * theta_dot  # it is held too early
         return offset, DriveMemory(deflection, rate, windup, friction)
 
@@ -281,7 +311,9 @@ class DynamicCompensator(Compensator):
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
-        """Link angle by the deflection of the desired motion, or by the measured wrenches, (num_worlds, n) [rad]."""
+        """Link angle by the deflection of the desired motion, or by the measured wrenches,
+        (num_worlds, n) [rad].
+        """
         return self._static.link_angle(theta) if self._measures else theta - memory.deflection
 
     @override
@@ -300,7 +332,9 @@ DRIVE = record_type(
 
 
 @compiled
-def settle(deflection: Array, target: Array, stiffness: Array, drives: Any, period_s: float) -> Array:
+def settle(
+    deflection: Array, target: Array, stiffness: Array, drives: Any, period_s: float
+) -> Array:
     """Deflections after a control period in which the dampers let them settle, (worlds, n) [rad].
 
     Args:
@@ -314,7 +348,9 @@ def settle(deflection: Array, target: Array, stiffness: Array, drives: Any, peri
     for world in range(len(target)):
         K = stiffness[min(world, len(stiffness) - 1)]
         for i in range(len(drives)):
-            settled[world, i] = follow_lag(deflection[world, i], target[world, i], drives[i].damping / K[i], period_s)
+            settled[world, i] = follow_lag(
+                deflection[world, i], target[world, i], drives[i].damping / K[i], period_s
+            )
     return settled
 
 
@@ -322,7 +358,8 @@ def settle(deflection: Array, target: Array, stiffness: Array, drives: Any, peri
 def servo_error(
     theta_dot: Array, theta_ddot: Array, torque: Array, windup: Array, drives: Any, period_s: float
 ) -> tuple[Array, Array]:
-    """Errors that servos need to move rotors under their loads, [rad], and their integrals after a control period.
+    """Errors that servos need to move rotors under their loads, [rad], and their integrals after a
+    control period.
 
     Args:
         theta_dot: Rates of the motor sides, (worlds, n) [rad/s].
@@ -341,14 +378,20 @@ def servo_error(
             effort += drive.velocity_gain * theta_dot[world, i]
             if drive.integral_gain > 0.0:  # k_p e + k_i ∫e = effort
                 time_s = drive.position_gain / drive.integral_gain
-                integrals[world, i] = follow_lag(windup[world, i], effort / drive.integral_gain, time_s, period_s)
-            errors[world, i] = (effort - drive.integral_gain * integrals[world, i]) / drive.position_gain
+                integrals[world, i] = follow_lag(
+                    windup[world, i], effort / drive.integral_gain, time_s, period_s
+                )
+            errors[world, i] = (
+                effort - drive.integral_gain * integrals[world, i]
+            ) / drive.position_gain
     return errors, integrals
 
 
 @compiled
 def follow_lag(state: float, target: float, time_constant_s: float, period_s: float) -> float:
-    """State of a first-order lag after one period towards a constant target; no lag for a time constant of zero."""
+    """State of a first-order lag after one period towards a constant target; no lag for a time
+    constant of zero.
+    """
     return target + math.exp(-period_s / time_constant_s) * (state - target)
 
 
@@ -357,7 +400,8 @@ PRESLIDING_RAD = 1e-3
 
 
 def presliding_friction(friction: Array, displacement: Array, coulomb: Array) -> Array:
-    r"""Coulomb friction with presliding: it turns round over a displacement, and stays at rest [Dahl1968].
+    r"""Coulomb friction with presliding: it turns round over a displacement, and stays at rest
+    [Dahl1968].
 
     .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
 

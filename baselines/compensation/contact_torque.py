@@ -1,7 +1,8 @@
-r"""Joint torques of a walker at rest on its feet: Eqs. 4 to 6 of the paper, and from measured foot wrenches.
+r"""Joint torques of a walker at rest on its feet: Eqs. 4 to 6 of the paper, and from measured foot
+wrenches.
 
-The paper takes τ_g = J_r^T F_r + J_l^T F_l with Jacobians from the center of mass to the contact points. Where the
-contact point is, and what of the robot has mass, is chosen by name:
+The paper takes τ_g = J_r^T F_r + J_l^T F_l with Jacobians from the center of mass to the contact
+points. Where the contact point is, and what of the robot has mass, is chosen by name:
 
 | name | contact | masses |
 |---|---|---|
@@ -10,7 +11,7 @@ contact point is, and what of the robot has mass, is chosen by name:
 | `lumped` | at the ankle axes | all in the pelvis; the legs weigh nothing, as in published code |
 
 In single support over its foot, `com` is the exact multibody torque.
-"""
+"""  # noqa: E501
 
 import math
 from typing import Any, Literal, NamedTuple
@@ -61,11 +62,15 @@ class LegTorque:
         return torque
 
     def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns with its foot."""
+        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns
+        with its foot.
+        """
         return _block_diagonal(self.gradient_by_leg(q))
 
     def gradient_by_leg(self, q: Array) -> Array:
-        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
+        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6)
+        [N·m/rad].
+        """
         legs = _by_leg(q)
         gradient = np.empty((*legs.shape, _PER_LEG))
         gradients(self._chains.legs, self._loads, legs, gradient)
@@ -92,7 +97,9 @@ class LegTorque:
         if not solutions(self._chains.legs, self._loads, legs, K, given, _by_leg(x)):
             torque = self.gravity_torque(q) if torque is None else torque
             # says so if it is singular
-            solve_stiffness(np.broadcast_to(K, legs.shape), self.gradient_by_leg(q), _by_leg(torque))
+            solve_stiffness(
+                np.broadcast_to(K, legs.shape), self.gradient_by_leg(q), _by_leg(torque)
+            )
         return x
 
 
@@ -136,7 +143,9 @@ class ContactGravity:
         return self.level_and_tilted(rows)[0 if level else 1]
 
     def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
-        """The gravity torques of `at` with a level pelvis, and with one that is tilted as the IMU says."""
+        """The gravity torques of `at` with a level pelvis, and with one that is tilted as the
+        IMU says.
+        """
         level = np.empty(len(rows), LOADS)
         tilted = np.empty(len(rows), LOADS)
         planned_loads(self._view.fields(rows), contact=self._contact, level=level, tilted=tilted)
@@ -144,7 +153,8 @@ class ContactGravity:
 
 
 class WrenchTorque:
-    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs above the sensors.
+    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs above
+    the sensors.
 
     Args:
         model: Assumed walker.
@@ -156,14 +166,17 @@ class WrenchTorque:
         self._gravity = model.biped.gravity
 
     def at(self, rows: Array, level: bool = False) -> LegTorque:
-        """The torque under the wrenches of observations, (num_worlds, m); `level` as in `ContactGravity.at`."""
+        """The torque under the wrenches of observations, (num_worlds, m); `level` as in
+        `ContactGravity.at`.
+        """
         loads = np.empty(len(rows), LOADS)
         measured_loads(self._view.fields(rows), gravity=self._gravity, is_level=level, loads=loads)
         return LegTorque(self._chains, loads)
 
 
 class PlannedTorque:
-    """Torque of the planned motion by inverse dynamics, and the static torque of what is commanded beside it.
+    """Torque of the planned motion by inverse dynamics, and the static torque of what is commanded
+    beside it.
 
     Args:
         model: Assumed walker.
@@ -177,11 +190,15 @@ class PlannedTorque:
         self._reference = model.observation_table.group("reference_angle")
 
     def at(self, rows: Array, gravity: LegTorque | None = None) -> "BoundPlannedTorque":
-        """The torque at the control steps of observations, (num_worlds, m); `gravity` is the static one, if known."""
+        """The torque at the control steps of observations, (num_worlds, m); `gravity` is the
+        static one, if known.
+        """
         plan = self._model.plan
         row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
         torque = plan.torque.take(row, axis=0, mode="clip")
-        return BoundPlannedTorque(torque, rows[:, self._reference], gravity or self._gravity.at(rows))
+        return BoundPlannedTorque(
+            torque, rows[:, self._reference], gravity or self._gravity.at(rows)
+        )
 
 
 class BoundPlannedTorque(NamedTuple):
@@ -191,9 +208,11 @@ class BoundPlannedTorque(NamedTuple):
     q_ref: Array
     gravity: LegTorque
 
-    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  the interface's
+    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
         """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
-        return self.torque + (self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref))
+        return self.torque + (
+            self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
+        )
 
 
 def _block_diagonal(blocks: Array) -> Array:
@@ -224,7 +243,9 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
         share = plan.load_share
         for foot in range(2):
             weight = share if foot == 1 else 1.0 - share
-            load.mass[foot] = -ground.mass * weight  # what the ground carries is a negative mass where it does
+            load.mass[foot] = (
+                -ground.mass * weight
+            )  # what the ground carries is a negative mass where it does
             for i in range(2):
                 middle = (1.0 - share) * ground.footholds[0, i] + share * ground.footholds[1, i]
                 load.point[foot, i] = plan.zmp_reference[i] - middle if ground.is_at_zmp else 0.0
@@ -272,7 +293,11 @@ def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
 def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> tuple[float, float, float]:
     """Gravity in the frame of a tilted pelvis [m/s²]."""
     cosine = math.cos(pitch)
-    return gravity * math.sin(pitch), -gravity * (cosine * math.sin(roll)), -gravity * (cosine * math.cos(roll))
+    return (
+        gravity * math.sin(pitch),
+        -gravity * (cosine * math.sin(roll)),
+        -gravity * (cosine * math.cos(roll)),
+    )
 
 
 @compiled
@@ -292,8 +317,11 @@ def shift_plan(observed: Any, shift: Array, spacing: float) -> None:
 
 
 @compiled
-def shifted_shares(observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array) -> None:
-    """Load shares of the right foot at the end of the last control period, under a ZMP that is shifted.
+def shifted_shares(
+    observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array
+) -> None:
+    """Load shares of the right foot at the end of the last control period, under a ZMP that is
+    shifted.
 
     Args:
         observed: Observations, rows with fields, (n,).
@@ -304,7 +332,9 @@ def shifted_shares(observed: Any, planned: Array, period_s: float, shift: Array,
         found: To be filled, (n,).
     """
     for world in range(len(found)):
-        row = int(min(max(np.rint(observed[world].clock[0] / period_s) - 1.0, 0.0), len(planned) - 1.0))
+        row = int(
+            min(max(np.rint(observed[world].clock[0] / period_s) - 1.0, 0.0), len(planned) - 1.0)
+        )
         found[world] = shifted_share(planned[row], shift[world, 1], spacing)
 
 
@@ -312,8 +342,9 @@ def shifted_shares(observed: Any, planned: Array, period_s: float, shift: Array,
 def shifted_share(share: float, shift_y: float, spacing: float) -> float:
     """Load share of the right foot under a ZMP that is shifted to the left.
 
-    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot that stands takes
-    over, whose ankle carries the shift, so that the change fades with 4 μ (1 − μ).
+    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot
+    that stands takes over, whose ankle carries the shift, so that the change fades with 4 μ (1 −
+    μ).
 
     Args:
         share: Planned share μ.

@@ -1,7 +1,7 @@
 """Gravity torque of the assumed rigid model: what the compensators turn into a deflection.
 
-`gravity_torque(q)` and its gradient on (..., n) joint angles, for a whole batch at once: in closed form for one hinge,
-link by link for a tree of them. Both agree to rounding.
+`gravity_torque(q)` and its gradient on (..., n) joint angles, for a whole batch at once: in closed
+form for one hinge, link by link for a tree of them. Both agree to rounding.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,12 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.compensation.contact_torque import ContactGravity, ContactMethod, PlannedTorque, WrenchTorque
+from baselines.compensation.contact_torque import (
+    ContactGravity,
+    ContactMethod,
+    PlannedTorque,
+    WrenchTorque,
+)
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.rigid_body import RigidBody
@@ -32,7 +37,9 @@ class GravityModel(Protocol):
 
 
 class FixedGravity:
-    """Gravity torque of a robot that stands on nothing but its base: the same at every control step."""
+    """Gravity torque of a robot that stands on nothing but its base: the same at every control
+    step.
+    """
 
     def __init__(self, gravity: GravityModel) -> None:
         self.gravity_torque = gravity.gravity_torque
@@ -47,7 +54,11 @@ class FixedDynamics:
     """Inverse dynamics of a robot on a fixed base."""
 
     def __init__(self, model: RobotModel) -> None:
-        body = HingeTorque(model) if _is_plain_hinge(model) else TreeTorque(model.rigid, model.joint_names)
+        body = (
+            HingeTorque(model)
+            if _is_plain_hinge(model)
+            else TreeTorque(model.rigid, model.joint_names)
+        )
         self.inverse_dynamics = body.inverse_dynamics
 
     def at(self, rows: Array, gravity: Any = None) -> "FixedDynamics":  # noqa: ARG002  a walker's
@@ -56,11 +67,12 @@ class FixedDynamics:
 
 
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
-    """The gravity torque of a robot model by a chosen method; a `GravityModel` after `at(observations)`.
+    """The gravity torque of a robot model by a chosen method; a `GravityModel` after
+    `at(observations)`.
 
-    A robot on a fixed base has "hinge" (default for one joint) and "tree" (default for several), and is a
-    `GravityModel` at once; a walker has the methods of `baselines.compensation.contact_torque`:
-    "com" (default), "ankle" and "lumped".
+    A robot on a fixed base has "hinge" (default for one joint) and "tree" (default for several),
+    and is a `GravityModel` at once; a walker has the methods of
+    `baselines.compensation.contact_torque`: "com" (default), "ankle" and "lumped".
 
     Raises:
         ConfigurationError: The method does not exist, or not for this robot.
@@ -77,8 +89,8 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     require_known("gravity method", [chosen], methods)
     if chosen != "tree" and needs_more_than_gravity(model.rigid):
         raise ConfigurationError(
-            f"gravity method {chosen!r} knows gravity alone, and this model has springs of joints or gravcomp; "
-            "choose tree"
+            f"gravity method {chosen!r} knows gravity alone, and this model has springs of joints"
+            " or gravcomp; choose tree"
         )
     return FixedGravity(methods[chosen](model))
 
@@ -97,12 +109,16 @@ def make_load(model: RobotModel, output: str, gravity: Any) -> Any:
     if output != "wrench":
         return gravity
     if not isinstance(model, WalkerModel):
-        raise ConfigurationError("the output compensator 'wrench' needs a walker with force-torque sensors at its feet")
+        raise ConfigurationError(
+            "the output compensator 'wrench' needs a walker with force-torque sensors at its feet"
+        )
     return WrenchTorque(model)
 
 
 def make_dynamics(model: RobotModel, gravity: Any) -> Any:
-    """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a walker."""
+    """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a
+    walker.
+    """
     return PlannedTorque(model, gravity) if isinstance(model, WalkerModel) else FixedDynamics(model)
 
 
@@ -122,7 +138,8 @@ class HingeTorque:
         names = model.joint_names
         if len(names) != 1:
             raise ConfigurationError(
-                f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}; choose tree"
+                f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)};"
+                " choose tree"
             )
         body = RigidBody(model.rigid, names)
         zero = np.zeros(1)
@@ -138,6 +155,8 @@ class HingeTorque:
         """∂τ_g/∂q, (..., 1) [rad] to (..., 1, 1) [N·m/rad]."""
         return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
 
-    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  as of a `RigidBody`
-        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to (..., 1) [N·m]."""
+    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
+        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to (...,
+        1) [N·m].
+        """
         return self._inertia * q_ddot + self.gravity_torque(q)

@@ -1,8 +1,10 @@
-"""Named inputs of a base policy: the quantities of its own in which something outside, such as a residual, may act.
+"""Named inputs of a base policy: the quantities of its own in which something outside, such as a
+residual, may act.
 
-Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the base to the last
-bit. An input acts on the quantity that the base itself plans or feeds back, so that its feedback does not work against
-it: a policy that is told to shift its center of mass also expects it there.
+Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the
+base to the last bit. An input acts on the quantity that the base itself plans or feeds back, so
+that its feedback does not work against it: a policy that is told to shift its center of mass also
+expects it there.
 
 Columns per joint are in the order of the robot's joints. Axes: x forward, y to the left.
 """
@@ -26,7 +28,8 @@ class InputKind:
         unit, meaning: In words.
         default: Bound where none is given.
         limit: Every bound must be below it.
-        axes: Columns that are no joints, and what each is in the mirror; none for an input with a column per joint.
+        axes: Columns that are no joints, and what each is in the mirror; none for an input with a
+            column per joint.
     """
 
     unit: str
@@ -45,15 +48,29 @@ _TILT: Mapping[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
 
 INPUTS: Mapping[str, InputKind] = {
     COMMAND: InputKind("rad", "offset of the command", default=0.02, limit=1e3),
-    DEFLECTION: InputKind("1", "relative change of the deflection that is compensated", default=0.6, limit=1e3),
-    "zmp": InputKind("m", "shift of the planned ZMP", default=0.02, limit=0.05, axes=_PLANE),
-    "com": InputKind("m", "shift of the planned center of mass", default=0.02, limit=0.05, axes=_PLANE),
-    "leg_length": InputKind(
-        "m", "left less right leg length", default=0.005, limit=0.05, axes={"difference": "opposite"}
+    DEFLECTION: InputKind(
+        "1", "relative change of the deflection that is compensated", default=0.6, limit=1e3
     ),
-    "hip": InputKind("rad", "offset of both hip rolls, of both hip pitches", default=0.02, limit=0.2, axes=_TILT),
+    "zmp": InputKind("m", "shift of the planned ZMP", default=0.02, limit=0.05, axes=_PLANE),
+    "com": InputKind(
+        "m", "shift of the planned center of mass", default=0.02, limit=0.05, axes=_PLANE
+    ),
+    "leg_length": InputKind(
+        "m",
+        "left less right leg length",
+        default=0.005,
+        limit=0.05,
+        axes={"difference": "opposite"},
+    ),
+    "hip": InputKind(
+        "rad", "offset of both hip rolls, of both hip pitches", default=0.02, limit=0.2, axes=_TILT
+    ),
     "posture_gain": InputKind(
-        "1", "relative change of the posture feedback's gains", default=0.5, limit=1.0, axes={"all": "same"}
+        "1",
+        "relative change of the posture feedback's gains",
+        default=0.5,
+        limit=1.0,
+        axes={"all": "same"},
     ),
     "balance_gain": InputKind(
         "1",
@@ -63,19 +80,29 @@ INPUTS: Mapping[str, InputKind] = {
         axes={"all": "same"},
     ),
 }
-"""All inputs by name. Every policy has `command`; a policy's `inputs` names the others that it has."""
+"""All inputs by name.
+
+Every policy has `command`; a policy's `inputs` names the others that it has.
+"""
 
 
 def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
     """The columns of an input as signals, which say what each is in the mirror."""
     kind = INPUTS[name]
     if kind.axes is not None:
-        return tuple(Signal(f"{name}.{axis}", kind.unit, kind.meaning, mirrored=m) for axis, m in kind.axes.items())
-    signs: list[Mirrored | None] = ["same"] * len(model.joint_names)  # a relative change has no direction
+        return tuple(
+            Signal(f"{name}.{axis}", kind.unit, kind.meaning, mirrored=m)
+            for axis, m in kind.axes.items()
+        )
+    signs: list[Mirrored | None] = ["same"] * len(
+        model.joint_names
+    )  # a relative change has no direction
     if name == COMMAND:
         signs = [signal.mirrored for signal in model.observation_table.signals_of("last_command")]
     named = zip(model.joint_names, signs, strict=True)
-    return tuple(Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named)
+    return tuple(
+        Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named
+    )
 
 
 def inputs_of(policy: Any) -> tuple[str, ...]:

@@ -5,10 +5,11 @@ r"""Links that sensors show, in the place of an output compensator.
 | joint torque sensors | :math:`\delta = K^{-1} \tau_J` with the assumed K, whatever the load | [7], [12] of the paper |
 | link encoders | :math:`\delta = \theta - q`, whatever K and load | [10] of the paper, at the hips alone |
 
-A policy sees θ − δ at once. The command must not lead by the measured δ at once: where both feet stand, the legs form a
-closed chain, and δ follows the command by as much as the command changes. The command leads by the model's deflection
-instead, which `baselines.adaptation` corrects slowly by what is measured.
-"""
+A policy sees θ − δ at once. The command must not lead by the measured δ at once: where both feet
+stand, the legs form a closed chain, and δ follows the command by as much as the command changes.
+The command leads by the model's deflection instead, which `baselines.adaptation` corrects slowly by
+what is measured.
+"""  # noqa: E501
 
 from typing import Any
 
@@ -38,7 +39,8 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
         raise ConfigurationError(
-            f"this policy reads {sensor}, which the environment does not have; make it with sensors=[{sensor!r}]"
+            f"this policy reads {sensor}, which the environment does not have; make it with"
+            f" sensors=[{sensor!r}]"
         )
 
 
@@ -65,13 +67,17 @@ class DeflectionSensors:
         self._is_torque = sensor == TORQUE_SENSOR
         self._columns = table.group(sensor)
         self._encoder = table.group("encoder_angle")
-        self.has: BoolArray = np.array([any(part in name for part in joints) for name in model.joint_names])
+        self.has: BoolArray = np.array(
+            [any(part in name for part in joints) for name in model.joint_names]
+        )
         self.modelled: Array = np.where(self.has & (sensor == LINK_ENCODER), 0.0, 1.0)
 
     def deflection(self, rows: Array) -> Array:
         """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
         shown = rows[:, self._columns]
-        return self.has * (shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown)
+        return self.has * (
+            shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown
+        )
 
 
 class MeasuredCompensator(Compensator):

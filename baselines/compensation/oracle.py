@@ -34,15 +34,17 @@ class OracleMemory(NamedTuple):
 class Oracle(PolicyAround):
     """Perfect sensing and a perfect model: the only policy that may read the truth.
 
-    The dynamic compensator with the true parameters around a policy that sees the true link angles; on the testbed also
-    an integrator on the true link error for what is left, with a gain below the damping of the link's resonance.
+    The dynamic compensator with the true parameters around a policy that sees the true link angles;
+    on the testbed also an integrator on the true link error for what is left, with a gain below the
+    damping of the link's resonance.
 
     Args:
         env: The environment itself, scalar or vector.
         policy: What is compensated: on the walker its controller.
         ramp_s: Time in which the compensation grows from zero [s].
         friction: Whether the compensator knows the friction; not where the policy does.
-        integral_gain: Gain on the true link error [1/s]; 0 where the policy moves links off the reference on purpose.
+        integral_gain: Gain on the true link error [1/s]; 0 where the policy moves links off the
+            reference on purpose.
     """
 
     integral_limit = 0.05
@@ -83,12 +85,16 @@ class Oracle(PolicyAround):
         )
 
     @override
-    def act(self, rows: Array, memory: OracleMemory, inputs: PolicyInputs) -> tuple[Array, OracleMemory]:
+    def act(
+        self, rows: Array, memory: OracleMemory, inputs: PolicyInputs
+    ) -> tuple[Array, OracleMemory]:
         """The observation must be the environment's present one."""
         self._require_present(rows)
         truth = self._env.truth()
         motion = self.view.motion(rows)
-        wanted, inner = self.policy.act(self.view.with_links(rows, truth.q, truth.q_dot), memory.inner, inputs)
+        wanted, inner = self.policy.act(
+            self.view.with_links(rows, truth.q, truth.q_dot), memory.inner, inputs
+        )
         error = np.where(self._ramp.is_over(memory.steps), memory.target - truth.q, 0.0)
         correction = memory.correction + self.integral_gain * self._dt * error
         correction = np.clip(correction, -self.integral_limit, self.integral_limit)
@@ -97,7 +103,9 @@ class Oracle(PolicyAround):
         offset, own = compensator.offset(desired, memory.compensator)
         steps = memory.steps + 1
         action = wanted + self._ramp.table.take(steps, mode="clip") * offset + correction
-        return action.astype(np.float32), OracleMemory(steps, correction, motion.q.copy(), own, inner)
+        return action.astype(np.float32), OracleMemory(
+            steps, correction, motion.q.copy(), own, inner
+        )
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:
@@ -107,6 +115,7 @@ class Oracle(PolicyAround):
     def _require_present(self, rows: Array) -> None:
         if not np.array_equal(rows, np.atleast_2d(self._env.task.observe())):
             raise ElasticError(
-                "the oracle reads the truth of the environment that it was made for, and this is not its present "
-                'observation; make one with baselines.make("oracle", env) for the environment that it is to run in'
+                "the oracle reads the truth of the environment that it was made for, and this is"
+                ' not its present observation; make one with baselines.make("oracle", env) for the'
+                " environment that it is to run in"
             )

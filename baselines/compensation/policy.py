@@ -1,11 +1,12 @@
 """Policies: what one is, the base class of ours, and what they share.
 
-Policies take observations of one world, (m,), or of many, (num_worlds, m). Those with memory keep it in `state`, one
-row per world: pass the returned state back, and `episode_start` where episodes begin, as Stable-Baselines3 does.
+Policies take observations of one world, (m,), or of many, (num_worlds, m). Those with memory keep
+it in `state`, one row per world: pass the returned state back, and `episode_start` where episodes
+begin, as Stable-Baselines3 does.
 
-A policy of ours computes rows: `BatchPolicy.predict` makes them once for a whole chain of policies, and each says how
-its memory begins and how it acts. Memory is a named tuple of arrays with one row per world; the memory of the policy
-inside it is one of its fields.
+A policy of ours computes rows: `BatchPolicy.predict` makes them once for a whole chain of policies,
+and each says how its memory begins and how it acts. Memory is a named tuple of arrays with one row
+per world; the memory of the policy inside it is one of its fields.
 """
 
 from abc import ABC, abstractmethod
@@ -28,18 +29,23 @@ class Policy(Protocol):
     """Commands the robot; a Stable-Baselines3 model is one too."""
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """Action and new state for an observation."""
         ...
 
 
 class PolicyInputs(NamedTuple):
-    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is not used.
+    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is
+    not used.
 
-    A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what each input is.
-    `command` is no field: it is added to whatever a policy commands. The last two fields tell a policy of a user how
-    `predict` was called.
+    A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what
+    each input is. `command` is no field: it is added to whatever a policy commands. The last two
+    fields tell a policy of a user how `predict` was called.
     """
 
     deflection: Array | None = None
@@ -84,7 +90,9 @@ class BatchPolicy(ABC):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs that it has beside `command`: its own, and those of the policies inside it."""
+        """Names of the inputs that it has beside `command`: its own, and those of the policies
+        inside it.
+        """
         return ()
 
     def predict(
@@ -118,7 +126,8 @@ class BatchPolicy(ABC):
         return as_action(action, is_single), memory
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw in the place of an observation's encoders, (..., n) [rad].
+        """Link angles that the policy saw in the place of an observation's encoders, (..., n)
+        [rad].
 
         Args:
             observation: As in `predict`.
@@ -145,8 +154,10 @@ class BatchPolicy(ABC):
             inputs: Values of its inputs.
         """
 
-    def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002  for those that estimate
-        """`link_estimate` of rows, (num_worlds, n) [rad]: the encoder angles of a policy that estimates nothing."""
+    def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002
+        """`link_estimate` of rows, (num_worlds, n) [rad]: the encoder angles of a policy that
+        estimates nothing.
+        """
         return self.view.theta(rows)
 
 
@@ -190,7 +201,9 @@ class Zero(BatchPolicy):
         deterministic: bool = True,
         inputs: PolicyInputs = NO_INPUTS,
     ) -> tuple[Action, Any]:
-        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of it."""
+        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of
+        it.
+        """
         return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
 
     @override
@@ -207,7 +220,8 @@ class UserMemory(NamedTuple):
 
     Attributes:
         has_begun: Worlds whose episode has begun before, (num_worlds,).
-        state: Its state in a list of one. The policy itself begins it afresh, where we tell it that an episode starts.
+        state: Its state in a list of one. The policy itself begins it afresh, where we tell it that
+            an episode starts.
     """
 
     has_begun: BoolArray
@@ -227,9 +241,14 @@ class UserPolicy(BatchPolicy):
         return UserMemory(np.zeros(len(rows), dtype=np.bool_), [None])
 
     @override
-    def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> tuple[Array, UserMemory]:
+    def act(
+        self, rows: Array, memory: UserMemory, inputs: PolicyInputs
+    ) -> tuple[Array, UserMemory]:
         action, state = self._policy.predict(
-            rows[0] if inputs.is_single else rows, memory.state[0], ~memory.has_begun, inputs.deterministic
+            rows[0] if inputs.is_single else rows,
+            memory.state[0],
+            ~memory.has_begun,
+            inputs.deterministic,
         )
         offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
         return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
@@ -241,7 +260,9 @@ class UserPolicy(BatchPolicy):
 
 def as_batch_policy(policy: Any, table: SignalTable, control_period_s: float) -> BatchPolicy:
     """The policy itself if it is one of ours, else one around it."""
-    return policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, table, control_period_s)
+    return (
+        policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, table, control_period_s)
+    )
 
 
 def as_action(offsets: Array, is_single: bool) -> Action:
@@ -282,13 +303,18 @@ def count_rows(memory: Any) -> int:
 
 
 def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
-    """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor tuple stays."""
+    """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor
+    tuple stays.
+    """
     if isinstance(memory, np.ndarray):
         changed = memory.copy()
         changed[worlds] = rows
         return changed
     if isinstance(memory, tuple):
-        return _like(memory, [put_rows(part, worlds, other) for part, other in zip(memory, rows, strict=True)])
+        return _like(
+            memory,
+            [put_rows(part, worlds, other) for part, other in zip(memory, rows, strict=True)],
+        )
     return memory
 
 
@@ -341,7 +367,9 @@ class ObservationView:
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
 
     def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
-        """A copy of the observation with link angles in place of the encoders', and rates if they are given."""
+        """A copy of the observation with link angles in place of the encoders', and rates if
+        they are given.
+        """
         seen = rows.copy()
         seen[:, self._theta] = q
         if q_dot is not None:
@@ -358,8 +386,8 @@ class ObservationView:
         rows = rows[None] if rows.ndim < 2 else rows
         if rows.ndim != 2 or rows.shape[1] != self._width:
             raise ElasticError(
-                f"an observation must have the {self._width} columns of its table, one row per world, got shape "
-                f"{np.shape(observation)}"
+                f"an observation must have the {self._width} columns of its table, one row per"
+                f" world, got shape {np.shape(observation)}"
             )
         return rows
 
@@ -375,17 +403,23 @@ class ObservationView:
         """
         starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
         if not np.all(starts):
-            sign = "clock.time" if self._clock is not None else "a reference at rest, and no command yet"
+            sign = (
+                "clock.time"
+                if self._clock is not None
+                else "a reference at rest, and no command yet"
+            )
             raise ElasticError(
-                "predict() was called without `state` in what looks like the middle of an episode (a beginning is "
-                f"known by {sign}): this policy has memory; pass the state that the last call returned, "
-                "and episode_start=True where an episode begins"
+                "predict() was called without `state` in what looks like the middle of an episode"
+                f" (a beginning is known by {sign}): this policy has memory; pass the state that"
+                " the last call returned, and episode_start=True where an episode begins"
             )
 
     def is_start(self, rows: Array) -> BoolArray:
-        """True for an observation that can be the first of an episode: by its clock, or at rest without a command.
+        """True for an observation that can be the first of an episode: by its clock, or at rest
+        without a command.
 
-        Nothing is commanded where the last command is the reference, or zero, as an environment may begin with.
+        Nothing is commanded where the last command is the reference, or zero, as an environment may
+        begin with.
         """
         if self._clock is not None:
             return rows[:, self._clock][:, 0] < 1.5 * self._period_s
@@ -406,7 +440,9 @@ _GROUPS: Mapping[str, tuple[int, ...]] = {
     "load_share": (),
     "zmp_reference": (2,),
 }
-"""Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and moment, axes."""
+"""Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and
+moment, axes.
+"""
 
 
 class WalkView:

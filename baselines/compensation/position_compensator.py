@@ -4,9 +4,10 @@ The command leads the link by the deflection of its spring, and by what the serv
 
 .. math:: u = q + \left(K^{-1} + k_p^{-1}\right) \tau(q, \dot q, \ddot q)
 
-Eq. 9 is the case at rest of a servo that holds its angle. τ is the torque that the joints have to deliver: gravity,
-inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowers it. Damping and friction of the model
-are not in it. What a motor encoder shows is turned into the link angle by Eq. 10.
+Eq. 9 is the case at rest of a servo that holds its angle. τ is the torque that the joints have to
+deliver: gravity, inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowers
+it. Damping and friction of the model are not in it. What a motor encoder shows is turned into the
+link angle by Eq. 10.
 """
 
 import warnings
@@ -20,9 +21,24 @@ import numpy.typing as npt
 from scipy.linalg import get_lapack_funcs
 
 from elastic_env.core.config import read_mapping
-from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
+from elastic_env.core.errors import (
+    ActionError,
+    ConfigurationError,
+    ElasticError,
+    require_known,
+    shown,
+    unknown_name,
+)
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.joint.joint_settings import HELD, RIGID, SOFTEST, JointSettings, ServoSettings, key_of, read_joints
+from elastic_env.joint.joint_settings import (
+    HELD,
+    RIGID,
+    SOFTEST,
+    JointSettings,
+    ServoSettings,
+    key_of,
+    read_joints,
+)
 from elastic_env.joint.known_torque import (
     commanded_hinges,
     hinges_of,
@@ -36,10 +52,14 @@ from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.rigid.tree.torque import TreeTorque
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
-"""A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000, "wrist_*": 300}."""
+"""A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000,
+"wrist_*": 300}.
+"""
 
 _LAST_STEP_RAD = 1e-8
-"""A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
+"""A step below this is the last one: what it leaves is smaller by the factor with which Newton's
+steps shrink.
+"""
 _MOST_ITERATIONS = 50
 _LARGEST_STEP_RAD = 1e6
 """Steps beyond this lead nowhere."""
@@ -49,12 +69,18 @@ _LAST_RESIDUAL_RAD = 1e-12
 _SAME_RAD = 1e-6
 """Largest distance of two results that count as one equilibrium."""
 _FILES = (".yaml", ".yml")
-_HOW_TO_GIVE = "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
-_POSES, _TRIES = 500, 33
+_HOW_TO_GIVE = (
+    "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
+)
+_POSES = 500
+_TRIES = 33
 """Poses at which the weight is looked at, and angles of a joint beside the heaviest of them."""
-_JUMP_RAD, _CALM_RAD_S = 1e-3, 0.02
+_JUMP_RAD = 1e-3
+_CALM_RAD_S = 0.02
 """Jump of a command that is worth a word, and a rate of the command that is not [rad], [rad/s]."""
-_factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
+_factored, _solved = get_lapack_funcs(
+    ("getrf", "getrs")
+)  # without the checks of lu_factor, which take longer
 
 
 class PositionCompensator:
@@ -68,24 +94,28 @@ class PositionCompensator:
 
     Args:
         model: Compiled rigid model on a fixed base.
-        stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number, `rigid`, `held`, or
-            a mapping as `elastic_env.joint.joint_settings` reads it. Of such a mapping K and the servo's k_p and k_i
-            are used. Damping, friction and rotor inertia act on the way to rest alone, and backlash is refused.
-        joints: Hinges that are commanded, in the order of the arrays; None for all that are not held, in the order of
-            the model. The other joints are held where the model's first keyframe has them, or at its reference.
-        position_gain: k_p of servos that give way under a load [N·m/rad], infinite for servos that hold their angle;
-            None for what `stiffness` says of the servos. Where neither says it and the model has position actuators,
-            a warning says their k_p.
+        stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number,
+            `rigid`, `held`, or a mapping as `elastic_env.joint.joint_settings` reads it. Of such a
+            mapping K and the servo's k_p and k_i are used. Damping, friction and rotor inertia act
+            on the way to rest alone, and backlash is refused.
+        joints: Hinges that are commanded, in the order of the arrays; None for all that are not
+            held, in the order of the model. The other joints are held where the model's first
+            keyframe has them, or at its reference.
+        position_gain: k_p of servos that give way under a load [N·m/rad], infinite for servos that
+            hold their angle; None for what `stiffness` says of the servos. Where neither says it
+            and the model has position actuators, a warning says their k_p.
         limit_rad: Largest offset between command and desired angle [rad].
-        ramp_s: Time in which offsets grow from zero after the start, and in which a payload is taken over [s].
+        ramp_s: Time in which offsets grow from zero after the start, and in which a payload is
+            taken over [s].
         period_s: Time between two commands, for the ramp [s].
 
     Raises:
         ConfigurationError: The model or a value cannot be used; the message says which.
 
     Warns:
-        UserWarning: Once each: the weight needs more than `limit_rad`, a command meets a limit, a payload moves the
-            command at once, or servos of the model give way and nobody says their k_p.
+        UserWarning: Once each: the weight needs more than `limit_rad`, a command meets a limit, a
+            payload moves the command at once, or servos of the model give way and nobody says their
+            k_p.
     """
 
     def __init__(
@@ -103,10 +133,14 @@ class PositionCompensator:
         known = _known_joints(model, stiffness, joints)
         if joints is None:
             hinges = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
-            held_by_name = [] if known is None else [name for name, own in known.items() if own is None]
+            held_by_name = (
+                [] if known is None else [name for name, own in known.items() if own is None]
+            )
             joints = [name for name in hinges if name not in held_by_name]
             if not joints:
-                raise ConfigurationError(f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]")
+                raise ConfigurationError(
+                    f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]"
+                )
         self.joints = tuple(joints)
         require_known_torque(model, self.joints)
         held = _held(model, self.joints)
@@ -123,8 +157,11 @@ class PositionCompensator:
             servos = [one.servo for one in settings]
             self._compliance = 1.0 / np.array([one.stiffness for one in settings])
         _require_patterns_that_fit(position_gain, _joint_names(model))
-        self._of_command = self._compliance + 1.0 / _servo_gains(model, self.joints, servos, position_gain)
-        self._limit, self._ramp = _number("limit_rad", limit_rad, "rad"), _number("ramp_s", ramp_s, "s", least=0.0)
+        self._of_command = self._compliance + 1.0 / _servo_gains(
+            model, self.joints, servos, position_gain
+        )
+        self._limit = _number("limit_rad", limit_rad, "rad")
+        self._ramp = _number("ramp_s", ramp_s, "s", least=0.0)
         self._steps = max(int(np.ceil(self._ramp / _number("period_s", period_s, "s"))), 1)
         self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[max(at, key=lambda j: int(model.jnt_bodyid[j]))])
@@ -132,11 +169,14 @@ class PositionCompensator:
         self._warn_of_room()
 
     @classmethod
-    def from_model(cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any) -> Self:
-        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as of the class.
+    def from_model(
+        cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any
+    ) -> Self:
+        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as
+        of the class.
 
-        `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`. Hinges that such a file
-        does not name are rigid, as those are that were not identified.
+        `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
+        Hinges that such a file does not name are rigid, as those are that were not identified.
 
         Raises:
             ConfigurationError: The file or a value cannot be used.
@@ -146,7 +186,9 @@ class PositionCompensator:
         """
         compiled = compiled_model(model)
         if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
-            return cls(compiled, _of_file(compiled, Path(stiffness), options.get("joints")), **options)
+            return cls(
+                compiled, _of_file(compiled, Path(stiffness), options.get("joints")), **options
+            )
         return cls(compiled, stiffness, **options)  # type: ignore[arg-type]
 
     def reset(self) -> None:
@@ -154,14 +196,19 @@ class PositionCompensator:
         self._count = 0
         self._asked: tuple[Array, Array | None, Array | None] | None = None
         self._load = self._load_wanted = self._load_step = 0.0
-        self._carrier, self._place = self._tip, np.zeros(3)
+        self._carrier = self._tip
+        self._place = np.zeros(3)
         self._links.set_load(self._carrier, 0.0, self._place)
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
-    def set_payload(self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None) -> None:
-        """Let the robot carry another point mass; commands take it over within the time of the ramp.
+    def set_payload(
+        self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None
+    ) -> None:
+        """Let the robot carry another point mass; commands take it over within the time of the
+        ramp.
 
-        In another place or on another body it is taken over from zero: the command lets go of the last one at once.
+        In another place or on another body it is taken over from zero: the command lets go of the
+        last one at once.
 
         Args:
             mass_kg: Mass, 0 for none [kg].
@@ -183,8 +230,11 @@ class PositionCompensator:
                 place = _in_body(self._model, sites[body], place)
         before = None if self._asked is None else self._torque(*self._asked)
         if (carrier, *place) != (self._carrier, *self._place):
-            self._load, self._carrier, self._place = 0.0, carrier, place
-        self._load_wanted, self._load_step = mass, abs(mass - self._load) / self._steps
+            self._load = 0.0
+            self._carrier = carrier
+            self._place = place
+        self._load_wanted = mass
+        self._load_step = abs(mass - self._load) / self._steps
         if self._ramp == 0.0:
             self._load = mass
         self._links.set_load(self._carrier, self._load, self._place)
@@ -192,13 +242,19 @@ class PositionCompensator:
             self._warn_of_jump(self._of_command * (self._torque(*self._asked) - before))
 
     def torque(
-        self, q: npt.ArrayLike, q_dot: npt.ArrayLike | None = None, q_ddot: npt.ArrayLike | None = None
+        self,
+        q: npt.ArrayLike,
+        q_dot: npt.ArrayLike | None = None,
+        q_ddot: npt.ArrayLike | None = None,
     ) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
         return self._torque(*self._motion(q, q_dot, q_ddot))
 
     def command(
-        self, q_desired: npt.ArrayLike, q_dot: npt.ArrayLike | None = None, q_ddot: npt.ArrayLike | None = None
+        self,
+        q_desired: npt.ArrayLike,
+        q_dot: npt.ArrayLike | None = None,
+        q_ddot: npt.ArrayLike | None = None,
     ) -> Array:
         """Servo command that brings the links to where they should be.
 
@@ -238,15 +294,18 @@ class PositionCompensator:
 
         Raises:
             ActionError: A wrong number of values, or one that is not finite.
-            ElasticError: The load overcomes a spring: there is no equilibrium that a growing load leads to, or there
-                are several.
+            ElasticError: The load overcomes a spring: there is no equilibrium that a growing load
+                leads to, or there are several.
         """
         shown_angle = self._checked("theta", theta, "rad")
         gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
         size = gradient.ravel()
-        is_soft = size.dot(size) >= 1.0  # by the Frobenius norm, which is fast: there may be other equilibria
+        is_soft = (
+            size.dot(size) >= 1.0
+        )  # by the Frobenius norm, which is fast: there may be other equilibria
         gradient.flat[:: len(shown_angle) + 1] += 1.0
-        # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
+        # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at
+        # θ alone, for speed;
         # the first step is Eq. 12
         factors, pivots, is_singular = _factored(gradient)
         if is_singular:
@@ -259,13 +318,19 @@ class PositionCompensator:
             missing = residual.dot(residual)
             if missing < _LAST_STEP_RAD**2:
                 way = q - shown_angle
-                return self._soft_link_angle(shown_angle, q) if is_soft or way.dot(way) > _FAR_RAD**2 else q
+                return (
+                    self._soft_link_angle(shown_angle, q)
+                    if is_soft or way.dot(way) > _FAR_RAD**2
+                    else q
+                )
             if not missing < _LARGEST_STEP_RAD**2:
                 break
         return self._soft_link_angle(shown_angle, None)
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
-        """The same where the load bends a spring far: by a load that grows; the guess if it is the same pose."""
+        """The same where the load bends a spring far: by a load that grows; the guess if it is
+        the same pose.
+        """
         found = follow_load(
             theta,
             self._compliance,
@@ -275,14 +340,20 @@ class PositionCompensator:
             within=(self._lowest, self._highest),
         )
         if found.lost.any():
-            raise ElasticError(f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}")
+            raise ElasticError(
+                f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
+            )
         return guess if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD else found.q
 
     def _warn_of_room(self) -> None:
-        """Warn where the weight at some pose within the ranges needs a larger offset than the limit."""
+        """Warn where the weight at some pose within the ranges needs a larger offset than the
+        limit.
+        """
         needed = self._of_command * self._heaviest()
         if (needed > self._limit).any():
-            self._warn_of_offset(int(needed.argmax()), float(needed.max()), "at some pose within the joint ranges")
+            self._warn_of_offset(
+                int(needed.argmax()), float(needed.max()), "at some pose within the joint ranges"
+            )
 
     def _heaviest(self) -> Array:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
@@ -314,8 +385,9 @@ class PositionCompensator:
             worst = int(over.argmax())
             ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
             warnings.warn(
-                f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond its range of {ends} "
-                f"in the model: its link stays {over[worst]:.2g} rad short; keep q_desired that far from the end",
+                f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond"
+                f" its range of {ends} in the model: its link stays {over[worst]:.2g} rad short;"
+                " keep q_desired that far from the end",
                 stacklevel=4,
             )
 
@@ -327,9 +399,9 @@ class PositionCompensator:
         digit = 10.0 ** (np.floor(np.log10(needed)) - 1.0)
         enough = np.ceil(1.05 * needed / digit) * digit
         warnings.warn(
-            f"the load needs an offset of {needed:.3g} rad of joint {self.joints[joint]!r} {when}, and commands are "
-            f"cut at limit_rad = {self._limit:g}: the link ends short of where it should be; limit_rad={enough:.3g} "
-            "is enough",
+            f"the load needs an offset of {needed:.3g} rad of joint {self.joints[joint]!r} {when},"
+            f" and commands are cut at limit_rad = {self._limit:g}: the link ends short of where it"
+            f" should be; limit_rad={enough:.3g} is enough",
             stacklevel=4,
         )
 
@@ -340,11 +412,17 @@ class PositionCompensator:
         if size <= _JUMP_RAD or "jump" in self._said:
             return
         self._said.add("jump")
-        cure = f"ramp_s={max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5):.3g} takes it over in that time"
+        cure = (
+            f"ramp_s={max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5):.3g} takes it over in"
+            " that time"
+        )
         if self._ramp > 0.0:
-            cure = "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
+            cure = (
+                "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
+            )
         warnings.warn(
-            f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g} mrad at once; {cure}",
+            f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
+            f" mrad at once; {cure}",
             stacklevel=3,
         )
 
@@ -362,25 +440,37 @@ class PositionCompensator:
         if values.shape != (n,):
             size = f", an array of shape {values.shape}" if isinstance(given, np.ndarray) else ""
             raise ActionError(
-                f"{name} must be {n} numbers [{unit}], of {', '.join(self.joints)}; got {shown(given)}{size}"
+                f"{name} must be {n} numbers [{unit}], of {', '.join(self.joints)}; got"
+                f" {shown(given)}{size}"
             )
         if not np.isfinite(values).all():
-            bad = [name for name, value in zip(self.joints, values, strict=True) if not np.isfinite(value)]
-            raise ActionError(f"{name} must be finite [{unit}], got {shown(values.tolist())}; see {', '.join(bad)}")
+            bad = [
+                name
+                for name, value in zip(self.joints, values, strict=True)
+                if not np.isfinite(value)
+            ]
+            raise ActionError(
+                f"{name} must be finite [{unit}], got {shown(values.tolist())}; see"
+                f" {', '.join(bad)}"
+            )
         return values
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
         if q_dot is None and q_ddot is None:
             return self._links.gravity_torque(q)
         rest = np.zeros(len(q))
-        return self._links.inverse_dynamics(q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot)
+        return self._links.inverse_dynamics(
+            q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot
+        )
 
     def _take_load(self) -> None:
         """One step towards the payload that is wanted."""
         if self._load != self._load_wanted:
             way = self._load_wanted - self._load
             self._load = (
-                self._load_wanted if abs(way) <= self._load_step else self._load + np.copysign(self._load_step, way)
+                self._load_wanted
+                if abs(way) <= self._load_step
+                else self._load + np.copysign(self._load_step, way)
             )
             self._links.set_load(self._carrier, self._load, self._place)
 
@@ -395,7 +485,11 @@ def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
 def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
-    return {j: float(home[model.jnt_qposadr[j]]) for j in range(model.njnt) if model.joint(j).name not in joints}
+    return {
+        j: float(home[model.jnt_qposadr[j]])
+        for j in range(model.njnt)
+        if model.joint(j).name not in joints
+    }
 
 
 def _joint_names(model: mujoco.MjModel) -> list[str]:
@@ -405,14 +499,18 @@ def _joint_names(model: mujoco.MjModel) -> list[str]:
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
     """What a file says of joints, in which the hinges that it leaves out are rigid."""
     mapping = read_mapping(file)
-    names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    names = [
+        model.joint(j).name
+        for j in range(model.njnt)
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
     left_out = [name for name in names if name and key_of(mapping, name) is None]
     said = [name for name in left_out if commanded is None or name in commanded]
     if not said or len(left_out) == len(names):
         return mapping
     warnings.warn(
-        f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}: {HELD} or its "
-        "stiffness K [N·m/rad] there",
+        f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}:"
+        f" {HELD} or its stiffness K [N·m/rad] there",
         stacklevel=4,
     )
     return mapping | dict.fromkeys(said, RIGID)
@@ -429,32 +527,40 @@ def _known_joints(
     for name in commanded or ():
         if name in known and known[name] is None:
             raise ConfigurationError(
-                f"joint {name!r} is named by `joints`, and stiffness says that it is {HELD}; give it a stiffness K "
-                "[N·m/rad], or leave it out of `joints`"
+                f"joint {name!r} is named by `joints`, and stiffness says that it is {HELD}; give"
+                " it a stiffness K [N·m/rad], or leave it out of `joints`"
             )
     return known
 
 
-def _settings_of(known: Mapping[str, JointSettings | None], joints: Sequence[str]) -> list[JointSettings]:
-    """Settings of the joints that are commanded, all of which have to be known and without backlash."""
+def _settings_of(
+    known: Mapping[str, JointSettings | None], joints: Sequence[str]
+) -> list[JointSettings]:
+    """Settings of the joints that are commanded, all of which have to be known and without
+    backlash.
+    """
     found: list[JointSettings] = []
     for joint in joints:
         own = known.get(joint)
         if own is None:
             raise ConfigurationError(
-                f"stiffness of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and inf for a "
-                "rigid joint. It is measured by a known torque and the deflection under it"
+                f"stiffness of joint {joint!r} is missing; give {joint!r} or a pattern such as '*',"
+                " and inf for a rigid joint. It is measured by a known torque and the deflection"
+                " under it"
             )
         if own.backlash > 0.0:
             raise ConfigurationError(
-                f"backlash of joint {joint!r} is {own.backlash:g} rad, which this compensator cannot take away: at "
-                f"rest {own.backlash / 2.0:g} rad remain to either side; leave the key out of what you give it"
+                f"backlash of joint {joint!r} is {own.backlash:g} rad, which this compensator"
+                f" cannot take away: at rest {own.backlash / 2.0:g} rad remain to either side;"
+                " leave the key out of what you give it"
             )
         found.append(own)
     return found
 
 
-def _servo_gains(model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[ServoSettings], given: Any) -> Array:
+def _servo_gains(
+    model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[ServoSettings], given: Any
+) -> Array:
     """k_p of servos that give way, infinite for those that hold their angle, (n,) [N·m/rad].
 
     Args:
@@ -467,8 +573,8 @@ def _servo_gains(model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[
     if given is not None:
         if any(said):
             raise ConfigurationError(
-                f"the servo of joint {joints[said.index(True)]!r} is said twice, under `servo` in stiffness and by "
-                "position_gain; keep one of them"
+                f"the servo of joint {joints[said.index(True)]!r} is said twice, under `servo` in"
+                " stiffness and by position_gain; keep one of them"
             )
         return _per_joint("position_gain", given, joints)
     gains = np.full(len(joints), np.inf)
@@ -483,8 +589,9 @@ def _servo_gains(model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[
     if unsaid:
         listed = ", ".join(f"{name}: {gain:g}" for name, gain in unsaid.items())
         warnings.warn(
-            f"the model has position servos that give way under a load, which is not compensated; give "
-            f"position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that hold their angle",
+            "the model has position servos that give way under a load, which is not compensated;"
+            f" give position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that"
+            " hold their angle",
             stacklevel=4,
         )
     return gains
@@ -497,12 +604,15 @@ def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
     if isinstance(given, Mapping):
         values = [_of_joint(name, given, joint) for joint in joints]
     elif isinstance(given, str | Path):
-        raise ConfigurationError(f"{name} must be numbers [N·m/rad], got {shown(str(given))}; {_HOW_TO_GIVE}")
+        raise ConfigurationError(
+            f"{name} must be numbers [N·m/rad], got {shown(str(given))}; {_HOW_TO_GIVE}"
+        )
     elif isinstance(given, list | tuple | np.ndarray):
         values = list(given)
         if len(values) != len(joints):
             raise ConfigurationError(
-                f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got {len(values)}"
+                f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got"
+                f" {len(values)}"
             )
     else:
         values = [given] * len(joints)
@@ -512,7 +622,9 @@ def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
     ]
     for joint, number in zip(joints, numbers, strict=True):
         if number < SOFTEST:
-            raise ConfigurationError(f"{name} of {joint} must be at least {SOFTEST:g} [N·m/rad], got {number:g}")
+            raise ConfigurationError(
+                f"{name} of {joint} must be at least {SOFTEST:g} [N·m/rad], got {number:g}"
+            )
     return np.array(numbers)
 
 
@@ -528,20 +640,30 @@ def _of_joint(name: str, given: Mapping[str, Any], joint: str) -> Any:
     key = key_of(given, joint)
     if key is None:
         raise ConfigurationError(
-            f"{name} of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and inf for a servo that "
-            "holds its angle"
+            f"{name} of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and"
+            " inf for a servo that holds its angle"
         )
     return given[key]
 
 
-def _number(name: str, value: Any, unit: str, least: float | None = None, finite: bool = True) -> float:
+def _number(
+    name: str, value: Any, unit: str, least: float | None = None, finite: bool = True
+) -> float:
     """A positive number, or one from `least` on."""
-    if isinstance(value, bool | str) or not isinstance(value, int | float | np.integer | np.floating):
+    if isinstance(value, bool | str) or not isinstance(
+        value, int | float | np.integer | np.floating
+    ):
         raise ConfigurationError(f"{name} must be a number [{unit}], got {shown(value)}")
     number = float(value)
-    if np.isnan(number) or (finite and np.isinf(number)) or not (number > 0.0 if least is None else number >= least):
+    if (
+        np.isnan(number)
+        or (finite and np.isinf(number))
+        or not (number > 0.0 if least is None else number >= least)
+    ):
         bound = "> 0" if least is None else f">= {least:g}"
-        raise ConfigurationError(f"{name} must be {'finite and ' if finite else ''}{bound} [{unit}], got {number:g}")
+        raise ConfigurationError(
+            f"{name} must be {'finite and ' if finite else ''}{bound} [{unit}], got {number:g}"
+        )
     return number
 
 
@@ -556,5 +678,7 @@ def _array(given: Any) -> Array:
 def _finite(name: str, given: Any, size: int, unit: str) -> Array:
     values = _array(given)
     if values.shape != (size,) or not np.isfinite(values).all():
-        raise ConfigurationError(f"{name} must be {size} finite numbers [{unit}], got {shown(given)}")
+        raise ConfigurationError(
+            f"{name} must be {size} finite numbers [{unit}], got {shown(given)}"
+        )
     return values

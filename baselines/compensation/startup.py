@@ -1,11 +1,12 @@
 r"""How a compensation grows from zero while the robot stands.
 
-The robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A walker that is
-moved there within the second of standing would be left swinging on its springs, so its ramp is shaped [Singer1990]: two
-equal halves, half a period of its slowest sway apart, whose swings cancel.
+The robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A
+walker that is moved there within the second of standing would be left swinging on its springs, so
+its ramp is shaped [Singer1990]: two equal halves, half a period of its slowest sway apart, whose
+swings cancel.
 
-[Singer1990] N. C. Singer, W. P. Seering, "Preshaping Command Inputs to Reduce System Vibration", J. Dyn. Sys., Meas.,
-Control 112(1).
+[Singer1990] N. C. Singer, W. P. Seering, "Preshaping Command Inputs to Reduce System Vibration", J.
+Dyn. Sys., Meas., Control 112(1).
 """
 
 import numpy as np
@@ -34,7 +35,10 @@ class Ramp:
         self._period_s = model.control_period_s
         self._delay = 0.0
         if isinstance(model, WalkerModel):
-            half_period = np.pi / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
+            half_period = (
+                np.pi
+                / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
+            )
             if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
                 self._delay = float(half_period)
         steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)

@@ -1,16 +1,19 @@
-r"""How much more a walker's joints bend than the model says, from what their motors and the IMU disagree on.
+r"""How much more a walker's joints bend than the model says, from what their motors and the IMU
+disagree on.
 
-A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be tilted: by what the
-joints of its leg bend, δ = θ − q about their axes z, and by what never changes, the tilt of the ground and the errors
-of homing and of the mounting,
+A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be
+tilted: by what the joints of its leg bend, δ = θ − q about their axes z, and by what never changes,
+the tilt of the ground and the errors of homing and of the mounting,
 
 .. math:: e = \sum_j z_j \delta_j + c
 
-The model and the measured foot wrenches say how much bending to expect, s = Σ z_j K⁻¹τ_j. With a common relative error
-ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load and c does not, so that recursive least
-squares over the time that a foot is loaded tell ρ from c, for roll and pitch of each leg [Kalman1960, without drift].
+The model and the measured foot wrenches say how much bending to expect, s = Σ z_j K⁻¹τ_j. With a
+common relative error ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load
+and c does not, so that recursive least squares over the time that a foot is loaded tell ρ from c,
+for roll and pitch of each leg [Kalman1960, without drift].
 
-[Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic Eng. 82.
+[Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic
+Eng. 82.
 """
 
 import math
@@ -46,7 +49,8 @@ ESTIMATE = record_type(
 
 
 class BendingObserver:
-    """Estimates of the model's error, from the observations of a walker; its memory is rows of `ESTIMATE`.
+    """Estimates of the model's error, from the observations of a walker; its memory is rows of
+    `ESTIMATE`.
 
     Args:
         model: Assumed walker.
@@ -78,13 +82,16 @@ class BendingObserver:
         memory["covariance"] = _PRIOR
         return memory
 
-    def observe(self, rows: Array, memory: Records, bending: Array | None = None) -> tuple[Array, Records]:
+    def observe(
+        self, rows: Array, memory: Records, bending: Array | None = None
+    ) -> tuple[Array, Records]:
         """Estimates after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).
             memory: (num_worlds,).
-            bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under the foot wrenches.
+            bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under
+                the foot wrenches.
         """
         seen, expected = self.disagreement(rows, self.bending(rows) if bending is None else bending)
         memory = memory.copy()
@@ -102,16 +109,21 @@ class BendingObserver:
         return found, memory
 
     def bending(self, rows: Array) -> Array:
-        """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
+        """Expected bending of the joints under the measured foot wrenches, δ = θ − q,
+        (num_worlds, 12) [rad].
+        """
         theta = rows[:, self._theta]
         return theta - self._compensator.at(rows).link_angle(theta)
 
     def expected_tilt(self, rows: Array) -> Array:
-        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds, 2 legs, 2) [rad]."""
+        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds,
+        2 legs, 2) [rad].
+        """
         return self.disagreement(rows, self.bending(rows))[1]
 
     def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
-        """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
+        """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a
+        foot that is flat.
 
         Args:
             rows: Observations, (num_worlds, m).
@@ -139,7 +151,8 @@ def regress(
     memory: Any,
     found: Array,
 ) -> None:
-    """One step of recursive least squares for seen − expected = ρ · expected + c, of feet that are loaded.
+    """One step of recursive least squares for seen − expected = ρ · expected + c, of feet that are
+    loaded.
 
     Args:
         observed: Observations, rows with fields.
@@ -149,7 +162,8 @@ def regress(
         loaded_n: Force of a loaded foot [N].
         deviation_rad: Standard deviation of a measurement [rad].
         memory: Rows of `ESTIMATE`, to be updated, (n,).
-        found: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured over assumed load less one.
+        found: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured over
+            assumed load less one.
     """
     for world in range(len(found)):
         load = 0.0
@@ -168,7 +182,9 @@ def regress(
 
 @compiled
 def update(x: Array, P: Array, expected: float, seen: float, deviation_rad: float) -> None:
-    """A measurement of (expected, 1) · x = seen − expected, whose errors have a standard deviation."""
+    """A measurement of (expected, 1) · x = seen − expected, whose errors have a standard
+    deviation.
+    """
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
     variance = (expected * first + second) + deviation_rad**2

@@ -1,26 +1,28 @@
 r"""IMU and foot sensors of a walker as they would be on level ground.
 
-Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is left of its
-direction when the acceleration of the center of mass c is taken off is the tilt of the ground λ, whatever the joints
-bend:
+Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is
+left of its direction when the acceleration of the center of mass c is taken off is the tilt of the
+ground λ, whatever the joints bend:
 
 .. math:: \lambda = \overline{f_{xy} / f_z - \ddot c_{xy} / g}
 
-as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis, which is parallel to
-them but for what the joints bend. The mean of the acceleration over a time t is a difference of velocities, known from
-the motors to some σ_v, so that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The
-weight leans too, and acts at the center of mass, h over the ankles: set upright, it leaves the ankles with the wrenches
-of level ground,
+as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis,
+which is parallel to them but for what the joints bend. The mean of the acceleration over a time t
+is a difference of velocities, known from the motors to some σ_v, so that with σ_λ before any
+measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The weight leans too, and acts at the
+center of mass, h over the ankles: set upright, it leaves the ankles with the wrenches of level
+ground,
 
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 
 A weight that leans bends the legs further than one that is upright, s and s' by the model
-(`baselines.estimation.bending`), each leg by its share w of the load. Level ground would not show that either, so that
-what the robot tilts by itself is
+(`baselines.estimation.bending`), each leg by its share w of the load. Level ground would not show
+that either, so that what the robot tilts by itself is
 
 .. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
 
-On two feet that is too much about x, where a leaning weight goes from one foot to the other rather than to the ankles.
+On two feet that is too much about x, where a leaning weight goes from one foot to the other rather
+than to the ankles.
 """
 
 from typing import NamedTuple
@@ -34,7 +36,9 @@ from elastic_env.world.robot_model import WalkerModel
 
 TILT_RAD = 0.01
 VELOCITY_M_PER_S = 0.07
-"""σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
+"""σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well
+velocities are known.
+"""
 
 _DIFFERENCE_S = 1e-3
 
@@ -80,7 +84,9 @@ class GroundLevel:
 
     def begin(self, num_worlds: int) -> GroundMemory:
         """Memory before the first measurement."""
-        return GroundMemory(np.zeros(num_worlds), np.zeros((num_worlds, 2)), np.full((num_worlds, 2), np.nan))
+        return GroundMemory(
+            np.zeros(num_worlds), np.zeros((num_worlds, 2)), np.full((num_worlds, 2), np.nan)
+        )
 
     def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         """Values after a measurement, see `signals`, and the new memory.
@@ -100,7 +106,9 @@ class GroundLevel:
         return np.hstack([own, wrenches]), memory
 
     def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
-        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12), and the new memory."""
+        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12),
+        and the new memory.
+        """
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
         force = wrench[:, :, 0]
@@ -111,7 +119,9 @@ class GroundLevel:
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
         added = over_ankles * (upright - force)[..., :2]
-        turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)
+        turned = moment + np.stack(
+            [-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1
+        )
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
 
@@ -132,7 +142,9 @@ class GroundLevel:
         return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
-        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded one, (n, 2)."""
+        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
+        one, (n, 2).
+        """
         n = len(rows)
         theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
         com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))

@@ -1,14 +1,16 @@
 r"""By how much each joint bends more than its model, from sensors of the deflection.
 
-The measured foot wrenches and the assumed model give the deflection to expect, :math:`h = K^{-1} (\tau + \tau_F)`. The
-Coulomb friction :math:`\tau_F` turns round over a short displacement of the link [Dahl1968]. Sensors show
+The measured foot wrenches and the assumed model give the deflection to expect, :math:`h = K^{-1}
+(\tau + \tau_F)`. The Coulomb friction :math:`\tau_F` turns round over a short displacement of the
+link [Dahl1968]. Sensors show
 
 .. math:: \delta = (1 + r) h + c
 
-with c for homing errors. This is linear regression of δ − h on h, joint by joint, after every measurement. Its prior
-says that the joints of a robot are alike: :math:`r \sim N(0, \sigma_c^2 \mathbf{1}\mathbf{1}^T + \sigma_i^2 I)`, so
-that joints without load take after the others [Gelman2013, chapter 15]. The normal matrix is diagonal but for one rank,
-which the matrix inversion lemma solves in closed form.
+with c for homing errors. This is linear regression of δ − h on h, joint by joint, after every
+measurement. Its prior says that the joints of a robot are alike: :math:`r \sim N(0, \sigma_c^2
+\mathbf{1}\mathbf{1}^T + \sigma_i^2 I)`, so that joints without load take after the others
+[Gelman2013, chapter 15]. The normal matrix is diagonal but for one rank, which the matrix inversion
+lemma solves in closed form.
 
 [Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 [Gelman2013] A. Gelman et al., "Bayesian Data Analysis", 3rd edition.
@@ -27,17 +29,22 @@ from elastic_env.world.robot_model import RobotModel
 class StiffnessPrior(Model):
     """Knowledge of the joints before they are measured, as standard deviations."""
 
-    common: float = quantity("1", 0.5, gt=0, description="relative error that all joints share")
-    own: float = quantity("1", 0.1, gt=0, description="relative error of a joint beside it")
-    offset_rad: float = quantity("rad", 0.002, gt=0, description="offset of a measured deflection")
-    noise_rad: float = quantity("rad", 0.01, gt=0, description="model error of a measured deflection")
+    common: float = quantity("1", 0.5, gt=0)
+    """Relative error that all joints share [1]."""
+    own: float = quantity("1", 0.1, gt=0)
+    """Relative error of a joint beside it [1]."""
+    offset_rad: float = quantity("rad", 0.002, gt=0)
+    """Offset of a measured deflection [rad]."""
+    noise_rad: float = quantity("rad", 0.01, gt=0)
+    """Model error of a measured deflection [rad]."""
 
 
 def regress(sums: Array, prior: StiffnessPrior) -> Array:
     """Relative errors r of the joints by the regression of the module.
 
     Args:
-        sums: Number of measurements, and sums of h, h², y = δ − h, and h y of each joint, (5, ..., n), with h in [rad].
+        sums: Number of measurements, and sums of h, h², y = δ − h, and h y of each joint, (5, ...,
+            n), with h in [rad].
         prior: Standard deviations.
 
     Returns:
@@ -86,7 +93,9 @@ class StiffnessRegression:
     def begin(self, num_worlds: int) -> RegressionMemory:
         """Memory before the first measurement."""
         n = len(self._coulomb)
-        return RegressionMemory(np.zeros((num_worlds, n)), np.zeros((num_worlds, n)), np.zeros((num_worlds, 5, n)))
+        return RegressionMemory(
+            np.zeros((num_worlds, n)), np.zeros((num_worlds, n)), np.zeros((num_worlds, 5, n))
+        )
 
     def friction(self, q: Array, memory: RegressionMemory) -> Array:
         """Coulomb friction of links that have moved to q, (num_worlds, n) [rad] to [N·m]."""
@@ -94,7 +103,13 @@ class StiffnessRegression:
         return presliding_friction(memory.friction, moved, self._coulomb)
 
     def add(
-        self, h: Array, deflection: Array, friction: Array, q: Array, memory: RegressionMemory, measured: BoolArray
+        self,
+        h: Array,
+        deflection: Array,
+        friction: Array,
+        q: Array,
+        memory: RegressionMemory,
+        measured: BoolArray,
     ) -> tuple[Array, RegressionMemory]:
         """Relative errors r after a measurement, (num_worlds, n) [1], and the new memory.
 

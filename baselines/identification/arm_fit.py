@@ -1,18 +1,20 @@
-r"""Stiffness of every joint of an arm from static poses: least squares over all poses, with 95 % intervals.
+r"""Stiffness of every joint of an arm from static poses: least squares over all poses, with 95 %
+intervals.
 
-The unknowns x of `PoseModel` minimise the squared residuals of the measurement. A weak prior, Gaussian with the scales
-of the model, keeps unknowns near zero that the poses say nothing about; on the others it has no visible effect.
+The unknowns x of `PoseModel` minimise the squared residuals of the measurement. A weak prior,
+Gaussian with the scales of the model, keeps unknowns near zero that the poses say nothing about; on
+the others it has no visible effect.
 
-The intervals do not assume equal noise: friction without known direction acts on all measurements of a pose at once,
-and more in one pose than in another. The covariance of x is the cluster-robust one in its jackknife form (CR3), a
-cluster per pose, with Student's t:
+The intervals do not assume equal noise: friction without known direction acts on all measurements
+of a pose at once, and more in one pose than in another. The covariance of x is the cluster-robust
+one in its jackknife form (CR3), a cluster per pose, with Student's t:
 
 .. math:: V = M^{-1} \Big( \tfrac{N-1}{N} \sum_i J_i^T e^*_i e^{*T}_i J_i + \Lambda \Big) M^{-1}, \quad
     e^*_i = (1 - J_i M^{-1} J_i^T)^{-1} e_i, \quad M = J^T J + \Lambda
 
-(R. M. Bell and D. F. McCaffrey, "Bias Reduction in Standard Errors for Linear Regression with Multi-Stage Samples",
-Survey Methodology 28(2), 2002.) Λ is the precision of the prior.
-"""
+(R. M. Bell and D. F. McCaffrey, "Bias Reduction in Standard Errors for Linear Regression with
+Multi-Stage Samples", Survey Methodology 28(2), 2002.) Λ is the precision of the prior.
+"""  # noqa: E501
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,15 +24,29 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import least_squares
 
-from baselines.identification.log_signs import require_deflections_with_load, require_like_encoders, require_signs
+from baselines.identification.log_signs import (
+    require_deflections_with_load,
+    require_like_encoders,
+    require_signs,
+)
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import PoseModel, measurement_unit
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array, IntArray
 
-_FINEST: dict[Kind, float] = {"end_effector": 1e-4, "imu": 1e-4, "link_encoders": 1e-5, "torques": 1e-2}
+_FINEST: dict[Kind, float] = {
+    "end_effector": 1e-4,
+    "imu": 1e-4,
+    "link_encoders": 1e-5,
+    "torques": 1e-2,
+}
 """Noise beside which the prior counts [m], [rad], [N·m]: about that of good sensors."""
-USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
+USUAL_NOISE: dict[Kind, float] = {
+    "end_effector": 3e-4,
+    "imu": 1e-3,
+    "link_encoders": 1e-4,
+    "torques": 0.1,
+}
 """Noise of usual sensors [m], [rad], [N·m]."""
 FAR_BEYOND = 10.0
 """Ratio of residuals and usual noise from which on the log does not fit the arm."""
@@ -54,7 +70,8 @@ class ArmFit:
         model: The poses.
         unknowns: Estimates, (p,).
         covariance: Of the estimates, (p, p).
-        information: JᵀJ / σ² + Λ in units of the scales, with the spread σ of the residuals, (p, p).
+        information: JᵀJ / σ² + Λ in units of the scales, with the spread σ of the residuals, (p,
+            p).
         q: Link angles, (N, n) [rad].
         residual: Measured less predicted, (N, m).
         spread: Standard deviation of the residuals, in the unit of the measurement.
@@ -96,7 +113,8 @@ def fit_arm(model: PoseModel, progress: Callable[[int], None] | None = None) -> 
         progress: Called with the number of evaluations so far.
 
     Raises:
-        ConfigurationError: Too few poses for the unknowns, or the signs of the log contradict the model.
+        ConfigurationError: Too few poses for the unknowns, or the signs of the log contradict the
+            model.
         ElasticError: The log does not fit the arm.
     """
     require_poses(model)
@@ -122,18 +140,28 @@ def _solution(model: PoseModel, noise: float, progress: Callable[[int], None] | 
         found = _least_squares(problem, found.x, _FURTHER_EVALUATIONS, x_scale="jac")
     if not found.success:
         raise ElasticError(
-            f"the fit did not converge in {MOST_EVALUATIONS + _FURTHER_EVALUATIONS} steps; check zeros and units of "
-            "the log's columns and the masses of the model, or seek fewer joints by --joints"
+            f"the fit did not converge in {MOST_EVALUATIONS + _FURTHER_EVALUATIONS} steps; check"
+            " zeros and units of the log's columns and the masses of the model, or seek fewer"
+            " joints by --joints"
         )
     return model.scale * found.x
 
 
 def _least_squares(problem: "_Problem", start: Array, evaluations: int, **options: Any) -> Any:
-    return least_squares(problem.residual, start, jac=problem.jacobian, method="trf", max_nfev=evaluations, **options)  # type: ignore[arg-type]
+    return least_squares(
+        problem.residual,
+        start,
+        jac=problem.jacobian,  # pyright: ignore[reportArgumentType]  a callable is meant to be here
+        method="trf",
+        max_nfev=evaluations,
+        **options,
+    )
 
 
 def _spread_near(model: PoseModel) -> float:
-    """Spread of the residuals of poses to first order about small deflections, in the unit of the measurement."""
+    """Spread of the residuals of poses to first order about small deflections, in the unit of
+    the measurement.
+    """
     start = model.start_with(_FIRST_DEFLECTION_RAD)
     predicted, gradient = model.predicted(start)
     noise = _FINEST[model.log.kind]
@@ -144,7 +172,8 @@ def _spread_near(model: PoseModel) -> float:
 
 
 class _Problem:
-    """Residuals of the poses and of the prior, and their derivatives, in units of noise and of the scales.
+    """Residuals of the poses and of the prior, and their derivatives, in units of noise and of the
+    scales.
 
     Args:
         model: The poses.
@@ -152,13 +181,20 @@ class _Problem:
         progress: Called with the number of evaluations so far.
     """
 
-    def __init__(self, model: PoseModel, noise: float, progress: Callable[[int], None] | None) -> None:
-        self._model, self._noise, self._progress = model, noise, progress
-        self._count, self._at, self._gradient = 0, np.empty(0), np.empty(0)
+    def __init__(
+        self, model: PoseModel, noise: float, progress: Callable[[int], None] | None
+    ) -> None:
+        self._model = model
+        self._noise = noise
+        self._progress = progress
+        self._count = 0
+        self._at = np.empty(0)
+        self._gradient = np.empty(0)
         self._size = model.target.size + model.unknowns.size
 
     def residual(self, x: Array) -> Array:
-        """Predicted less measured, then the prior, (N m + p,); infinite where a load overcomes a spring.
+        """Predicted less measured, then the prior, (N m + p,); infinite where a load overcomes a
+        spring.
 
         Raises:
             ElasticError: It does so at the start.
@@ -176,7 +212,9 @@ class _Problem:
         return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
 
     def jacobian(self, x: Array) -> Array:
-        """Its derivatives, (N m + p, p); `least_squares` asks for them where it has asked for the residual."""
+        """Its derivatives, (N m + p, p); `least_squares` asks for them where it has asked for
+        the residual.
+        """
         if not np.array_equal(x, self._at):
             self.residual(x)
         rows = self._gradient.reshape(-1, len(x)) * self._model.scale / self._noise
@@ -189,24 +227,31 @@ def require_poses(model: PoseModel) -> None:
     Raises:
         ConfigurationError: Too few poses, or positions that the arm cannot reach.
     """
-    size, each = model.unknowns.size, model.target.shape[1]
+    size = model.unknowns.size
+    each = model.target.shape[1]
     needed = -(-size // each) + _FURTHER_POSES
     if len(model.log) < needed:
         raise ConfigurationError(
-            f"{size} unknowns need at least {needed} poses of {each} measured numbers each, the log has "
-            f"{len(model.log)}; log further poses, or seek fewer joints by --joints"
+            f"{size} unknowns need at least {needed} poses of {each} measured numbers each, the log"
+            f" has {len(model.log)}; log further poses, or seek fewer joints by --joints"
         )
     if model.log.kind == "end_effector":
         _require_reach(model)
 
 
 def _require_reach(model: PoseModel) -> None:
-    """Refuse positions that spread far more or less than those of the model, such as millimetres."""
-    own, measured = (_radius(points) for points in (model.arm.attitude(model.log.theta).position, model.log.measured))
+    """Refuse positions that spread far more or less than those of the model, such as
+    millimetres.
+    """
+    own, measured = (
+        _radius(points)
+        for points in (model.arm.attitude(model.log.theta).position, model.log.measured)
+    )
     if not own / _UNLIKE < measured < own * _UNLIKE:
         raise ConfigurationError(
-            f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of the model over "
-            f"{own:.3g} m: convert millimetres to metres, or name the body that was measured by --end-effector"
+            f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of"
+            f" the model over {own:.3g} m: convert millimetres to metres, or name the body that was"
+            " measured by --end-effector"
         )
 
 
@@ -233,10 +278,15 @@ def _described(model: PoseModel, unknowns: Array, finest: float) -> ArmFit:
     covariance = _clustered(rows, residual / finest, inverse)
     spread = max(spread, 1e-3 * finest)  # simulated logs without noise
     return ArmFit(
-        model, unknowns, covariance * np.outer(model.scale, model.scale),
-        information_of(model, unknowns, spread)[1], model.link_angles(unknowns)[0], residual, spread,
+        model,
+        unknowns,
+        covariance * np.outer(model.scale, model.scale),
+        information_of(model, unknowns, spread)[1],
+        model.link_angles(unknowns)[0],
+        residual,
+        spread,
         freedom=max(len(residual) - int(np.ceil(used / residual.shape[1])), 1),
-    )  # fmt: skip
+    )
 
 
 def _clustered(rows: Array, residual: Array, inverse: Array) -> Array:
@@ -260,6 +310,9 @@ def summed_up(fit: ArmFit) -> str:
     friction = (
         "friction is separated by the sides of approach"
         if fit.model.log.direction is not None
-        else "the log has no sides of approach: friction counts as noise, and the intervals contain it"
+        else (
+            "the log has no sides of approach: friction counts as noise, and the intervals"
+            " contain it"
+        )
     )
     return f"residual spread {in_unit(fit.spread, fit.model.log.kind)}; {friction}"

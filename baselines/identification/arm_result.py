@@ -1,4 +1,6 @@
-"""What an identification of an arm found, as files hold it: intervals in JSON, stiffness in YAML."""
+"""What an identification of an arm found, as files hold it: intervals in JSON, stiffness in
+YAML.
+"""
 
 import math
 from pathlib import Path
@@ -19,15 +21,16 @@ from elastic_env.joint.known_torque import hinges_of
 Source = Literal["told apart", "wide interval", "no upper end", "rigid", "assumed"]
 """Origin of a joint's stiffness.
 
-An estimate with a narrow interval, as asked for; with a wider one; or with one that reaches to rigid. Rigid where the
-poses say nothing of the joint, or where the estimate of 1/K is negative. Assumed where the user gave K in its place.
+An estimate with a narrow interval, as asked for; with a wider one; or with one that reaches to
+rigid. Rigid where the poses say nothing of the joint, or where the estimate of 1/K is negative.
+Assumed where the user gave K in its place.
 """
 
 _OFFSET_KNOWN_RAD = 0.05
 """Half-width of an offset's interval above which the poses do not tell the offset."""
 _KNOWN = 0.5
 """The same for friction and payload, as a share of their plausible size."""
-_SHOWN = 0.05  # of the largest derivative of the measurement by a joint: gravity couples the others by less
+_SHOWN = 0.05  # of the largest derivative by a joint: gravity couples the others by less
 UNLOADED = "gravity does not load it in these poses"
 UNSEEN = "the measurement does not show its angle"
 NEGATIVE = "stiffer than the log can tell; the estimate is negative"
@@ -92,20 +95,29 @@ class ArmIdentification(Model):
         files = [folder / "identification.json", folder / "joints.yaml"]
         files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# stiffness [N·m/rad], by elastic identify; .inf for a rigid joint"
-        lines = [yaml_line(joint.joint, {"stiffness": _written(joint)}, _comment(joint)) for joint in self.joints]
-        lines += [yaml_line(name, {"stiffness": math.inf}, "rigid: not sought") for name in self.rigid_joints]
+        lines = [
+            yaml_line(joint.joint, {"stiffness": _written(joint)}, _comment(joint))
+            for joint in self.joints
+        ]
+        lines += [
+            yaml_line(name, {"stiffness": math.inf}, "rigid: not sought")
+            for name in self.rigid_joints
+        ]
         lines += [yaml_line(name, "held", "not in the log") for name in self.held_joints]
         files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
         return files
 
 
-def described(fit: ArmFit, within: float, assumed: float | None, planned: Array | None = None) -> ArmIdentification:
+def described(
+    fit: ArmFit, within: float, assumed: float | None, planned: Array | None = None
+) -> ArmIdentification:
     """The result of a fit.
 
     Args:
         fit: The fit.
         within: Largest half-width of 1/K, relative, of a joint that counts as told apart.
-        assumed: K of joints whose interval of 1/K holds zero; None for their own estimate, or rigid.
+        assumed: K of joints whose interval of 1/K holds zero; None for their own estimate, or
+            rigid.
         planned: Information with the proposed poses, (p, p); None without a plan.
 
     Raises:
@@ -114,8 +126,8 @@ def described(fit: ArmFit, within: float, assumed: float | None, planned: Array 
     compliance, half = fit.estimate("compliance")
     if assumed is None and not (compliance > half).any():
         raise ConfigurationError(
-            "the poses tell no stiffness: the interval of every joint reaches to rigid; log poses with larger "
-            "gravity torques (--plan proposes them), or a finer measurement"
+            "the poses tell no stiffness: the interval of every joint reaches to rigid; log poses"
+            " with larger gravity torques (--plan proposes them), or a finer measurement"
         )
     why = reasons(fit, within)
     after = None if planned is None else expected_half_width(fit, planned)
@@ -133,7 +145,9 @@ def described(fit: ArmFit, within: float, assumed: float | None, planned: Array 
         residual_spread=fit.spread,
         friction_is_noise=log.direction is None,
         rigid_joints=tuple(joint for joint in log.joints if joint not in sought),
-        held_joints=tuple(joint for joint in hinges_of(fit.model.arm.model) if joint not in log.joints),
+        held_joints=tuple(
+            joint for joint in hinges_of(fit.model.arm.model) if joint not in log.joints
+        ),
         outlying_poses=tuple(int(pose) + 1 for pose in fit.outliers),
     )
 
@@ -148,7 +162,9 @@ def expected_half_width(fit: ArmFit, information: Array) -> Array:
 def reasons(fit: ArmFit, within: float) -> list[str]:
     """Why the poses do not tell each stiffness apart; empty text where they do, (k,)."""
     compliance, half = fit.estimate("compliance")
-    unloaded, unseen, alike = _unloaded(fit), _unseen(fit), _alike(fit)
+    unloaded = _unloaded(fit)
+    unseen = _unseen(fit)
+    alike = _alike(fit)
     names = [fit.model.log.joints[at] for at in fit.model.unknowns.elastic]
 
     def reason(i: int) -> str:
@@ -161,7 +177,10 @@ def reasons(fit: ArmFit, within: float) -> list[str]:
         others = [names[j] for j in np.flatnonzero(alike[i] & ~unloaded)]
         if others:
             return f"these poses do not separate it from {', '.join(others)}"
-        return f"its interval is wider than ±{100.0 * within:.3g} %: its deflections are small beside the noise"
+        return (
+            f"its interval is wider than ±{100.0 * within:.3g} %: its deflections are small beside"
+            " the noise"
+        )
 
     return [reason(i) for i in range(len(names))]
 
@@ -197,7 +216,9 @@ def _joint(
     friction, friction_half = _first_known(fit, "friction", i)
     is_shown = why not in (UNLOADED, UNSEEN)
     source = _source(c, h, within, is_rigid=best == 0.0 or not is_shown, assumed=assumed)
-    stiffness = math.inf if source == "rigid" else 1.0 / best if assumed is None or c > h else assumed
+    stiffness = (
+        math.inf if source == "rigid" else 1.0 / best if assumed is None or c > h else assumed
+    )
     return JointStiffness(
         joint=fit.model.log.joints[fit.model.unknowns.elastic[i]],
         stiffness_nm_per_rad=stiffness,
@@ -217,7 +238,9 @@ def _joint(
 
 
 def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float | None) -> Source:
-    """Origin of the stiffness of a joint with the compliance c and the half-width h of its interval."""
+    """Origin of the stiffness of a joint with the compliance c and the half-width h of its
+    interval.
+    """
     if c > h and not is_rigid:
         return "told apart" if h <= within * c else "wide interval"
     if assumed is not None:
@@ -228,7 +251,8 @@ def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float
 def bounded_compliance(fit: ArmFit) -> Array:
     """Compliances that fit best among those that are not negative, (k,) [rad/(N·m)].
 
-    To first order: where an estimate is negative it becomes zero, and the others take over what it explained.
+    To first order: where an estimate is negative it becomes zero, and the others take over what it
+    explained.
     """
     compliance, _ = fit.estimate("compliance")
     own = fit.model.unknowns.slices["compliance"]
@@ -245,7 +269,9 @@ def bounded_compliance(fit: ArmFit) -> Array:
 
 
 def _first_known(fit: ArmFit, name: str, i: int = 0) -> tuple[float | None, float | None]:
-    """An estimate, None where the poses do not tell it, and its half-width, None where it is not sought."""
+    """An estimate, None where the poses do not tell it, and its half-width, None where it is not
+    sought.
+    """
     values, half = fit.estimate(name)
     if not len(values):
         return None, None

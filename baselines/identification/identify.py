@@ -1,14 +1,16 @@
-r"""Stiffness of an elastic joint from static positions: deflection against gravity torque (Fig. 5 of the paper).
+r"""Stiffness of an elastic joint from static positions: deflection against gravity torque (Fig. 5
+of the paper).
 
-The joint is driven to positions from both sides and left to settle; encoder and IMU are averaged. Of link angle q and
-encoder θ the regression is
+The joint is driven to positions from both sides and left to settle; encoder and IMU are averaged.
+Of link angle q and encoder θ the regression is
 
 .. math:: \theta_i - q_i = \frac{1}{K} (\tau_i + F d_i) + \frac{b}{2}\,\mathrm{sign}(\tau_i + F d_i) + c
 
-with the gravity torque τ at the *link* angle, the direction of approach d = ±1 (friction F), the dead band b and an
-offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with 1.75 mrad of backlash, by +4 % with τ taken
-at the encoder angle. With two known masses, c₁ sin q separates an IMU error of that shape from K.
-"""
+with the gravity torque τ at the *link* angle, the direction of approach d = ±1 (friction F), the
+dead band b and an offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with 1.75
+mrad of backlash, by +4 % with τ taken at the encoder angle. With two known masses, c₁ sin q
+separates an IMU error of that shape from K.
+"""  # noqa: E501
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,12 +30,14 @@ HYSTERESIS_RESOLUTION_RAD = 1e-4
 
 _SIGN_ITERATIONS = 5
 _ANGLE_ITERATIONS = 12  # each gains a digit: the error shrinks by about τ_g′/K
-_SINGULAR = 1e-2  # smallest singular value, relative, of unit columns that are told apart beyond their noise
+_SINGULAR = 1e-2  # smallest relative singular value of unit columns that are told apart
 _RESAMPLES = 999
 
 
 class Identification(Model):
-    """Result of an identification; written as `identification.json`, which env and compensator take as their K."""
+    """Result of an identification; written as `identification.json`, which env and compensator
+    take as their K.
+    """
 
     stiffness_nm_per_rad: float
     stiffness_low_nm_per_rad: float
@@ -44,15 +48,17 @@ class Identification(Model):
     offset_rad: float
     """θ − q without torque: homing error of the encoder less that of the IMU."""
     imu_sine_error_rad: float | None
-    """Amplitude of an IMU error proportional to sin q; None with a single mass, which cannot tell it from K."""
+    """Amplitude of an IMU error proportional to sin q; None with a single mass, which cannot
+    tell it from K.
+    """
     line_stiffness_nm_per_rad: float
     """K of a plain line through all points."""
     pearson_r: float
     residual_rad: float
     """Standard deviation of the residuals."""
     hysteresis: bool
-    """Whether the two directions of approach differ: the 95 % interval of the friction excludes zero, and the
-    difference 2 F/K exceeds `HYSTERESIS_RESOLUTION_RAD`."""
+    """Whether the two directions of approach differ: the 95 % interval of the friction excludes
+    zero, and the difference 2 F/K exceeds `HYSTERESIS_RESOLUTION_RAD`."""
     friction_low_nm: float
     friction_high_nm: float
     points: int
@@ -61,7 +67,9 @@ class Identification(Model):
     @property
     def half_width(self) -> float:
         """Half-width of the interval of K relative to K."""
-        return (self.stiffness_high_nm_per_rad - self.stiffness_low_nm_per_rad) / (2.0 * self.stiffness_nm_per_rad)
+        return (self.stiffness_high_nm_per_rad - self.stiffness_low_nm_per_rad) / (
+            2.0 * self.stiffness_nm_per_rad
+        )
 
     def link_angles(self, points: StaticPoints) -> Array:
         """Link angles of static points in the encoder's zero, (len(points),) [rad]."""
@@ -79,7 +87,9 @@ class Identification(Model):
 
 @dataclass(frozen=True)
 class Fit:
-    """Coefficients of the regression: compliance 1/K, F/K, b/2, c, and with two loads the sine error."""
+    """Coefficients of the regression: compliance 1/K, F/K, b/2, c, and with two loads the sine
+    error.
+    """
 
     coefficients: Array
     residuals: Array
@@ -108,7 +118,8 @@ class Fit:
 
 
 def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: bool) -> Fit:
-    """Least squares of the deflections; the sign of the load, which depends on the friction, by iteration.
+    """Least squares of the deflections; the sign of the load, which depends on the friction, by
+    iteration.
 
     Args:
         points: Static points.
@@ -119,14 +130,21 @@ def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: b
     deflection = points.theta - points.q
     direction = points.direction.astype(np.float64)
     constant = [np.ones(len(points)), *([np.sin(q)] if with_sine_error else [])]
-    design, coefficients, friction, rank = np.zeros((len(points), 4)), np.zeros(4), 0.0, 0
+    design = np.zeros((len(points), 4))
+    coefficients = np.zeros(4)
+    friction = 0.0
+    rank = 0
     for _ in range(_SIGN_ITERATIONS):
-        design = np.stack([torque, direction, np.sign(torque + friction * direction), *constant], axis=1)
+        design = np.stack(
+            [torque, direction, np.sign(torque + friction * direction), *constant], axis=1
+        )
         scale = np.linalg.norm(design, axis=0)
         scaled, _, rank, _ = np.linalg.lstsq(design / scale, deflection, rcond=_SINGULAR)
         coefficients = scaled / scale
         friction = coefficients[1] / coefficients[0]
-    return Fit(coefficients, deflection - design @ coefficients, is_determined=rank == design.shape[1])
+    return Fit(
+        coefficients, deflection - design @ coefficients, is_determined=rank == design.shape[1]
+    )
 
 
 def fit_link_angles(
@@ -154,7 +172,9 @@ def corrected_angles(imu: Array, offset: float, sine_error: float) -> Array:
     return q
 
 
-def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed: int = 0) -> Identification:
+def identify_points(
+    points: StaticPoints, gravity: Sequence[GravityModel], seed: int = 0
+) -> Identification:
     """K, friction, dead band and offset of static points, with intervals from resampled positions.
 
     Args:
@@ -168,20 +188,23 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
     positions = np.unique(points.position)
     if len(positions) < 5 or len(np.unique(points.direction)) < 2:
         raise ElasticError(
-            f"an identification needs at least 5 positions approached from both sides, got {len(positions)} positions "
-            f"and the directions {np.unique(points.direction).tolist()}"
+            "an identification needs at least 5 positions approached from both sides, got"
+            f" {len(positions)} positions and the directions {np.unique(points.direction).tolist()}"
         )
     with_sine_error = len(gravity) > 1
     fit, q, torque = fit_link_angles(points, gravity, with_sine_error)
     if not fit.is_determined:
         masses = ", and two masses that differ" if with_sine_error else ""
         raise ElasticError(
-            "the points do not determine stiffness, friction, dead band and offset: positions with torques of both "
-            f"signs are needed{masses}; got {torque.min():.3g} to {torque.max():.3g} N·m"
+            "the points do not determine stiffness, friction, dead band and offset: positions with"
+            f" torques of both signs are needed{masses}; got {torque.min():.3g} to"
+            f" {torque.max():.3g} N·m"
         )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
-    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+    from scipy import (
+        stats,
+    )  # here: it takes half a second to load, and most programs need none of it
 
     generator = np.random.default_rng(seed)
 
@@ -195,10 +218,14 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
             chosen = generator.integers(len(rows), size=len(rows))
 
     interval = stats.bootstrap(
-        (np.arange(len(positions)),), statistics, n_resamples=_RESAMPLES, vectorized=False, method="percentile",
+        (np.arange(len(positions)),),
+        statistics,
+        n_resamples=_RESAMPLES,
+        vectorized=False,
+        method="percentile",
         confidence_level=_expanded_level(len(positions)),
         rng=generator,
-    ).confidence_interval  # fmt: skip
+    ).confidence_interval
     line: Any = stats.linregress(torque, points.theta - points.q)
     return Identification(
         stiffness_nm_per_rad=fit.stiffness,
@@ -227,17 +254,22 @@ def identify(
 
     Args:
         envs: One or two testbeds with reference "hold", scalar or vector.
-        seed: Seed of the episodes, of the first world's in a vector environment, and of the resampling.
+        seed: Seed of the episodes, of the first world's in a vector environment, and of the
+            resampling.
         progress: Called with the share of the work that is done.
 
     Returns:
         Result and points of every world; one entry each for scalar environments.
     """
     if len(envs) not in {1, 2}:
-        raise ConfigurationError(f"identification takes one environment or two with different masses, got {len(envs)}")
+        raise ConfigurationError(
+            f"identification takes one environment or two with different masses, got {len(envs)}"
+        )
     parts = []
     for number, env in enumerate(envs):
-        share = None if progress is None else (lambda done, n=number: progress((n + done) / len(envs)))
+        share = (
+            None if progress is None else (lambda done, n=number: progress((n + done) / len(envs)))
+        )
         parts.append(record_points(env, seed, share))
     gravity = [make_gravity(env.unwrapped.assumed_model) for env in envs]
     points = [StaticPoints.joined(world) for world in zip(*parts, strict=True)]
@@ -245,12 +277,18 @@ def identify(
 
 
 def _expanded_level(positions: int, level: float = 0.95) -> float:
-    """Level of a percentile interval that covers `level` with few positions, where the plain one is too narrow.
+    """Level of a percentile interval that covers `level` with few positions, where the plain one is
+    too narrow.
 
-    The expanded percentile interval of T. Hesterberg, "What Teachers Should Know About the Bootstrap", The American
-    Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the normal quantile.
+    The expanded percentile interval of T. Hesterberg, "What Teachers Should Know About the
+    Bootstrap", The American Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the
+    normal quantile.
     """
-    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+    from scipy import (
+        stats,
+    )  # here: it takes half a second to load, and most programs need none of it
 
-    quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf((1.0 + level) / 2.0, positions - 1)
+    quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf(
+        (1.0 + level) / 2.0, positions - 1
+    )
     return float(1.0 - 2.0 * stats.norm.sf(quantile))

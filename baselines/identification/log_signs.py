@@ -1,4 +1,6 @@
-"""Signs of a log that contradict the model: encoders that are swapped, and joints that turn the other way."""
+"""Signs of a log that contradict the model: encoders that are swapped, and joints that turn the
+other way.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,11 +13,15 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 
 _EXPLAINED = 0.8
-"""Share of a joint's deflections that a spring of negative stiffness explains where it contradicts the model."""
+"""Share of a joint's deflections that a spring of negative stiffness explains where it
+contradicts the model.
+"""
 _MOST_CORRELATED = -0.9
 _LEAST_MOTION_RAD = 0.05
 _BETTER = 0.2
-"""Ratio of the spreads of the residuals with a sign turned round and as logged, where the sign is wrong."""
+"""Ratio of the spreads of the residuals with a sign turned round and as logged, where the sign
+is wrong.
+"""
 _MOST_NAMED = 4
 _MOST_JOINTS = 16
 """Joints of an arm whose signs are tried."""
@@ -38,7 +44,8 @@ def require_like_encoders(log: PoseLog) -> None:
             wrong.append(joint)
     if wrong:
         raise ConfigurationError(
-            f"theta and q run against each other: a sign is wrong ({_joints(wrong)}); give both the sign of the model"
+            f"theta and q run against each other: a sign is wrong ({_joints(wrong)}); give both the"
+            " sign of the model"
         )
 
 
@@ -67,9 +74,9 @@ def require_deflections_with_load(model: PoseModel, unknowns: Array, half_width:
                 against.append(name)
     if against:
         raise ConfigurationError(
-            "the links deflect against their load: are theta and q swapped, or a sign wrong "
-            f"({_joints(against)})? Springs give way to the load; give theta.JOINT of the motor encoder and q.JOINT of "
-            "the link encoder in the signs of the model"
+            "the links deflect against their load: are theta and q swapped, or a sign wrong"
+            f" ({_joints(against)})? Springs give way to the load; give theta.JOINT of the motor"
+            " encoder and q.JOINT of the link encoder in the signs of the model"
         )
 
 
@@ -91,8 +98,9 @@ def require_signs(model: PoseModel, spread_of: Callable[[PoseModel], float]) -> 
     if least < _BETTER * spread_of(model):
         wrong = [joint for joint, own in found.items() if own < 2.0 * least]
         raise ConfigurationError(
-            f"the links deflect against their load: a sign is wrong ({_joints(wrong)}). With all columns of "
-            f"{' or '.join(wrong[:3])} turned round the poses fit the model; give them the sign of the model"
+            f"the links deflect against their load: a sign is wrong ({_joints(wrong)}). With all"
+            f" columns of {' or '.join(wrong[:3])} turned round the poses fit the model; give them"
+            " the sign of the model"
         )
 
 

@@ -50,7 +50,8 @@ class PoseLog:
         kind: What else was measured.
         columns: Joints or axes of the measurement, (m,).
         measured: The measurement, (N, m), in the unit of its kind.
-        direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the log has none.
+        direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the
+            log has none.
     """
 
     joints: tuple[str, ...]
@@ -64,7 +65,9 @@ class PoseLog:
         return len(self.theta)
 
 
-def read_log(path: Path, ranges: Mapping[str, tuple[float, float]], kind: Kind | None = None) -> PoseLog:
+def read_log(
+    path: Path, ranges: Mapping[str, tuple[float, float]], kind: Kind | None = None
+) -> PoseLog:
     """Read and check a log.
 
     Args:
@@ -77,42 +80,54 @@ def read_log(path: Path, ranges: Mapping[str, tuple[float, float]], kind: Kind |
     """
     columns = _columns(path)
     names = {
-        quantity: [key.split(".", 1)[1] for key in columns if key.startswith(f"{quantity}.")] for quantity in UNITS
+        quantity: [key.split(".", 1)[1] for key in columns if key.startswith(f"{quantity}.")]
+        for quantity in UNITS
     }
     for quantity in ("theta", "q", "torque", "direction"):
         for joint in names[quantity]:
             if joint not in ranges:
-                raise ConfigurationError(f"{path}, column {quantity}.{joint}: {unknown_name('joint', joint, ranges)}")
+                raise ConfigurationError(
+                    f"{path}, column {quantity}.{joint}: {unknown_name('joint', joint, ranges)}"
+                )
     joints = tuple(joint for joint in ranges if joint in names["theta"])
     if not joints:
         raise ConfigurationError(
-            f"{path} has no motor encoders; give a column theta.JOINT [rad] for each of: {', '.join(ranges)}"
+            f"{path} has no motor encoders; give a column theta.JOINT [rad] for each of:"
+            f" {', '.join(ranges)}"
         )
     quantity = _quantity(path, [name for name in KINDS if names[name]], kind)
     chosen = KINDS[quantity][0]
     _require_columns(path, chosen, names[quantity], joints)
     order = AXES.get(chosen) or tuple(joint for joint in joints if joint in names[quantity])
     log = PoseLog(
-        joints, _table(columns, "theta", joints), chosen, order, _table(columns, quantity, order),
+        joints,
+        _table(columns, "theta", joints),
+        chosen,
+        order,
+        _table(columns, quantity, order),
         _directions(path, columns, joints) if names["direction"] else None,
-    )  # fmt: skip
+    )
     _require_radians(path, "theta", joints, log.theta, ranges)
     if chosen == "link_encoders":
         _require_radians(path, "q", order, log.measured, ranges)
     if chosen == "imu":
-        _require_radians(path, "imu", order, log.measured, dict.fromkeys(order, (-math.pi, math.pi)))
+        _require_radians(
+            path, "imu", order, log.measured, dict.fromkeys(order, (-math.pi, math.pi))
+        )
     if np.ptp(log.theta, axis=0).max() < _ALIKE_RAD:
         raise ConfigurationError(
-            f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log poses that differ in "
-            "all joints, such as those that --plan proposes"
+            f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log"
+            " poses that differ in all joints, such as those that --plan proposes"
         )
     return averaged(log)
 
 
 def averaged(log: PoseLog) -> PoseLog:
-    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as their mean.
+    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as
+    their mean.
 
-    Their friction and the errors of the model are the same, so that they do not count as independent.
+    Their friction and the errors of the model are the same, so that they do not count as
+    independent.
     """
     sides = np.zeros_like(log.theta) if log.direction is None else log.direction
     starts = [0]
@@ -132,18 +147,27 @@ def averaged(log: PoseLog) -> PoseLog:
 def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:
     """Write columns such as `theta.elbow`, each (N,), as a log with units in its header."""
     units = [UNITS[name.split(".", 1)[0]] for name in columns]
-    header = [name if unit == "1" else f"{name} [{unit}]" for name, unit in zip(columns, units, strict=True)]
+    header = [
+        name if unit == "1" else f"{name} [{unit}]"
+        for name, unit in zip(columns, units, strict=True)
+    ]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
-        writer.writerows([[f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)])
+        writer.writerows(
+            [[f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)]
+        )
     return path
 
 
 def _columns(path: Path) -> dict[str, Array]:
     """All columns of the file by their names without units."""
     table = read_table(
-        path, what="log", row="pose", most_rows=MOST_POSES, example="theta.JOINT [rad] and q.JOINT [rad]"
+        path,
+        what="log",
+        row="pose",
+        most_rows=MOST_POSES,
+        example="theta.JOINT [rad] and q.JOINT [rad]",
     )
     names = [_name(path, text) for text in table.names]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -156,14 +180,16 @@ def _name(path: Path, text: str) -> str:
     found = _HEADER.match(text)
     if found is None or found[1] not in UNITS:
         raise ConfigurationError(
-            f"{path} has the column {shown(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT, direction.JOINT, "
-            "end_effector.x, .y, .z, imu.roll and imu.pitch"
+            f"{path} has the column {shown(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
+            " direction.JOINT, end_effector.x, .y, .z, imu.roll and imu.pitch"
         )
-    quantity, of, unit = found[1], found[2], found[3]
+    quantity = found[1]
+    of = found[2]
+    unit = found[3]
     if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
-            f"{path}, column {quantity}.{shown(of)[1:-1]}: the unit must be [{UNITS[quantity]}], got "
-            f"[{shown(unit)[1:-1]}]; convert the column"
+            f"{path}, column {quantity}.{shown(of)[1:-1]}: the unit must be [{UNITS[quantity]}],"
+            f" got [{shown(unit)[1:-1]}]; convert the column"
         )
     return f"{quantity}.{of}"
 
@@ -181,23 +207,30 @@ def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
         return found[0]
     if len(found) > 1:
         raise ConfigurationError(
-            f"{path} has several measurements ({', '.join(kinds)}) and one is used; choose it by --measured-by"
+            f"{path} has several measurements ({', '.join(kinds)}) and one is used; choose it by"
+            " --measured-by"
         )
     missing = f"none of {kind}" if kind else "none"
     raise ConfigurationError(
-        f"{path} needs a measurement besides the motor encoders and has {missing}; add columns q.JOINT [rad], "
-        "end_effector.x, .y, .z [m], imu.roll, imu.pitch [rad], or torque.JOINT [N·m]"
+        f"{path} needs a measurement besides the motor encoders and has {missing}; add columns"
+        " q.JOINT [rad], end_effector.x, .y, .z [m], imu.roll, imu.pitch [rad], or torque.JOINT"
+        " [N·m]"
     )
 
 
 def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> None:
-    """Refuse axes that are missing or unknown, and measurements of joints without a motor encoder."""
+    """Refuse axes that are missing or unknown, and measurements of joints without a motor
+    encoder.
+    """
     if kind in AXES and sorted(given) != sorted(AXES[kind]):
         raise ConfigurationError(
-            f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got {', '.join(given)}"
+            f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
+            f" {', '.join(given)}"
         )
     if kind not in AXES and (without := [joint for joint in given if joint not in joints]):
-        raise ConfigurationError(f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column")
+        raise ConfigurationError(
+            f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column"
+        )
 
 
 def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str]) -> Array:
@@ -206,14 +239,18 @@ def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str])
     table = np.stack([columns.get(f"direction.{joint}", zero) for joint in joints], axis=-1)
     if not np.isin(table, (-1.0, 0.0, 1.0)).all():
         raise ConfigurationError(
-            f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown), "
-            f"got {table[~np.isin(table, (-1.0, 0.0, 1.0))][0]:g}"
+            f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown),"
+            f" got {table[~np.isin(table, (-1.0, 0.0, 1.0))][0]:g}"
         )
     return table
 
 
 def _require_radians(
-    path: Path, quantity: str, of: Sequence[str], angles: Array, ranges: Mapping[str, tuple[float, float]]
+    path: Path,
+    quantity: str,
+    of: Sequence[str],
+    angles: Array,
+    ranges: Mapping[str, tuple[float, float]],
 ) -> None:
     """Refuse angles that the joints cannot reach, such as degrees."""
     bounds = np.array([ranges[name] for name in of])
@@ -226,17 +263,24 @@ def _require_radians(
         in_degrees = np.deg2rad(angles)
         is_degrees = bool(((in_degrees >= low) & (in_degrees <= high)).all())
         _refuse_angle(
-            path, f"{quantity}.{of[column]}", float(angles[pose, column]), bounds[column], is_degrees, int(pose)
+            path,
+            f"{quantity}.{of[column]}",
+            float(angles[pose, column]),
+            bounds[column],
+            is_degrees,
+            int(pose),
         )
 
 
-def _refuse_angle(path: Path, name: str, angle: float, bounds: Array, is_degrees: bool, pose: int) -> NoReturn:
+def _refuse_angle(
+    path: Path, name: str, angle: float, bounds: Array, is_degrees: bool, pose: int
+) -> NoReturn:
     cure = (
         "the angles look like degrees: convert them to radians"
         if is_degrees
         else "give angles in radians, in the zero and the sign of the model"
     )
     raise ConfigurationError(
-        f"{path}, pose {pose + 1}, column {name}: {angle:g} rad lies beyond the joint's range of {bounds[0]:g} to "
-        f"{bounds[1]:g} rad; {cure}"
+        f"{path}, pose {pose + 1}, column {name}: {angle:g} rad lies beyond the joint's range of"
+        f" {bounds[0]:g} to {bounds[1]:g} rad; {cure}"
     )

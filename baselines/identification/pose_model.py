@@ -4,13 +4,14 @@ The encoders read θ + o. At rest the transmissions carry
 
 .. math:: K (\theta - q) = \tau(q) + m\, b(q) + F d
 
-with the gravity torque τ, a payload m that adds b per kilogram, and friction on the link side of the springs: F d after
-an approach from the side d = ±1. Unknown are the compliances c = 1/K, in which the deflection is linear, the offsets o,
-and where asked F, m, and the frame of the measurement. Link encoders show q, a tracker R p(q) + t, an IMU its link's
-vertical, and torque sensors the right-hand side. Derivatives follow from
+with the gravity torque τ, a payload m that adds b per kilogram, and friction on the link side of
+the springs: F d after an approach from the side d = ±1. Unknown are the compliances c = 1/K, in
+which the deflection is linear, the offsets o, and where asked F, m, and the frame of the
+measurement. Link encoders show q, a tracker R p(q) + t, an IMU its link's vertical, and torque
+sensors the right-hand side. Derivatives follow from
 
 .. math:: (1 + C\, \partial\tau/\partial q)\, dq = -do - (\tau + m b + F d)\, dc - C (b\, dm + d\, dF)
-"""
+"""  # noqa: E501
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,12 +31,16 @@ Frame = Literal["known", "offset", "pose"]
 """What is known of the measurement's frame: all, its directions, or nothing."""
 
 LARGEST_DEFLECTION_RAD = 0.3
-"""Scale of the unknown compliances: the largest torque of a joint bends it by about as much, or less."""
+"""Scale of the unknown compliances: the largest torque of a joint bends it by about as much, or
+less.
+"""
 SMALLEST_LOAD = 1e-3
 """Share of the largest torque in the arm below which a joint counts as not loaded."""
 
 _PRIOR = {"offset": 0.3, "payload_kg": 10.0, "translation_m": 1.0, "rotation_rad": 0.3}
-_FIRST_ITERATIONS, _MOST_ITERATIONS, _LAST_STEP_RAD = 6, 50, 1e-12
+_FIRST_ITERATIONS = 6
+_MOST_ITERATIONS = 50
+_LAST_STEP_RAD = 1e-12
 _SOFT = 0.5
 """Change of the deflection by that of the link angle from which on the load is followed."""
 _FINEST_STEP = 0.05
@@ -67,11 +72,18 @@ class Unknowns:
         """Part of the vector for each kind of unknown."""
         k = len(self.elastic)
         sizes = {
-            "compliance": k, "offset": k, "friction": k * self.friction, "payload": int(self.payload),
-            "translation": 3 * self.translation, "rotation": 3 * self.rotation,
-        }  # fmt: skip
+            "compliance": k,
+            "offset": k,
+            "friction": k * self.friction,
+            "payload": int(self.payload),
+            "translation": 3 * self.translation,
+            "rotation": 3 * self.rotation,
+        }
         ends = np.cumsum(list(sizes.values()))
-        return {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        return {
+            name: slice(int(end) - size, int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
 
     @property
     def size(self) -> int:
@@ -86,7 +98,8 @@ class Unknowns:
             friction=log.direction is not None,
             payload=payload,
             translation=log.kind == "end_effector" and frame != "known",
-            rotation=(log.kind == "end_effector" and frame == "pose") or (log.kind == "imu" and frame != "known"),
+            rotation=(log.kind == "end_effector" and frame == "pose")
+            or (log.kind == "imu" and frame != "known"),
         )
 
 
@@ -96,7 +109,8 @@ class PoseModel:
 
     Attributes:
         arm: The rigid arm.
-        log: The poses; `measured` is used only to find the axes of an IMU and the frame to begin with.
+        log: The poses; `measured` is used only to find the axes of an IMU and the frame to begin
+            with.
         unknowns: What is sought.
     """
 
@@ -112,18 +126,22 @@ class PoseModel:
     @cached_property
     def scale(self) -> Array:
         """Plausible size of each unknown, (p,)."""
-        own, largest = self.unknowns.slices, max(float(np.abs(self.arm.torque(self.log.theta)).max()), 1e-9)
+        own = self.unknowns.slices
+        largest = max(float(np.abs(self.arm.torque(self.log.theta)).max()), 1e-9)
         load = np.maximum(self.load, SMALLEST_LOAD * largest)
         scale = np.empty(self.unknowns.size)
         scale[own["compliance"]] = LARGEST_DEFLECTION_RAD / load
         scale[own["offset"]] = _PRIOR["offset"]
         scale[own["friction"]] = load[: own["friction"].stop - own["friction"].start]
         scale[own["payload"]] = _PRIOR["payload_kg"]
-        scale[own["translation"]], scale[own["rotation"]] = _PRIOR["translation_m"], _PRIOR["rotation_rad"]
+        scale[own["translation"]] = _PRIOR["translation_m"]
+        scale[own["rotation"]] = _PRIOR["rotation_rad"]
         return scale
 
     def start_with(self, deflection_rad: float) -> Array:
-        """Unknowns to begin with, (p,): joints that bend by as much under their largest torque, and zeros."""
+        """Unknowns to begin with, (p,): joints that bend by as much under their largest torque,
+        and zeros.
+        """
         values = np.zeros(self.unknowns.size)
         compliance = self.unknowns.slices["compliance"]
         values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
@@ -135,11 +153,15 @@ class PoseModel:
         if not self.unknowns.rotation:
             return np.eye(3)
         at = self.arm.attitude(self.log.theta)
-        shown, own = self.log.measured, at.position
+        shown = self.log.measured
+        own = at.position
         if self.log.kind == "imu":
-            shown, own = vertical(self.log.measured), at.rotation.transpose(0, 2, 1) @ self.arm.up
+            shown = vertical(self.log.measured)
+            own = at.rotation.transpose(0, 2, 1) @ self.arm.up
             return Rotation.align_vectors(shown, own)[0].as_matrix()
-        return Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[0].as_matrix()
+        return Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[
+            0
+        ].as_matrix()
 
     @property
     def target(self) -> Array:
@@ -148,7 +170,8 @@ class PoseModel:
 
     def expand(self, unknowns: Array, name: str) -> Array:
         """One of c, o, F of all joints, zero where it is not sought, (n,)."""
-        values, own = np.zeros(len(self.log.joints)), unknowns[self.unknowns.slices[name]]
+        values = np.zeros(len(self.log.joints))
+        own = unknowns[self.unknowns.slices[name]]
         values[self.unknowns.elastic[: len(own)]] = own
         return values
 
@@ -211,9 +234,9 @@ class PoseModel:
         if path.lost.any():
             pose = int(path.lost[:, 0].argmax()) + 1
             raise ElasticError(
-                f"no link angles for pose {pose}: {path.reason(compliance, self.log.joints)}. Check zeros, units and "
-                "frame (--frame) of the log's columns, the point that was measured (--end-effector), and the masses of "
-                "the model"
+                f"no link angles for pose {pose}: {path.reason(compliance, self.log.joints)}. Check"
+                " zeros, units and frame (--frame) of the log's columns, the point that was"
+                " measured (--end-effector), and the masses of the model"
             )
         return path.q
 
@@ -232,24 +255,36 @@ class PoseModel:
 
     def _link_gradient(self, unknowns: Array, q: Array, inverse: Array) -> Array:
         """∂q/∂unknowns, (N, n, p)."""
-        own, elastic, compliance = self.unknowns.slices, self.unknowns.elastic, self.expand(unknowns, "compliance")
+        own = self.unknowns.slices
+        elastic = self.unknowns.elastic
+        compliance = self.expand(unknowns, "compliance")
         gradient = np.zeros((*q.shape, self.unknowns.size))
-        gradient[..., own["compliance"]] = -(inverse * self.torque(unknowns, q)[:, None])[..., elastic]
+        gradient[..., own["compliance"]] = -(inverse * self.torque(unknowns, q)[:, None])[
+            ..., elastic
+        ]
         gradient[..., own["offset"]] = -inverse[..., elastic]
         if self.log.direction is not None:
-            gradient[..., own["friction"]] = -(inverse * (compliance * self.log.direction)[:, None])[..., elastic]
+            gradient[..., own["friction"]] = -(
+                inverse * (compliance * self.log.direction)[:, None]
+            )[..., elastic]
         if self.unknowns.payload:
-            gradient[..., own["payload"]] = -inverse @ (compliance * self.arm.payload_torque(q))[..., None]
+            gradient[..., own["payload"]] = (
+                -inverse @ (compliance * self.arm.payload_torque(q))[..., None]
+            )
         return gradient
 
     def _turned(self, unknowns: Array) -> Array:
         """Rotation from the model's to the measurement's frame, (3, 3)."""
         turn = unknowns[self.unknowns.slices["rotation"]]
-        return Rotation.from_rotvec(turn).as_matrix() @ self._aligned if len(turn) else self._aligned
+        return (
+            Rotation.from_rotvec(turn).as_matrix() @ self._aligned if len(turn) else self._aligned
+        )
 
     def _positions(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
         """What a tracker shows [m]."""
-        own, R, at = self.unknowns.slices, self._turned(unknowns), self.arm.attitude(q)
+        own = self.unknowns.slices
+        R = self._turned(unknowns)
+        at = self.arm.attitude(q)
         turned = at.position @ R.T
         gradient = R @ at.position_gradient @ dq
         gradient[..., own["translation"]] = np.eye(3)[:, : 3 * self.unknowns.translation]
@@ -259,8 +294,13 @@ class PoseModel:
         return turned + (shift if len(shift) else 0.0), gradient
 
     def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
-        """Tilt between the vertical that the IMU should see and the one that it saw, about two axes [rad]."""
-        own, R, at, up = self.unknowns.slices, self._turned(unknowns), self.arm.attitude(q), self.arm.up
+        """Tilt between the vertical that the IMU should see and the one that it saw, about two
+        axes [rad].
+        """
+        own = self.unknowns.slices
+        R = self._turned(unknowns)
+        at = self.arm.attitude(q)
+        up = self.arm.up
         across = _across(vertical(self.log.measured))
         back = R @ at.rotation.transpose(0, 2, 1)
         seen = back @ up
@@ -271,22 +311,29 @@ class PoseModel:
 
     def _torques(self, unknowns: Array, q: Array, dq: Array, at: list[int]) -> tuple[Array, Array]:
         """What torque sensors show [N·m]."""
-        own, elastic = self.unknowns.slices, self.unknowns.elastic
+        own = self.unknowns.slices
+        elastic = self.unknowns.elastic
         gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns)) @ dq
         if self.log.direction is not None:
-            gradient[..., own["friction"]] += (np.eye(q.shape[1]) * self.log.direction[:, None])[..., elastic]
+            gradient[..., own["friction"]] += (np.eye(q.shape[1]) * self.log.direction[:, None])[
+                ..., elastic
+            ]
         if self.unknowns.payload:
             gradient[..., own["payload"]] += self.arm.payload_torque(q)[..., None]
         return self.torque(unknowns, q)[:, at], gradient[:, at]
 
 
 def vertical(attitude: Array) -> Array:
-    """Unit vector against gravity in the frame of an IMU, from roll and pitch, (N, 2) [rad] to (N, 3).
+    """Unit vector against gravity in the frame of an IMU, from roll and pitch, (N, 2) [rad] to (N,
+    3).
 
     Of R = R_z(yaw) R_y(pitch) R_x(roll), from the IMU's to the world's frame, it is the last row.
     """
-    roll, pitch = attitude[..., 0], attitude[..., 1]
-    return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
+    roll = attitude[..., 0]
+    pitch = attitude[..., 1]
+    return np.stack(
+        [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1
+    )
 
 
 def roll_and_pitch(direction: Array) -> Array:
@@ -312,4 +359,6 @@ def _cross(vectors: Array) -> Array:
     """Matrices of the cross product with vectors from the left, (N, 3) to (N, 3, 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     o = np.zeros_like(x)
-    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2)
+    return np.stack(
+        [np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2
+    )

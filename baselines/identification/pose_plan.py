@@ -1,15 +1,18 @@
-r"""Which further poses would tell the stiffness of joints apart: a D_s-optimal choice from random poses.
+r"""Which further poses would tell the stiffness of joints apart: a D_s-optimal choice from random
+poses.
 
-Poses are drawn within the joint ranges. Those in which parts of the arm touch are dropped, where the model has shapes.
-Of the rest those are chosen that shrink the joint confidence region of the compliances most. With the information M of
-all unknowns and its block M_f of those that are not sought (offsets, friction, frame, payload) this maximises
+Poses are drawn within the joint ranges. Those in which parts of the arm touch are dropped, where
+the model has shapes. Of the rest those are chosen that shrink the joint confidence region of the
+compliances most. With the information M of all unknowns and its block M_f of those that are not
+sought (offsets, friction, frame, payload) this maximises
 
 .. math:: \log\det M - \log\det M_f, \quad M = M_0 + \sum_i J_i^T J_i / \sigma^2
 
-where M_0 holds the log and the prior. Poses are added one by one, then exchanged for better ones until none is better
-(V. V. Fedorov, "Theory of Optimal Experiments", Academic Press, 1972; D_s-optimality: A. Atkinson, A. Donev, R. Tobias,
-"Optimum Experimental Designs, with SAS", Oxford, 2007, ch. 10). The weak prior makes this a Bayesian design, so that
-joints that no pose tells apart do no harm (K. Chaloner and I. Verdinelli, Statistical Science 10(3), 1995).
+where M_0 holds the log and the prior. Poses are added one by one, then exchanged for better ones
+until none is better (V. V. Fedorov, "Theory of Optimal Experiments", Academic Press, 1972;
+D_s-optimality: A. Atkinson, A. Donev, R. Tobias, "Optimum Experimental Designs, with SAS", Oxford,
+2007, ch. 10). The weak prior makes this a Bayesian design, so that joints that no pose tells apart
+do no harm (K. Chaloner and I. Verdinelli, Statistical Science 10(3), 1995).
 """
 
 from dataclasses import dataclass, replace
@@ -53,7 +56,12 @@ class PosePlan:
 
 
 def plan_poses(
-    model: PoseModel, unknowns: Array, spread: float, information: Array, candidates: PoseLog, count: int
+    model: PoseModel,
+    unknowns: Array,
+    spread: float,
+    information: Array,
+    candidates: PoseLog,
+    count: int,
 ) -> PosePlan:
     """Choose poses that tell the stiffness apart.
 
@@ -78,8 +86,11 @@ def plan_further(fit: ArmFit, candidates: PoseLog, count: int) -> PosePlan:
     return plan_poses(fit.model, fit.unknowns, fit.spread, fit.information, candidates, count)
 
 
-def candidate_poses(arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, generator: np.random.Generator) -> PoseLog:
-    """Random poses within limits and without contacts; pairs of bodies that touch in all poses of the log do not count.
+def candidate_poses(
+    arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, generator: np.random.Generator
+) -> PoseLog:
+    """Random poses within limits and without contacts; pairs of bodies that touch in all poses of
+    the log do not count.
 
     Args:
         arm: The arm.
@@ -91,9 +102,12 @@ def candidate_poses(arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, gener
         ElasticError: Nearly all poses are in contact.
     """
     low, high = np.where(np.isfinite(arm.ranges), arm.ranges, [-_UNLIMITED_RAD, _UNLIMITED_RAD]).T
-    middle, half = 0.5 * (low + high), 0.5 * _WITHIN * (high - low)
+    middle = 0.5 * (low + high)
+    half = 0.5 * _WITHIN * (high - low)
     touches = _Contacts(shapes, arm.joints)
-    usual = set.intersection(*(touches.of(theta) for theta in (like.theta if len(like) else [middle])))
+    usual = set.intersection(
+        *(touches.of(theta) for theta in (like.theta if len(like) else [middle]))
+    )
     poses: list[Array] = []
     for draw in range(_MOST_DRAWS * CANDIDATES):
         theta = middle + half * generator.uniform(-1.0, 1.0, len(middle))
@@ -103,22 +117,27 @@ def candidate_poses(arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, gener
             break
         if draw == _MOST_DRAWS * CANDIDATES - 1 and len(poses) < CANDIDATES // 10:
             raise ElasticError(
-                f"only {len(poses)} of {draw + 1} random poses are free of contacts; check joint ranges and shapes of "
-                "the model, or give a model without shapes"
+                f"only {len(poses)} of {draw + 1} random poses are free of contacts; check joint"
+                " ranges and shapes of the model, or give a model without shapes"
             )
     theta = np.array(poses)
     sides = None if like.direction is None else generator.choice([-1.0, 1.0], size=theta.shape)
-    return PoseLog(arm.joints, theta, like.kind, like.columns, _rigid_measurement(arm, like, theta), sides)
+    return PoseLog(
+        arm.joints, theta, like.kind, like.columns, _rigid_measurement(arm, like, theta), sides
+    )
 
 
 def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
     """The log of a measurement that is yet to be made, with sides of approach."""
-    columns, nothing = AXES.get(kind, arm.joints), np.zeros((0, len(arm.joints)))
+    columns = AXES.get(kind, arm.joints)
+    nothing = np.zeros((0, len(arm.joints)))
     return PoseLog(arm.joints, nothing, kind, columns, np.zeros((0, len(columns))), nothing)
 
 
 def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
-    """What a sensor in the model's own frame would show of rigid joints; only its directions matter, (N, m)."""
+    """What a sensor in the model's own frame would show of rigid joints; only its directions
+    matter, (N, m).
+    """
     if like.kind == "end_effector":
         return arm.attitude(theta).position
     if like.kind == "imu":
@@ -135,7 +154,8 @@ class _Contacts:
     """
 
     def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model = model
+        self._data = mujoco.MjData(model)
         if model.nkey:
             self._data.qpos[:] = model.key_qpos[0]
         self._at = [int(model.joint(joint).qposadr[0]) for joint in joints]

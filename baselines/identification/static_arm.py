@@ -1,4 +1,6 @@
-"""An arm at rest as identification needs it: torques with and without a payload, and where a body of it is."""
+"""An arm at rest as identification needs it: torques with and without a payload, and where a
+body of it is.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +40,8 @@ class StaticArm:
         model: Compiled rigid model on a fixed base.
         joints: Hinges in the order of all arrays; the others are held, see `PositionCompensator`.
         end_effector: Site or body that is measured; None for the outermost body.
-        payload: Body or site that carries a payload of unknown mass at its origin; None for no payload.
+        payload: Body or site that carries a payload of unknown mass at its origin; None for no
+            payload.
 
     Raises:
         ConfigurationError: The model cannot be used, or a name does not exist.
@@ -51,8 +54,10 @@ class StaticArm:
         end_effector: str | None = None,
         payload: str | None = None,
     ) -> None:
-        self.model, self.joints = model, tuple(joints)
-        # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into account
+        self.model = model
+        self.joints = tuple(joints)
+        # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into
+        # account
         self._bare = PositionCompensator(model, np.inf, joints=joints)
         self._loaded: PositionCompensator | None = None
         if payload is not None:
@@ -64,7 +69,8 @@ class StaticArm:
             self._data.qpos[:] = model.key_qpos[0]
         self._at = np.array([model.joint(joint).qposadr[0] for joint in joints])
         self._dofs = np.array([model.joint(joint).dofadr[0] for joint in joints])
-        self._body, self._point = _outermost(model), np.zeros(3)
+        self._body = _outermost(model)
+        self._point = np.zeros(3)
         self._turn = np.eye(3)
         self.end_effector = model.body(self._body).name or f"body {self._body}"
         if end_effector is not None:
@@ -87,7 +93,9 @@ class StaticArm:
             ConfigurationError: It has no gravity.
         """
         if not self.model.opt.gravity.any():
-            raise ConfigurationError("the model has no gravity, so nothing bends its joints; set <option gravity=...>")
+            raise ConfigurationError(
+                "the model has no gravity, so nothing bends its joints; set <option gravity=...>"
+            )
 
     def torque(self, q: Array) -> Array:
         """Torque that holds the arm without payload, (N, n) [rad] to (N, n) [N·m]."""
@@ -95,7 +103,11 @@ class StaticArm:
 
     def payload_torque(self, q: Array) -> Array:
         """What a payload of 1 kg adds, (N, n) [rad] to (N, n) [N·m]; zero without a payload."""
-        return np.zeros(q.shape) if self._loaded is None else _rows(self._loaded, q) - _rows(self._bare, q)
+        return (
+            np.zeros(q.shape)
+            if self._loaded is None
+            else _rows(self._loaded, q) - _rows(self._bare, q)
+        )
 
     def torque_gradient(self, q: Array, payload_kg: float = 0.0) -> Array:
         """∂τ/∂q by central differences, (N, n) [rad] to (N, n, n) [N·m/rad]."""
@@ -103,7 +115,9 @@ class StaticArm:
         for step in _STEP_RAD * np.eye(q.shape[-1]):
             change = self.torque(q + step) - self.torque(q - step)
             if payload_kg:
-                change += payload_kg * (self.payload_torque(q + step) - self.payload_torque(q - step))
+                change += payload_kg * (
+                    self.payload_torque(q + step) - self.payload_torque(q - step)
+                )
             columns.append(change / (2.0 * _STEP_RAD))
         return np.stack(columns, axis=-1)
 
@@ -120,12 +134,16 @@ class StaticArm:
             found.rotation[i] = turn @ self._turn
             found.position[i] = self._data.xpos[self._body] + turn @ self._point
             mujoco.mj_jac(self.model, self._data, *jacobians, found.position[i], self._body)
-            found.position_gradient[i], found.rotation_gradient[i] = (part[:, self._dofs] for part in jacobians)
+            found.position_gradient[i], found.rotation_gradient[i] = (
+                part[:, self._dofs] for part in jacobians
+            )
         return found
 
 
 def _rows(compensator: PositionCompensator, q: Array) -> Array:
-    """Torques at rest of all poses at once, with the bits of `PositionCompensator.torque`, (N, n) [N·m]."""
+    """Torques at rest of all poses at once, with the bits of `PositionCompensator.torque`, (N,
+    n) [N·m].
+    """
     return compensator._links.gravity_torque(q)
 
 

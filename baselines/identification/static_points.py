@@ -1,4 +1,6 @@
-"""Static points of a joint: encoder and IMU averaged at rest, at positions approached from both sides."""
+"""Static points of a joint: encoder and IMU averaged at rest, at positions approached from both
+sides.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,7 +39,11 @@ class StaticPoints:
     def rows(self, chosen: IntArray) -> "StaticPoints":
         """Some of the points, in the given order."""
         return StaticPoints(
-            self.theta[chosen], self.q[chosen], self.direction[chosen], self.position[chosen], self.load[chosen]
+            self.theta[chosen],
+            self.q[chosen],
+            self.direction[chosen],
+            self.position[chosen],
+            self.load[chosen],
         )
 
     @staticmethod
@@ -48,13 +54,16 @@ class StaticPoints:
             theta=np.concatenate([part.theta for part in parts]),
             q=np.concatenate([part.q for part in parts]),
             direction=np.concatenate([part.direction for part in parts]),
-            position=np.concatenate([part.position + start for part, start in zip(parts, first, strict=True)]),
+            position=np.concatenate(
+                [part.position + start for part, start in zip(parts, first, strict=True)]
+            ),
             load=np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)]),
         )
 
 
 class HoldRecorder:
-    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations and infos alone.
+    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations
+    and infos alone.
 
     Args:
         directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
@@ -67,7 +76,9 @@ class HoldRecorder:
         self._counts = np.zeros(len(directions), dtype=np.int64)
 
     def take(self, encoder: Array, imu: Array, rest: int) -> None:
-        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window, -1 outside."""
+        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window,
+        -1 outside.
+        """
         if rest >= 0:
             self._sums[rest] += np.stack([encoder, imu], axis=-1)
             self._counts[rest] += 1
@@ -84,7 +95,9 @@ class HoldRecorder:
             ElasticError: A window has no sample: the run ended early.
         """
         if not self.is_complete:
-            raise ElasticError(f"the run ended before all {len(self._counts)} static positions were visited")
+            raise ElasticError(
+                f"the run ended before all {len(self._counts)} static positions were visited"
+            )
         means = self._sums / self._counts[:, None, None]
         half = len(self._directions) // 2
         position = np.concatenate([np.arange(half), np.arange(half)[::-1]])
@@ -115,7 +128,8 @@ def record_points(
     task = env.unwrapped.task
     if not hasattr(task.config.reference, "visits"):
         raise ConfigurationError(
-            f"identification needs the reference 'hold', the environment has {task.config.reference.kind!r}"
+            "identification needs the reference 'hold', the environment has"
+            f" {task.config.reference.kind!r}"
         )
     recorder = HoldRecorder(task.config.reference.visits[1], task.num_worlds)
     encoder = task.observation_table.names.index("encoder_angle")
@@ -132,7 +146,9 @@ def record_points(
 
 
 def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], q: Array) -> Array:
-    """Gravity torque at link angles q, each under the load of its point, (len(points),) [rad] to [N·m]."""
+    """Gravity torque at link angles q, each under the load of its point, (len(points),) [rad] to
+    [N·m].
+    """
     torque = np.empty(len(points))
     for load, model in enumerate(gravity):
         rows = points.load == load

@@ -1,8 +1,9 @@
 """A base policy under a residual: what the residual acts on, and how fast it can change.
 
-The residual is a number in [−1, 1] for every column of the inputs that it acts on, or for every pair of joints. It is
-decided from the features of `baselines.residual.features` once in `decision_period` control steps. Times the bound of
-its column it passes a first-order low-pass, and becomes an input of the base (`baselines.compensation.inputs`).
+The residual is a number in [−1, 1] for every column of the inputs that it acts on, or for every
+pair of joints. It is decided from the features of `baselines.residual.features` once in
+`decision_period` control steps. Times the bound of its column it passes a first-order low-pass, and
+becomes an input of the base (`baselines.compensation.inputs`).
 """
 
 from typing import Any, NamedTuple
@@ -43,27 +44,30 @@ class Corrected:
         settings: How the residual acts.
 
     Raises:
-        ConfigurationError: An input that the base does not have, a joint that the robot has not, or caution without a
-            walker.
+        ConfigurationError: An input that the base does not have, a joint that the robot has not, or
+            caution without a walker.
     """
 
     def __init__(self, base: Policy, model: RobotModel, settings: ResidualSettings) -> None:
         has = inputs_of(base)
         if lacking := [name for name in settings.acts_on if name not in has]:
             raise ConfigurationError(
-                f"the residual acts on {', '.join(lacking)}, which {type(base).__name__} does not have as an input; "
-                f"it has: {', '.join(has)}"
+                f"the residual acts on {', '.join(lacking)}, which {type(base).__name__} does not"
+                f" have as an input; it has: {', '.join(has)}"
             )
         if settings.cautious and not isinstance(model, WalkerModel):
             raise ConfigurationError(
-                f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set cautious: false"
+                f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set"
+                " cautious: false"
             )
         self.base = as_batch_policy(base, model.observation_table, model.control_period_s)
         self.settings = settings
         self.model = model
         self.view = ObservationView(model.observation_table, model.control_period_s)
         self.channels = Channels(model, settings)
-        self._share = 1.0 - float(np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s))
+        self._share = 1.0 - float(
+            np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s)
+        )
 
     @property
     def num_residuals(self) -> int:
@@ -72,14 +76,17 @@ class Corrected:
 
     def begin(self, rows: Array) -> CorrectedMemory:
         """Memory at the start of an episode, whose first observations are rows, (num_worlds, m)."""
-        return CorrectedMemory(np.zeros((len(rows), len(self.channels.bounds))), self.base.begin(rows))
+        return CorrectedMemory(
+            np.zeros((len(rows), len(self.channels.bounds))), self.base.begin(rows)
+        )
 
     def act(
         self, observation: Array, residual: Array, state: Any = None, episode_start: Any = None
     ) -> tuple[Action, Any]:
         """Action and new state under a residual, (num_worlds, k) within [−1, 1].
 
-        A residual that has been zero since the start of the episode gives the base's action to the last bit.
+        A residual that has been zero since the start of the episode gives the base's action to the
+        last bit.
         """
         rows = self.view.rows(observation)
         memory = resume_memory(self, rows, state, episode_start)
@@ -108,23 +115,29 @@ class Corrected:
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        memory = resume_memory(self.base, rows, None if state is None else state.inner, episode_start)
+        memory = resume_memory(
+            self.base, rows, None if state is None else state.inner, episode_start
+        )
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Estimated link angle for an observation and the state that `act` returned for it, (..., n) [rad]."""
+        """Estimated link angle for an observation and the state that `act` returned for it,
+        (..., n) [rad].
+        """
         return self.base.link_estimate(observation, state.inner)
 
 
 class Channels:
-    """Columns on which a residual acts, by its settings: those of all its inputs, one input after the other.
+    """Columns on which a residual acts, by its settings: those of all its inputs, one input after
+    the other.
 
     Args:
         model: What may be known of the robot.
         settings: How the residual acts.
 
     Attributes:
-        signals: The numbers of a residual, (k,), as signals; those that left and right share have no side.
+        signals: The numbers of a residual, (k,), as signals; those that left and right share have
+            no side.
         bounds: Bound of every column, (width,); zero where the residual does not act.
 
     Raises:
@@ -149,11 +162,14 @@ class Channels:
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
         order = list(signals)
-        self._source = np.array([0 if source is None else order.index(source) for source in sources])
+        self._source = np.array(
+            [0 if source is None else order.index(source) for source in sources]
+        )
         self.signals = tuple(_rename(signal, name) for name, signal in signals.items())
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
-        """Values of all columns after a share of their way to what a residual wants, (num_worlds, width).
+        """Values of all columns after a share of their way to what a residual wants, (num_worlds,
+        width).
 
         Args:
             values: Before.
@@ -182,7 +198,9 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
         bounds[fit_columns(wanted, names, kind)] = value
     missing = [column for column, acts in zip(names, chosen & (bounds == 0.0), strict=True) if acts]
     if missing and kind.axes is None and settings.joints is not None:
-        raise ConfigurationError(f"{name} must have a bound for every joint of `joints`, none fits {missing}")
+        raise ConfigurationError(
+            f"{name} must have a bound for every joint of `joints`, none fits {missing}"
+        )
     return np.where(chosen, bounds, 0.0)
 
 

@@ -1,16 +1,18 @@
 r"""How far a walk shows that the model is wrong, and with it how far a cautious residual may act.
 
-Where the model is right there is nothing to correct, and whatever a residual does there does harm: it moves the feet
-by a millimeter per step, and the ZMP with them. So a cautious one acts in proportion to what speaks against the model:
-the relative error ρ of its stiffness in roll, as the bending shows it on either leg, with the uncertainty u that is
-left (`baselines.estimation.bending`), and the mean excess μ of the load over the assumed weight,
+Where the model is right there is nothing to correct, and whatever a residual does there does harm:
+it moves the feet by a millimeter per step, and the ZMP with them. So a cautious one acts in
+proportion to what speaks against the model: the relative error ρ of its stiffness in roll, as the
+bending shows it on either leg, with the uncertainty u that is left
+(`baselines.estimation.bending`), and the mean excess μ of the load over the assumed weight,
 
 .. math:: E = \overline{\rho^2 / (\sigma_\rho^2 + (2 u)^2)} + (\mu / \sigma_\mu)^2, \qquad g = E^2 / (1 + E^2)
 
-Well below σ the base is left alone, well above it the residual is free. An uncertain error is measured by two of its
-standard deviations: friction bends the joints of a leg that has not carried the robot yet, too. Pitch does not count,
-where friction hides more of the bending than a small error would show.
-"""
+Well below σ the base is left alone, well above it the residual is free. An uncertain error is
+measured by two of its standard deviations: friction bends the joints of a leg that has not carried
+the robot yet, too. Pitch does not count, where friction hides more of the bending than a small
+error would show.
+"""  # noqa: E501
 
 from typing import NamedTuple
 
@@ -27,15 +29,21 @@ ERROR_SCALE = 0.1
 LOAD_SCALE = 0.05
 """σ_ρ and σ_μ [1]: between what a right model shows in a walk, and errors that matter."""
 PRIOR_S = 0.5
-"""Time for which the assumed load counts in the mean [s]: a robot that steps presses with more and with less."""
+"""Time for which the assumed load counts in the mean [s]: a robot that steps presses with more
+and with less.
+"""
 
 _SEEN = SignalTable(BendingObserver.signals)
-_ERROR, _UNCERTAINTY = (_SEEN.columns(f"{group}.l_roll", f"{group}.r_roll") for group in ("model_error", "uncertainty"))
+_ERROR, _UNCERTAINTY = (
+    _SEEN.columns(f"{group}.l_roll", f"{group}.r_roll") for group in ("model_error", "uncertainty")
+)
 _LOAD = _SEEN.names.index("excess_load")
 
 
 class EvidenceMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the observer."""
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the
+    observer.
+    """
 
     loads: Array
     bending: Records
@@ -69,13 +77,17 @@ def caution(corrected: Corrected) -> Evidence | None:
     """Judge of how far a residual may act; None for one that is not cautious."""
     model = corrected.model
     settings = corrected.settings
-    if settings.cautious and isinstance(model, WalkerModel):  # `Corrected` refuses it for other robots
+    if settings.cautious and isinstance(
+        model, WalkerModel
+    ):  # `Corrected` refuses it for other robots
         return Evidence(model, settings.decision_period * model.control_period_s)
     return None
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:
-    """g, (...), from ρ of the legs and its uncertainty, (..., 2), and the mean excess μ of the load, (...) [1]."""
+    """g, (...), from ρ of the legs and its uncertainty, (..., 2), and the mean excess μ of the
+    load, (...) [1].
+    """
     bending = model_error**2 / (ERROR_SCALE**2 + (2.0 * uncertainty) ** 2)
     squared = (np.mean(bending, axis=-1) + (excess_load / LOAD_SCALE) ** 2) ** 2
     return squared / (1.0 + squared)

@@ -1,4 +1,5 @@
-"""Features that decide a residual: groups of the observation, and what can be said from it, the plan and the model.
+"""Features that decide a residual: groups of the observation, and what can be said from it, the
+plan and the model.
 
 | name | what it is |
 |---|---|
@@ -10,7 +11,7 @@
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
 | `base_action` | what the base alone would command now [rad] |
-"""
+"""  # noqa: E501
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -32,7 +33,9 @@ BASE_ACTION = "base_action"
 
 
 class Source(Protocol):
-    """Some features from observations; its memory is an array or a named tuple, one row per world."""
+    """Some features from observations; its memory is an array or a named tuple, one row per
+    world.
+    """
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -44,19 +47,24 @@ class Source(Protocol):
         ...
 
     def observe(self, rows: Array, memory: Any) -> tuple[Array, Any]:
-        """Features of observations, (num_worlds, m) to (num_worlds, signals), and the new memory."""
+        """Features of observations, (num_worlds, m) to (num_worlds, signals), and the new
+        memory.
+        """
         ...
 
 
 class FeaturesMemory(NamedTuple):
-    """Measurements of the last decisions, (num_worlds, history · k), the latest first; memory of the sources."""
+    """Measurements of the last decisions, (num_worlds, history · k), the latest first; memory of
+    the sources.
+    """
 
     past: Array
     sources: tuple[Any, ...]
 
 
 class Features:
-    """Features that decide a residual, in the order of the settings; the base's action and earlier measurements last.
+    """Features that decide a residual, in the order of the settings; the base's action and earlier
+    measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -70,12 +78,20 @@ class Features:
         model = corrected.model
         self._corrected = corrected
         period_s = settings.decision_period * model.control_period_s
-        self._sources = [_source(name, model, period_s) for name in _source_names(settings.observe, model)]
+        self._sources = [
+            _source(name, model, period_s) for name in _source_names(settings.observe, model)
+        ]
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
-        self._measured = np.array([i for i, signal in enumerate(seen) if signal.kind == "measured"], dtype=np.int64)
+        self._measured = np.array(
+            [i for i, signal in enumerate(seen) if signal.kind == "measured"], dtype=np.int64
+        )
         self._history = settings.history
-        commands = renamed(model.observation_table.signals_of("last_command"), BASE_ACTION) if self._acts else ()
+        commands = (
+            renamed(model.observation_table.signals_of("last_command"), BASE_ACTION)
+            if self._acts
+            else ()
+        )
         self.signals = (*seen, *commands)
         self.width = len(self.signals) + self._history * len(self._measured)
         measured = [seen[i] for i in self._measured]
@@ -87,7 +103,12 @@ class Features:
         return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
 
     def at(
-        self, rows: Array, memory: FeaturesMemory | None, fresh: BoolArray, state: Any, episode_start: Any
+        self,
+        rows: Array,
+        memory: FeaturesMemory | None,
+        fresh: BoolArray,
+        state: Any,
+        episode_start: Any,
     ) -> tuple[Array, FeaturesMemory]:
         """Features of a decision, and the memory for the next one.
 
@@ -105,8 +126,13 @@ class Features:
         begun = self.begin(n)
         if memory is None:
             fresh = np.ones_like(fresh)
-        kept: FeaturesMemory = begun if memory is None else put_rows(memory, fresh, select_rows(begun, fresh))
-        observed = [source.observe(rows, own) for source, own in zip(self._sources, kept.sources, strict=True)]
+        kept: FeaturesMemory = (
+            begun if memory is None else put_rows(memory, fresh, select_rows(begun, fresh))
+        )
+        observed = [
+            source.observe(rows, own)
+            for source, own in zip(self._sources, kept.sources, strict=True)
+        ]
         seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
         measured = seen[:, self._measured]
         past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), kept.past)
@@ -120,7 +146,8 @@ class Features:
         return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself without one.
+        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself
+        without one.
 
         Args:
             rows: Observations of the decision.
@@ -136,10 +163,14 @@ def _groups(model: RobotModel) -> list[str]:
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     """Names of the sources, with all groups for the whole observation."""
-    names = [group for name in observe for group in (_groups(model) if name == OBSERVATION else [name])]
+    names = [
+        group for name in observe for group in (_groups(model) if name == OBSERVATION else [name])
+    ]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ConfigurationError(f"observe must name everything once, {', '.join(twice)} are there twice")
+        raise ConfigurationError(
+            f"observe must name everything once, {', '.join(twice)} are there twice"
+        )
     return [name for name in names if name != BASE_ACTION]
 
 
@@ -156,8 +187,13 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
     if isinstance(model, WalkerModel) and name == "bending":
         return BendingObserver(model)
     errors = [error for error, groups in _ERRORS.items() if set(groups) <= set(_groups(model))]
-    further = [*errors, *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
-    raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
+    further = [
+        *errors,
+        *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else []),
+    ]
+    raise unknown_name(
+        "feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)]
+    )
 
 
 class _Instant:
@@ -174,7 +210,10 @@ class _Instant:
         return self._function(rows), memory
 
 
-_ERRORS = {"encoder_error": ("encoder_angle", "reference_angle"), "link_error": ("reference_angle", "link_encoder")}
+_ERRORS = {
+    "encoder_error": ("encoder_angle", "reference_angle"),
+    "link_error": ("reference_angle", "link_encoder"),
+}
 """Differences of two groups of the observation with a column per joint."""
 
 
@@ -186,16 +225,22 @@ def _error(name: str, model: RobotModel) -> _Instant:
 
 
 class _ContactError:
-    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
+    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less
+    the planned ones.
 
-    The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too little
-    for a ZMP.
+    The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too
+    little for a ZMP.
     """
 
     signals = (
         Signal("contact_error.x", "m", "ZMP less the planned one, forward", mirrored="same"),
         Signal("contact_error.y", "m", "likewise, to the left", mirrored="opposite"),
-        Signal("contact_error.share", "1", "share of the load on the right foot, likewise", mirrored="opposite"),
+        Signal(
+            "contact_error.share",
+            "1",
+            "share of the load on the right foot, likewise",
+            mirrored="opposite",
+        ),
     )
     _LEAST_N = 50.0
 
@@ -214,8 +259,13 @@ class _ContactError:
     def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         _, wrenches, memory = self._level.upright(rows, memory)
         wrench = wrenches.reshape(-1, 2, 2, 3)
-        force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
+        force, moment = self._sensors.ground_wrench(
+            wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
+        )
         zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
         vertical = force[:, :, 2].sum(axis=1)
-        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
+        share = (
+            force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
+            - rows[:, self._share][:, 0]
+        )
         return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0), memory

@@ -1,12 +1,14 @@
-"""A walker seen in the mirror of its plane of symmetry, x and z: what the right leg does looks as if the left did it.
+"""A walker seen in the mirror of its plane of symmetry, x and z: what the right leg does looks as
+if the left did it.
 
-A robot that is its own mirror image needs one answer for both of its steps. A residual that always sees the step on
-the left foot has half as much to learn, and learns it from twice as many steps. In the mirror left and right change
-places; vectors change their y, axes of rotation their x and z, and a share of the load or the choice of a foot, p,
-becomes 1 − p [Abdolhosseini2019]. What is decided in the mirror is turned back: the ZMP to the left becomes one to the
-right.
+A robot that is its own mirror image needs one answer for both of its steps. A residual that always
+sees the step on the left foot has half as much to learn, and learns it from twice as many steps. In
+the mirror left and right change places; vectors change their y, axes of rotation their x and z, and
+a share of the load or the choice of a foot, p, becomes 1 − p [Abdolhosseini2019]. What is decided
+in the mirror is turned back: the ZMP to the left becomes one to the right.
 
-[Abdolhosseini2019] F. Abdolhosseini et al., "On Learning Symmetric Locomotion", Motion, Interaction and Games.
+[Abdolhosseini2019] F. Abdolhosseini et al., "On Learning Symmetric Locomotion", Motion, Interaction
+and Games.
 """
 
 import re
@@ -31,7 +33,8 @@ class Mirror:
         signals: What the columns hold, with the sides l_ and r_ behind a dot.
 
     Raises:
-        ConfigurationError: A signal of which nobody has said what it is in the mirror, or one of a side alone.
+        ConfigurationError: A signal of which nobody has said what it is in the mirror, or one of a
+            side alone.
     """
 
     def __init__(self, signals: Sequence[Signal]) -> None:
@@ -39,8 +42,8 @@ class Mirror:
         others = [_other_side(name) for name in columns]
         if lacking := [name for name in others if name not in columns]:
             raise ConfigurationError(
-                f"in the mirror left and right change places, but there is no {', '.join(lacking)}; observe both, or "
-                "mirror: false"
+                f"in the mirror left and right change places, but there is no {', '.join(lacking)};"
+                " observe both, or mirror: false"
             )
         self._source = np.array([columns[name] for name in others], dtype=np.int64)
         self._sign = np.array([_sign(signal) for signal in signals])
@@ -60,15 +63,19 @@ class LeftFirst:
         corrected: The base and what acts on it.
 
     Raises:
-        ConfigurationError: No walker, a signal without a mirror image, or a joint corrected unlike the other leg's.
+        ConfigurationError: No walker, a signal without a mirror image, or a joint corrected unlike
+            the other leg's.
     """
 
-    def __init__(self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected) -> None:
+    def __init__(
+        self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected
+    ) -> None:
         model = corrected.model
         settings = corrected.settings
         if not isinstance(model, WalkerModel):
             raise ConfigurationError(
-                f"mirror is for a walker, whose legs are mirror images, got a {type(model).__name__}; set mirror: false"
+                "mirror is for a walker, whose legs are mirror images, got a"
+                f" {type(model).__name__}; set mirror: false"
             )
         bounds = corrected.channels.parts(corrected.channels.bounds)
         unlike = [
@@ -80,8 +87,8 @@ class LeftFirst:
         ]
         if unlike:
             raise ConfigurationError(
-                f"mirror needs joints and bounds that are the same on both legs, they are not for {', '.join(unlike)}; "
-                "name joints without l_ and r_, or mirror: false"
+                "mirror needs joints and bounds that are the same on both legs, they are not for"
+                f" {', '.join(unlike)}; name joints without l_ and r_, or mirror: false"
             )
         self._now = Mirror(signals)
         self._past = Mirror(measured)
@@ -91,7 +98,8 @@ class LeftFirst:
         self._support = model.observation_table.columns("clock.support")
 
     def __call__(self, rows: Array, features: Array) -> Array:
-        """Features as they are while the left foot is that of the step, and mirrored while the right is.
+        """Features as they are while the left foot is that of the step, and mirrored while the
+        right is.
 
         Args:
             rows: Observations, (num_worlds, m).
@@ -105,7 +113,9 @@ class LeftFirst:
         return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """A residual as it acts, (num_worlds, k): what was decided in the mirror is its mirror image."""
+        """A residual as it acts, (num_worlds, k): what was decided in the mirror is its mirror
+        image.
+        """
         return np.where(rows[:, self._support] == 1.0, self._residual(residual), residual)
 
 

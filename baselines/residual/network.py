@@ -56,29 +56,38 @@ def require_network(tensors: Tensors) -> int:
         _require_numbers(name, tensor)
     for name in ("mean", *(f"bias{i}" for i in range(depth))):
         if tensors[name].ndim != 1 or len(tensors[name]) == 0:
-            raise ConfigurationError(f"{name} must have the shape (n,) with n >= 1, got {tensors[name].shape}")
+            raise ConfigurationError(
+                f"{name} must have the shape (n,) with n >= 1, got {tensors[name].shape}"
+            )
     widths = [len(tensors[name]) for name in ("mean", *(f"bias{i}" for i in range(depth)))]
     for i in range(depth):
         if (shape := tensors[f"weight{i}"].shape) != (widths[i + 1], widths[i]):
-            raise ConfigurationError(f"weight{i} must have the shape {(widths[i + 1], widths[i])}, got {shape}")
+            raise ConfigurationError(
+                f"weight{i} must have the shape {(widths[i + 1], widths[i])}, got {shape}"
+            )
     if tensors["std"].shape != tensors["mean"].shape or not (tensors["std"] > 0.0).all():
-        raise ConfigurationError(f"std must have one positive value per feature, {widths[0]} of them")
+        raise ConfigurationError(
+            f"std must have one positive value per feature, {widths[0]} of them"
+        )
     return depth
 
 
 def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
     if tensor.dtype not in _TYPES:
-        raise ConfigurationError(f"{name} must be of type {' or '.join(_TYPES)}, got {tensor.dtype}")
+        raise ConfigurationError(
+            f"{name} must be of type {' or '.join(_TYPES)}, got {tensor.dtype}"
+        )
     largest = np.inf if name in ("mean", "std") else _LARGEST
     if not np.isfinite(tensor).all() or (np.abs(tensor) > largest).any():
         raise ConfigurationError(f"{name} must be finite, weights and biases within ±{_LARGEST:g}")
 
 
 class Network:
-    """Feed-forward network in single precision, as it was trained: the mean action of normalised features.
+    """Feed-forward network in single precision, as it was trained: the mean action of normalised
+    features.
 
-    A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant. They would also keep
-    threads in the way of the physics.
+    A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant.
+    They would also keep threads in the way of the physics.
 
     Args:
         settings: Activation, output and clipping.
@@ -93,7 +102,10 @@ class Network:
         self._mean = tensors["mean"].astype(np.float64)
         self._std = tensors["std"].astype(np.float64)
         self._layers = [
-            (np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T), tensors[f"bias{i}"].astype(np.float32))
+            (
+                np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T),
+                tensors[f"bias{i}"].astype(np.float32),
+            )
             for i in range(depth)
         ]
         self._activation = _ACTIVATIONS[settings.activation]
@@ -123,12 +135,16 @@ class Network:
 
 @compiled
 def affine(rows: Single, W: Single, b: Single) -> Single:
-    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up in the same order."""
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up
+    in the same order.
+    """
     out = np.empty((len(rows), len(b)), dtype=np.float32)
     for row in range(len(rows)):
         for j in range(len(b)):
             out[row, j] = b[j]
-        for i in range(W.shape[0]):  # along the outputs, whose sums are apart, the processor works on several at once
+        for i in range(
+            W.shape[0]
+        ):  # along the outputs, whose sums are apart, the processor works on several at once
             x = rows[row, i]
             for j in range(len(b)):
                 out[row, j] += x * W[i, j]

@@ -1,7 +1,9 @@
-"""Trained residuals as policies: a NumPy forward pass of weights from a folder, on top of the base they belong to.
+"""Trained residuals as policies: a NumPy forward pass of weights from a folder, on top of the base
+they belong to.
 
-A folder holds `residual.json` (base, settings, network, how it was trained) and `weights.safetensors`. Loading it runs
-no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
+A folder holds `residual.json` (base, settings, network, how it was trained) and
+`weights.safetensors`. Loading it runs no code from it and needs no torch. The observation is
+normalised in here; the base policy sees it as it is.
 """
 
 from hashlib import sha256
@@ -28,7 +30,8 @@ from elastic_env.core.tensors import read_tensors
 
 RESIDUAL = "residual:"
 """Before the folder of a trained residual, where policies are named."""
-DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
+DESCRIPTION = "residual.json"
+WEIGHTS = "weights.safetensors"
 _SHIPPED = Path(__file__).parents[1] / "trained"
 
 
@@ -67,7 +70,8 @@ class ResidualDescription(Model):
     """Between the layers."""
     output: Literal["clip", "tanh"] = "clip"
     """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
-    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
+    clip: float = quantity("1", 10.0, gt=0, le=1e6)
+    """Bound of normalised features, in standard deviations [1]."""
     weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """Digest of the weights; None for those of folders from before it was written."""
     training: dict[str, Any] = {}
@@ -97,7 +101,9 @@ def require_plain_base(name: str) -> str:
         ValueError: It is itself a residual, which could name another, or itself.
     """
     if name.startswith(RESIDUAL):
-        raise ValueError(f"the base of a residual must be no residual itself, got {name!r}; name a baseline")
+        raise ValueError(
+            f"the base of a residual must be no residual itself, got {name!r}; name a baseline"
+        )
     return name
 
 
@@ -140,8 +146,8 @@ class ResidualPolicy(BatchPolicy):
         expected = (self._features.width, corrected.num_residuals)
         if (network.num_features, network.num_outputs) != expected:
             raise ConfigurationError(
-                f"the network must take {expected[0]} features and give {expected[1]} residuals for these settings, "
-                f"it has {network.num_features} and {network.num_outputs}"
+                f"the network must take {expected[0]} features and give {expected[1]} residuals for"
+                f" these settings, it has {network.num_features} and {network.num_outputs}"
             )
         self._caution = caution(corrected)
 
@@ -156,7 +162,9 @@ class ResidualPolicy(BatchPolicy):
         )
 
     @override
-    def act(self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs) -> tuple[Array, ResidualMemory]:
+    def act(
+        self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs
+    ) -> tuple[Array, ResidualMemory]:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
             memory = put_rows(memory, due, select_rows(self._decide(rows, memory, due), due))
@@ -169,7 +177,9 @@ class ResidualPolicy(BatchPolicy):
 
     def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> ResidualMemory:
         """Memory after a decision, of the worlds that are due."""
-        seen, features = self._features.at(rows, memory.features, memory.wait == _UNDECIDED, memory.inner, None)
+        seen, features = self._features.at(
+            rows, memory.features, memory.wait == _UNDECIDED, memory.inner, None
+        )
         known = None
         residual = memory.residual.copy()
         residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
@@ -199,11 +209,15 @@ def save_residual(folder: Path, description: ResidualDescription, tensors: Tenso
 
 def shipped() -> list[str]:
     """Names of the residuals that come with the package, such as testbed/seed_0."""
-    return sorted(path.parent.relative_to(_SHIPPED).as_posix() for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}"))
+    return sorted(
+        path.parent.relative_to(_SHIPPED).as_posix() for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}")
+    )
 
 
 def located(folder: Path) -> Path:
-    """A residual's folder: the path itself, or where nothing lies there, the one of that name in the package."""
+    """A residual's folder: the path itself, or where nothing lies there, the one of that name in
+    the package.
+    """
     own = _SHIPPED / folder
     try:
         return own if not folder.exists() and own.exists() else folder
@@ -230,17 +244,26 @@ def read_description(folder: Path) -> ResidualDescription:
 def _none_at(folder: Path, why: str) -> str:
     """Sentence that says what to do where no residual is."""
     try:
-        inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
+        inside = [
+            path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")
+        ]
     except OSError:  # a name that is too long, or a folder that cannot be read
         inside = []
     if inside:
-        inside.sort(key=lambda path: (path.name != "last", path))  # the last policy, for the best one flatters itself
-        return f"{folder} is no residual but has some inside; give one of them: {', '.join(map(str, inside))}"
-    families = {name: [at.partition("/")[2] for at in own] for name, own in groupby(shipped(), _family)}
+        inside.sort(
+            key=lambda path: (path.name != "last", path)
+        )  # the last policy, for the best one flatters itself
+        return (
+            f"{folder} is no residual but has some inside; give one of them:"
+            f" {', '.join(map(str, inside))}"
+        )
+    families = {
+        name: [at.partition("/")[2] for at in own] for name, own in groupby(shipped(), _family)
+    }
     names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())
     return (
-        f"no residual at {shown(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), "
-        f"or the name of one that comes with the package: {names}"
+        f"no residual at {shown(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is"
+        f" needed ({why}), or the name of one that comes with the package: {names}"
     )
 
 
@@ -260,12 +283,15 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     try:
         network = Network(description, tensors)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{shortened(folder / WEIGHTS)} holds no network: {error}") from None
+        raise ConfigurationError(
+            f"{shortened(folder / WEIGHTS)} holds no network: {error}"
+        ) from None
     found = sha256(content).hexdigest()
     if description.weights_sha256 not in (None, found):
         raise ConfigurationError(
-            f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest {description.weights_sha256}, "
-            f"it has {found}; copy it anew, or leave weights_sha256 out if you mean these weights"
+            f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest"
+            f" {description.weights_sha256}, it has {found}; copy it anew, or leave weights_sha256"
+            " out if you mean these weights"
         )
     return description, network
 

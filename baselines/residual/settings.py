@@ -18,30 +18,38 @@ _OLD_SPACES = {"model": DEFLECTION, "joint": COMMAND}
 class ResidualSettings(Model):
     """How a residual acts and what it sees."""
 
-    acts_on: dict[Title, Bound | None] = Field(default={DEFLECTION: None}, min_length=1, max_length=MOST_ENTRIES)
-    """Inputs of the base that it acts on (`baselines.compensation.inputs`), and the value of each at a residual of 1.
-    That is a number for all columns, or a mapping by the end of the joints' names or by axis, as in
-    {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}, which leaves the others alone. None takes the input's default."""
-    decision_period: int = quantity("1", 25, ge=1, le=100_000, description="control steps between decisions")
-    cutoff_hz: float = quantity(
-        "Hz", 2.0, gt=0, le=1e6, description="cut-off of the first-order low-pass of the correction"
+    acts_on: dict[Title, Bound | None] = Field(
+        default={DEFLECTION: None}, min_length=1, max_length=MOST_ENTRIES
     )
+    """Inputs of the base that it acts on (`baselines.compensation.inputs`), and the value of each
+    at a residual of 1. That is a number for all columns, or a mapping by the end of the joints'
+    names or by axis, as in {deflection: {ankle_roll: 0.6}, zmp: {x: 0.02}}, which leaves the others
+    alone. None takes the input's default."""
+    decision_period: int = quantity("1", 25, ge=1, le=100_000)
+    """Control steps between decisions [1]."""
+    cutoff_hz: float = quantity("Hz", 2.0, gt=0, le=1e6)
+    """Cut-off of the first-order low-pass of the correction [Hz]."""
     joints: Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)] | None = None
-    """Joints in which it acts, where an input has one column per joint, by the end of their names (ankle_roll means
-    both); None for all."""
+    """Joints in which it acts, where an input has one column per joint, by the end of their names
+    (ankle_roll means both); None for all."""
     shared: bool = False
-    """Left and right joints of the same name share their residual: there are half as many to explore, and one
-    that follows the step still tells the legs apart by which of them carries the robot."""
+    """Left and right joints of the same name share their residual: there are half as many to
+    explore, and one that follows the step still tells the legs apart by which of them carries the
+    robot."""
     mirror: bool = False
-    """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is turned back
-    (`baselines.residual.mirror`). For a walker."""
+    """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is
+    turned back (`baselines.residual.mirror`). For a walker."""
     cautious: bool = False
-    """It is played only as far as there is `evidence` that the model is wrong (`baselines.residual.evidence`),
-    and else leaves the base alone. In training, under the wrappers of `train`, it acts freely. For a walker."""
-    observe: tuple[Title, ...] = Field(default=("observation",), min_length=1, max_length=MOST_ENTRIES)
-    """Features that it sees: groups of the observation such as (clock, load_share), or all of it, and what
-    `baselines.residual.features` makes of it and of the plan."""
-    history: int = quantity("1", 0, ge=0, le=1000, description="earlier decisions whose measurements it sees as well")
+    """It is played only as far as there is `evidence` that the model is wrong
+    (`baselines.residual.evidence`), and else leaves the base alone. In training, under the wrappers
+    of `train`, it acts freely. For a walker."""
+    observe: tuple[Title, ...] = Field(
+        default=("observation",), min_length=1, max_length=MOST_ENTRIES
+    )
+    """Features that it sees: groups of the observation such as (clock, load_share), or all of it,
+    and what `baselines.residual.features` makes of it and of the plan."""
+    history: int = quantity("1", 0, ge=0, le=1000)
+    """Earlier decisions whose measurements it sees as well [1]."""
 
     @model_validator(mode="before")
     @classmethod
@@ -53,7 +61,10 @@ class ResidualSettings(Model):
             raise ValueError("acts_on says what space and scale said before; leave these two out")
         space = values.get("space", "model")
         if not isinstance(space, str) or space not in _OLD_SPACES:
-            raise ValueError(f"space must be one of {', '.join(_OLD_SPACES)}, got {shown(space)}; better give acts_on")
+            raise ValueError(
+                f"space must be one of {', '.join(_OLD_SPACES)}, got {shown(space)}; better give"
+                " acts_on"
+            )
         others = {key: value for key, value in values.items() if key not in ("space", "scale")}
         return {**others, "acts_on": {_OLD_SPACES[space]: values.get("scale")}}
 
@@ -62,13 +73,22 @@ class ResidualSettings(Model):
         require_known("input", self.acts_on, INPUTS)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
-            given = bound.values() if isinstance(bound, dict) else [kind.default if bound is None else bound]
+            given = (
+                bound.values()
+                if isinstance(bound, dict)
+                else [kind.default if bound is None else bound]
+            )
             if not given or not all(0.0 < one < kind.limit for one in given):
                 limit = f"{kind.limit:g} {kind.unit}".removesuffix(" 1")
-                raise ValueError(f"the bound of {name} must be positive and below {limit}, got {shown(bound)}")
+                raise ValueError(
+                    f"the bound of {name} must be positive and below {limit}, got {shown(bound)}"
+                )
         return self
 
     @property
     def bounds(self) -> dict[str, Bound]:
         """`acts_on` with the defaults put in."""
-        return {name: INPUTS[name].default if bound is None else bound for name, bound in self.acts_on.items()}
+        return {
+            name: INPUTS[name].default if bound is None else bound
+            for name, bound in self.acts_on.items()
+        }

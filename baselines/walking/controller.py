@@ -1,22 +1,27 @@
-r"""The walking controller: foot force difference control, and feedback of the center of mass from joint angles.
+r"""The walking controller: foot force difference control, and feedback of the center of mass from
+joint angles.
 
 * Foot force difference control [Kajita2010]: the leg that carries too little grows,
   ż = k ((F_l − F_r)_ref − (F_l − F_r)) − z/T, half of z on each side.
-* Feedback of the center of mass: the error of the divergent component of motion ξ = c + ċ/ω asks for a ZMP shift
-  Δp = k (ξ − ξ_ref), which the ankles produce by winding their springs, Δτ/K.
-* Dry friction of the joints that the plan moves is wound against likewise, F/K in the direction of the planned rate;
-  F is what an identification found.
+* Feedback of the center of mass: the error of the divergent component of motion ξ = c + ċ/ω asks
+  for a ZMP shift Δp = k (ξ − ξ_ref), which the ankles produce by winding their springs, Δτ/K.
+* Dry friction of the joints that the plan moves is wound against likewise, F/K in the direction of
+  the planned rate; F is what an identification found.
 
-Inputs (`baselines.compensation.inputs`) shift the plan's ZMP or center of mass (`baselines.walking.zmp_shift`), add to
-the leg length difference, turn the hips, and change the gains. Feedback then refers to the shifted plan.
+Inputs (`baselines.compensation.inputs`) shift the plan's ZMP or center of mass
+(`baselines.walking.zmp_shift`), add to the leg length difference, turn the hips, and change the
+gains. Feedback then refers to the shifted plan.
 
-All are offsets of the joints around the planned walk. Where a joint is, it takes from the encoder columns of the
-observation, so that an output compensator around it (`baselines.Compensated`) shows it links instead of motors.
+All are offsets of the joints around the planned walk. Where a joint is, it takes from the encoder
+columns of the observation, so that an output compensator around it (`baselines.Compensated`) shows
+it links instead of motors.
 
-Local frame: at the sole of the step's support foot, level, its place in the plan's world that of the planned foothold,
-re-taken at every support change. The center of mass in it follows from joint angles and the attitude of the IMU.
+Local frame: at the sole of the step's support foot, level, its place in the plan's world that of
+the planned foothold, re-taken at every support change. The center of mass in it follows from joint
+angles and the attitude of the IMU.
 
-[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
+[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum
+Tracking", IROS.
 """
 
 import math
@@ -28,8 +33,20 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import shifted_shares
-from baselines.compensation.policy import NO_INPUTS, ONE_WORLD, BatchPolicy, PolicyInputs, Records, WalkView
-from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share, move_pelvis
+from baselines.compensation.policy import (
+    NO_INPUTS,
+    ONE_WORLD,
+    BatchPolicy,
+    PolicyInputs,
+    Records,
+    WalkView,
+)
+from baselines.walking.zmp_shift import (
+    Stances,
+    center_of_mass_per_pelvis,
+    following_share,
+    move_pelvis,
+)
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -42,22 +59,31 @@ from elastic_env.world.robot_model import WalkerModel
 class WalkingGains(Model):
     """Gains of the walking controller."""
 
-    force_difference: float = quantity("m/(N·s)", 8e-4, ge=0, description="leg length difference per force difference")
-    force_difference_decay_s: float = quantity("s", 0.5, gt=0, description="time constant of its decay")
-    force_difference_limit_m: float = quantity("m", 0.04, gt=0, description="largest difference of the leg lengths")
-    dcm: float = quantity("1", 0.4, ge=0, description="ZMP shift per error of the divergent component of motion")
-    zmp_limit_m: float = quantity("m", 0.06, gt=0, description="largest ZMP shift")
-    velocity_filter_s: float = quantity("s", 0.05, gt=0, description="time constant of the COM velocity")
-    zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
-    friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
+    force_difference: float = quantity("m/(N·s)", 8e-4, ge=0)
+    """Leg length difference per force difference [m/(N·s)]."""
+    force_difference_decay_s: float = quantity("s", 0.5, gt=0)
+    """Time constant of its decay [s]."""
+    force_difference_limit_m: float = quantity("m", 0.04, gt=0)
+    """Largest difference of the leg lengths [m]."""
+    dcm: float = quantity("1", 0.4, ge=0)
+    """ZMP shift per error of the divergent component of motion [1]."""
+    zmp_limit_m: float = quantity("m", 0.06, gt=0)
+    """Largest ZMP shift [m]."""
+    velocity_filter_s: float = quantity("s", 0.05, gt=0)
+    """Time constant of the COM velocity [s]."""
+    zmp_filter_s: float = quantity("s", 0.03, gt=0)
+    """Time constant of the ZMP shift [s]."""
+    friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0)
+    """Joint rate at which friction acts in full [rad/s]."""
     weight_filter_s: float | None = None
-    """Time constant of the weight that is measured [s]. Null takes the assumed weight. A load on the robot then
-    shortens the leg that carries it."""
+    """Time constant of the weight that is measured [s]. Null takes the assumed weight. A load on
+    the robot then shortens the leg that carries it."""
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Center of mass and feet as a controller sees them, level and relative to the pelvis, one row per world.
+    """Center of mass and feet as a controller sees them, level and relative to the pelvis, one row
+    per world.
 
     Attributes:
         com: Center of mass, (num_worlds, 3) [m].
@@ -74,7 +100,9 @@ class LocalFrame:
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
-    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
+    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2)
+    [rad].
+    """
     return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), _sole(biped), attitude))
 
 
@@ -186,7 +214,9 @@ class WalkingController(BatchPolicy):
 
     @override
     def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> tuple[Array, Records]:
-        """A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as much."""
+        """A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as
+        much.
+        """
         observed = self._walk_view.fields(rows)
         com, soles = self._local_frame(rows)
         action = np.empty((len(rows), 12))
@@ -213,7 +243,9 @@ class WalkingController(BatchPolicy):
         return action.astype(np.float32), now
 
     def _local_frame(self, rows: Array) -> tuple[Array, Array]:
-        """Center of mass, (num_worlds, 3), and soles, (num_worlds, 2, 3), level and relative to the pelvis [m]."""
+        """Center of mass, (num_worlds, 3), and soles, (num_worlds, 2, 3), level and relative to
+        the pelvis [m].
+        """
         q = np.ascontiguousarray(rows[:, self._theta]).reshape(-1, 2, 6)
         com = np.empty((len(rows), 3))
         soles = np.empty((len(rows), 2, 3))
@@ -222,7 +254,9 @@ class WalkingController(BatchPolicy):
         return com, soles
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for those of the plan."""
+        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for
+        those of the plan.
+        """
         if shift is None:
             return _NO_SHARES
         shares = np.empty(len(observed))
@@ -262,7 +296,9 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
     constants["friction_deflection"] = model.coulomb_friction.reshape(2, 6) / stiffness
     constants["velocity_share"] = _share(period_s, gains.velocity_filter_s)
     constants["zmp_share"] = _share(period_s, gains.zmp_filter_s)
-    constants["weight_share"] = 0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s)
+    constants["weight_share"] = (
+        0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s)
+    )
     return constants
 
 
@@ -337,13 +373,17 @@ def control(
         own = now[world]
         last = before[world]
         given = inputs[world]
-        row = int(min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0))
+        row = int(
+            min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0)
+        )
         coming[world] = min(row + 1, len(plan) - 1)
         planned = plan[row]
         own.steps = last.steps + 1.0
         ramped = ramp[int(min(own.steps, len(ramp) - 1.0))]
         for i in range(2):
-            own.following[i] = follow_zmp(last.following[i], given.zmp[i], constants.following_share)
+            own.following[i] = follow_zmp(
+                last.following[i], given.zmp[i], constants.following_share
+            )
             own.planned[i] = ramped * (own.following[i] + given.com[i])
             pelvis[world, i] = own.planned[i] / constants.per_pelvis[i]
             is_shifted = is_shifted or own.planned[i] != 0.0
@@ -361,7 +401,9 @@ def control(
 
 @compiled
 def follow_zmp(center: float, zmp: float, share: float) -> float:
-    """The center of mass a period later, under a ZMP shift that stays as it is; see `baselines.walking.zmp_shift`."""
+    """The center of mass a period later, under a ZMP shift that stays as it is; see
+    `baselines.walking.zmp_shift`.
+    """
     return center + share * (zmp - center)
 
 
@@ -381,7 +423,9 @@ def vertical_force(shown: Any, foot: int) -> float:
 
 
 @compiled
-def balance_feet(controller: Any, shown: Any, share: float, change: float, last: Any, own: Any) -> None:
+def balance_feet(
+    controller: Any, shown: Any, share: float, change: float, last: Any, own: Any
+) -> None:
     """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
     gain = (1.0 + change) * controller.force_difference
     desired = (1.0 - 2.0 * share) * own.weight
@@ -392,7 +436,9 @@ def balance_feet(controller: Any, shown: Any, share: float, change: float, last:
 
 
 @compiled
-def follow_com(controller: Any, shown: Any, planned: Any, change: float, last: Any, own: Any) -> None:
+def follow_com(
+    controller: Any, shown: Any, planned: Any, change: float, last: Any, own: Any
+) -> None:
     """Filtered deviation of the COM velocity from the plan [m/s], and ZMP shift [m]."""
     support = int(shown.clock[2])
     for i in range(2):
@@ -404,15 +450,21 @@ def follow_com(controller: Any, shown: Any, planned: Any, change: float, last: A
             before = com - last.planned[i]
             deviation = now + controller.footholds[support, i] - planned.com[i]
             deviating = (now - before) / controller.period_s - planned.com_dot[i]
-            own.velocity[i] = last.velocity[i] + controller.velocity_share * (deviating - last.velocity[i])
+            own.velocity[i] = last.velocity[i] + controller.velocity_share * (
+                deviating - last.velocity[i]
+            )
             error = deviation + own.velocity[i] / controller.omega
             wanted = within((1.0 + change) * controller.dcm * error, controller.zmp_limit_m)
             own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
 
 
 @compiled
-def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array) -> None:
-    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added, and friction [rad]."""
+def offset_leg(
+    controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array
+) -> None:
+    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added,
+    and friction [rad].
+    """
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
     difference = own.difference + given.leg_length
@@ -440,8 +492,11 @@ def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp
 
 
 @compiled
-def lengthening(controller: Any, knee: float, difference: float, sign: float) -> tuple[float, float, float]:
-    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or shorten it [rad].
+def lengthening(
+    controller: Any, knee: float, difference: float, sign: float
+) -> tuple[float, float, float]:
+    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or
+    shorten it [rad].
 
     The ankle stays on the line from the hip, and the sole keeps its attitude.
     """

@@ -1,26 +1,32 @@
-r"""Balance by moving the feet: the published stabiliser of THORMANG3, in the place of the walking controller.
+r"""Balance by moving the feet: the published stabiliser of THORMANG3, in the place of the walking
+controller.
 
-The planned poses of the feet in the pelvis are adjusted, and inverse kinematics give the joint angles:
+The planned poses of the feet in the pelvis are adjusted, and inverse kinematics give the joint
+angles:
 
 ==============  =======================================================================================
-both feet turn  :math:`u = k_\varphi \hat\varphi + 0.1 \, k_\omega \hat\omega` about x and y: against the pelvis' tilt φ
-each foot z     :math:`(R_y(u_y) R_x(u_x) r)_z`, r its place from the middle of the feet: they turn as one
-each foot gives :math:`k_f (f - f_{ref})` along x, y, z and :math:`k_m m` about x and y
+both feet turn  :math:`u = k_\varphi \hat\varphi + 0.1 \, k_\omega \hat\omega` about x and y:
+against the pelvis' tilt φ each foot z     :math:`(R_y(u_y) R_x(u_x) r)_z`, r its place from the
+middle of the feet: they turn as one each foot gives :math:`k_f (f - f_{ref})` along x, y, z and
+:math:`k_m m` about x and y
 ==============  =======================================================================================
 
-f and m are force and moment of the foot on its leg: a foot that carries too much rises. The force that is wanted has
-the planned load share, and m a of the planned center of mass. Every measurement passes a first-order low-pass,
-α = 2πfT/(1 + 2πfT). An adjustment is bounded. The center of mass is not fed back, and motors are taken for links.
+f and m are force and moment of the foot on its leg: a foot that carries too much rises. The force
+that is wanted has the planned load share, and m a of the planned center of mass. Every measurement
+passes a first-order low-pass, α = 2πfT/(1 + 2πfT). An adjustment is bounded. The center of mass is
+not fed back, and motors are taken for links.
 
 Source: thor-mang/ROBOTIS-THORMANG-MPC, a fork of ROBOTIS-GIT/ROBOTIS-THORMANG-MPC, has the method:
-thormang3_balance_control/src/thormang3_balance_control.cpp (adjustments, bounds, the factor 0.1) and
-thormang3_walking_module/src/thormang3_online_walking.cpp (forces wanted). Gains and cut-off frequencies are those of
-thor-mang/ROBOTIS-THORMANG-OPC, thormang3_demo/config/balance_param.yaml. Its derivative gains are zero and left out.
-Its shift of the center of mass, which was set by hand for that robot, is left out too.
+thormang3_balance_control/src/thormang3_balance_control.cpp (adjustments, bounds, the factor 0.1)
+and thormang3_walking_module/src/thormang3_online_walking.cpp (forces wanted). Gains and cut-off
+frequencies are those of thor-mang/ROBOTIS-THORMANG-OPC, thormang3_demo/config/balance_param.yaml.
+Its derivative gains are zero and left out. Its shift of the center of mass, which was set by hand
+for that robot, is left out too.
 
-Other than published: 250 Hz instead of 125 Hz. In double support horizontal forces follow the load share, not halves. A
-foot out of reach comes as near as the leg allows. The joint angles have no further feedback.
-"""
+Other than published: 250 Hz instead of 125 Hz. In double support horizontal forces follow the load
+share, not halves. A foot out of reach comes as near as the leg allows. The joint angles have no
+further feedback.
+"""  # noqa: E501
 
 from typing import NamedTuple
 
@@ -42,15 +48,24 @@ from elastic_env.world.robot_model import WalkerModel
 class FootBalanceGains(Model):
     """Gains of the balance by the feet; the defaults are the published values."""
 
-    gyro_s: float = quantity("s", 0.05, ge=0, description="turn of the feet per rate of the tilt, 0.1 times 0.5")
-    attitude: float = quantity("1", 1.0, ge=0, description="turn of the feet per tilt")
-    force_horizontal: float = quantity("m/N", 0.125e-3, ge=0, description="shift of a foot per excess force, x and y")
-    force_vertical: float = quantity("m/N", 0.015e-3, ge=0, description="lift of a foot per excess force")
-    moment: float = quantity("rad/(N·m)", 0.001, ge=0, description="turn of a foot per moment on it")
-    imu_cutoff_hz: float = quantity("Hz", 40.0, gt=0, description="cut-off frequency of attitude and gyroscope")
-    wrench_cutoff_hz: float = quantity("Hz", 30.0, gt=0, description="cut-off frequency of forces and moments")
-    shift_limit_m: float = quantity("m", 0.05, gt=0, description="largest shift of a foot along an axis")
-    turn_limit_rad: float = quantity("rad", np.deg2rad(15.0), gt=0, description="largest turn of a foot about an axis")
+    gyro_s: float = quantity("s", 0.05, ge=0)
+    """Turn of the feet per rate of the tilt, 0.1 times 0.5 [s]."""
+    attitude: float = quantity("1", 1.0, ge=0)
+    """Turn of the feet per tilt [1]."""
+    force_horizontal: float = quantity("m/N", 0.125e-3, ge=0)
+    """Shift of a foot per excess force, x and y [m/N]."""
+    force_vertical: float = quantity("m/N", 0.015e-3, ge=0)
+    """Lift of a foot per excess force [m/N]."""
+    moment: float = quantity("rad/(N·m)", 0.001, ge=0)
+    """Turn of a foot per moment on it [rad/(N·m)]."""
+    imu_cutoff_hz: float = quantity("Hz", 40.0, gt=0)
+    """Cut-off frequency of attitude and gyroscope [Hz]."""
+    wrench_cutoff_hz: float = quantity("Hz", 30.0, gt=0)
+    """Cut-off frequency of forces and moments [Hz]."""
+    shift_limit_m: float = quantity("m", 0.05, gt=0)
+    """Largest shift of a foot along an axis [m]."""
+    turn_limit_rad: float = quantity("rad", np.deg2rad(15.0), gt=0)
+    """Largest turn of a foot about an axis [rad]."""
 
 
 class BalanceMemory(NamedTuple):
@@ -76,7 +91,9 @@ class FootBalance(BatchPolicy):
         ramp_s: Time in which the feedback grows from zero [s].
     """
 
-    def __init__(self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S) -> None:
+    def __init__(
+        self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S
+    ) -> None:
         table = model.observation_table
         super().__init__(table, model.control_period_s)
         self._gains = gains or FootBalanceGains()
@@ -90,14 +107,20 @@ class FootBalance(BatchPolicy):
         self._clock = table.group("clock")
         acceleration, _ = derivatives(self._plan.com_dot, self._dt)
         wanted = np.hstack([acceleration / self._biped.gravity, np.ones((len(acceleration), 1))])
-        self._wanted = self._biped.weight * shares(self._plan.share)[..., None] * wanted[:, None]  # (T, 2, 3)
+        self._wanted = (
+            self._biped.weight * shares(self._plan.share)[..., None] * wanted[:, None]
+        )  # (T, 2, 3)
 
     @override
     def begin(self, rows: Array) -> BalanceMemory:
-        return BalanceMemory(np.zeros((len(rows), 1), dtype=np.int64), self._imu(rows), rows[:, self._wrench].copy())
+        return BalanceMemory(
+            np.zeros((len(rows), 1), dtype=np.int64), self._imu(rows), rows[:, self._wrench].copy()
+        )
 
     @override
-    def act(self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs) -> tuple[Array, BalanceMemory]:
+    def act(
+        self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs
+    ) -> tuple[Array, BalanceMemory]:
         steps = memory.steps + 1
         imu = memory.imu + self._share(self._gains.imu_cutoff_hz) * (self._imu(rows) - memory.imu)
         wrench_share = self._share(self._gains.wrench_cutoff_hz)
@@ -111,9 +134,15 @@ class FootBalance(BatchPolicy):
         return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
     def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> tuple[Array, Array]:
-        """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y, (num_worlds, 2, 2) [rad]."""
+        """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y, (num_worlds, 2,
+        2) [rad].
+        """
         gains = self._gains
-        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
+        row = np.clip(
+            np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1,
+            0,
+            self._plan.num_steps,
+        )
         force, moment = np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0)
         together = gains.attitude * imu[:, :2] + gains.gyro_s * imu[:, 2:]
         gain = np.array([gains.force_horizontal, gains.force_horizontal, gains.force_vertical])
@@ -128,7 +157,9 @@ class FootBalance(BatchPolicy):
         )
 
     def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
-        """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12) [rad]."""
+        """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)
+        [rad].
+        """
         leg = self._biped.leg
         up = self._biped.ankle_height
         position, R = foot_pose(leg, q.reshape(-1, 2, 6))

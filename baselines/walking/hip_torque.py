@@ -1,20 +1,23 @@
 r"""Hip roll by its measured torque: the published compensation of flexible hips of TALOS.
 
-The measured torque of each hip roll passes a first-order low-pass, is divided by K, bounded, limited in its rate, and
-added to the command:
+The measured torque of each hip roll passes a first-order low-pass, is divided by K, bounded,
+limited in its rate, and added to the command:
 
 .. math:: \Delta = \mathrm{rate}\big(\mathrm{clip}(\bar\tau_J / K, \pm\Delta_{max}), \pm\dot\Delta_{max}\big), \quad
           \bar\tau_k = \alpha \bar\tau_{k-1} + (1 - \alpha) \tau_k, \quad \alpha = e^{-2 \pi f T}
 
-In double support the value before the rate limit is zero, as where the published entity has its input for the phase
-connected. The joint torque is positive along q, so the motor leads by the deflection that it stands for.
+In double support the value before the rate limit is zero, as where the published entity has its
+input for the phase connected. The joint torque is positive along q, so the motor leads by the
+deflection that it stands for.
 
-The published entity reads the joint torque sensors of TALOS, and divides by 973.2 N·m/rad, the flexibility that was
-measured on that robot. Ours reads the sensor `joint_torque`, and divides by the K that is assumed of this robot.
+The published entity reads the joint torque sensors of TALOS, and divides by 973.2 N·m/rad, the
+flexibility that was measured on that robot. Ours reads the sensor `joint_torque`, and divides by
+the K that is assumed of this robot.
 
-Source: loco-3d/sot-talos-balance, src/hip-flexibility-compensation.cpp (method); src/dynamic_graph/sot_talos_balance/
-talos/hip_flexibility_compensation_conf.py (1 Hz, 0.01 rad, 0.003 rad/s); create_entities_utils.py (torque sensors).
-"""
+Source: loco-3d/sot-talos-balance, src/hip-flexibility-compensation.cpp (method);
+src/dynamic_graph/sot_talos_balance/ talos/hip_flexibility_compensation_conf.py (1 Hz, 0.01 rad,
+0.003 rad/s); create_entities_utils.py (torque sensors).
+"""  # noqa: E501
 
 from typing import Any, NamedTuple
 
@@ -33,9 +36,12 @@ _HIP_ROLLS = [1, 7]  # of twelve joints, left and right
 class HipTorqueGains(Model):
     """Hip roll by its measured torque; the defaults are the published values."""
 
-    cutoff_hz: float = quantity("Hz", 1.0, gt=0, description="cut-off frequency of the torque's low-pass")
-    limit_rad: float = quantity("rad", 0.01, gt=0, description="largest offset")
-    rate_rad_s: float = quantity("rad/s", 0.003, gt=0, description="largest rate of the offset")
+    cutoff_hz: float = quantity("Hz", 1.0, gt=0)
+    """Cut-off frequency of the torque's low-pass [Hz]."""
+    limit_rad: float = quantity("rad", 0.01, gt=0)
+    """Largest offset [rad]."""
+    rate_rad_s: float = quantity("rad/s", 0.003, gt=0)
+    """Largest rate of the offset [rad/s]."""
     in_double_support: bool = False
     """It also acts in double support, as where the published entity has no phase connected."""
 
@@ -77,7 +83,9 @@ class HipTorque(PolicyAround):
         ConfigurationError: The observation does not have the sensors.
     """
 
-    def __init__(self, policy: Policy, model: WalkerModel, gains: HipTorqueGains | None = None) -> None:
+    def __init__(
+        self, policy: Policy, model: WalkerModel, gains: HipTorqueGains | None = None
+    ) -> None:
         table = model.observation_table
         super().__init__(policy, table, model.control_period_s)
         require_sensor(table, TORQUE_SENSOR)
@@ -93,7 +101,9 @@ class HipTorque(PolicyAround):
         return HipTorqueMemory(torque, np.zeros_like(torque), self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: HipTorqueMemory, inputs: PolicyInputs) -> tuple[Array, HipTorqueMemory]:
+    def act(
+        self, rows: Array, memory: HipTorqueMemory, inputs: PolicyInputs
+    ) -> tuple[Array, HipTorqueMemory]:
         gains = self._gains
         action, inner = self.policy.act(rows, memory.inner, inputs)
         measured = rows[:, self._torque][:, _HIP_ROLLS]

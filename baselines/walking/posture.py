@@ -1,18 +1,20 @@
 r"""Posture feedback: the hips turn the pelvis back to level, by its IMU.
 
-The same offset on both hip rolls, and on both hip pitches, turns the pelvis against legs that stand:
+The same offset on both hip rolls, and on both hip pitches, turns the pelvis against legs that
+stand:
 
 .. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega
 
-The hip roll of a leg in the air is turned as well, so that on a slope it lands where the ground is. Its hip pitch keeps
-the turn with which it left the ground, and follows u slowly: what the standing leg needs while it carries the robot
-alone would move the other foot forth and back.
+The hip roll of a leg in the air is turned as well, so that on a slope it lands where the ground is.
+Its hip pitch keeps the turn with which it left the ground, and follows u slowly: what the standing
+leg needs while it carries the robot alone would move the other foot forth and back.
 
-φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it winds up against homing
-errors and the integrator of the foot force control else. Walking robots do this widely, also the published controller
-of this one [Kajita2010, section V].
+φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it
+winds up against homing errors and the integrator of the foot force control else. Walking robots do
+this widely, also the published controller of this one [Kajita2010, section V].
 
-[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
+[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum
+Tracking", IROS.
 """
 
 from typing import Any, NamedTuple
@@ -36,15 +38,20 @@ _HIP_PITCH = 2
 class PostureGains(Model):
     """Gains of the posture feedback."""
 
-    proportional: float = quantity("1", 2.0, ge=0, description="hip angle per tilt")
-    integral: float = quantity("1/s", 4.0, ge=0, description="hip angle per tilt and time")
-    derivative: float = quantity("s", 0.1, ge=0, description="hip angle per rate of the tilt")
-    leak_s: float = quantity("s", 1.0, gt=0, description="time constant with which the integral leaks")
-    filter_s: float = quantity("s", 0.02, gt=0, description="time constant of the attitude's filter")
-    swing_s: float = quantity(
-        "s", 0.5, ge=0, description="time constant with which the pitch of a leg in the air follows"
-    )
-    limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
+    proportional: float = quantity("1", 2.0, ge=0)
+    """Hip angle per tilt [1]."""
+    integral: float = quantity("1/s", 4.0, ge=0)
+    """Hip angle per tilt and time [1/s]."""
+    derivative: float = quantity("s", 0.1, ge=0)
+    """Hip angle per rate of the tilt [s]."""
+    leak_s: float = quantity("s", 1.0, gt=0)
+    """Time constant with which the integral leaks [s]."""
+    filter_s: float = quantity("s", 0.02, gt=0)
+    """Time constant of the attitude's filter [s]."""
+    swing_s: float = quantity("s", 0.5, ge=0)
+    """Time constant with which the pitch of a leg in the air follows [s]."""
+    limit_rad: float = quantity("rad", 0.08, gt=0)
+    """Largest part of the integral, and of the whole [rad]."""
 
 
 POSTURE = record_type(
@@ -87,7 +94,11 @@ class PostureFeedback(PolicyAround):
     """
 
     def __init__(
-        self, policy: Any, model: WalkerModel, gains: PostureGains | None = None, ramp_s: float = STAND_S
+        self,
+        policy: Any,
+        model: WalkerModel,
+        gains: PostureGains | None = None,
+        ramp_s: float = STAND_S,
     ) -> None:
         super().__init__(policy, model.observation_table, model.control_period_s)
         self._walk_view = WalkView(model.observation_table)
@@ -98,7 +109,9 @@ class PostureFeedback(PolicyAround):
         for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):
             self._gains[name] = getattr(gains, name)
         self._gains["period_s"] = period_s
-        self._gains["integral_limit"] = gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
+        self._gains["integral_limit"] = (
+            gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
+        )
         self._gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
         self._gains["swing_share"] = period_s / max(gains.swing_s, period_s)
 
@@ -112,7 +125,9 @@ class PostureFeedback(PolicyAround):
         return PostureMemory(np.zeros(len(rows), FEEDBACK), self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: PostureMemory, inputs: PolicyInputs) -> tuple[Array, PostureMemory]:
+    def act(
+        self, rows: Array, memory: PostureMemory, inputs: PolicyInputs
+    ) -> tuple[Array, PostureMemory]:
         """It takes the input `posture_gain`."""
         change = _NO_CHANGE
         if inputs.posture_gain is not None:
@@ -138,7 +153,8 @@ _NO_CHANGE: Array = np.empty((0, 1))
 
 
 def hip_offsets(turn: Array) -> Array:
-    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and −pitch.
+    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and
+    −pitch.
 
     Args:
         turn: Roll and pitch of both hips, (n, 2), or of either, (n, 2, 2) [rad].
@@ -151,14 +167,17 @@ def hip_offsets(turn: Array) -> Array:
 
 
 @compiled
-def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, before: Any, now: Any, action: Array) -> None:
+def hold_posture(
+    gains: Any, observed: Any, ramp: Array, change: Array, before: Any, now: Any, action: Array
+) -> None:
     """Add the turn of the hips against the pelvis' tilt, and keep the memory after a control step.
 
     Args:
         gains: Row of `POSTURE`, (1,).
         observed: Observations, rows with fields.
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
-        change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself goes on as it is.
+        change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself goes
+            on as it is.
         before: Rows of `FEEDBACK`, (n,).
         now: The same after the control step, to be filled.
         action: Offsets of the joints, (n, 12) [rad].
@@ -176,18 +195,28 @@ def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, before: 
             integral = last.integral[i] + own.period_s * (tilt - last.integral[i] / own.leak_s)
             kept.tilt[i] = tilt
             kept.integral[i] = within(integral, own.integral_limit)
-            turn = own.proportional * tilt + own.integral * kept.integral[i] + own.derivative * shown.imu_rate[i]
+            turn = (
+                own.proportional * tilt
+                + own.integral * kept.integral[i]
+                + own.derivative * shown.imu_rate[i]
+            )
             turn = share * within((1.0 + further) * turn, own.limit_rad)
             for leg in range(2):
                 if i == 0:
                     action[world, 6 * leg + 1] += turn
                 else:
-                    action[world, 6 * leg + 2] += pitch_of_leg(own, shown.load_share, leg, turn, last, kept)
+                    action[world, 6 * leg + 2] += pitch_of_leg(
+                        own, shown.load_share, leg, turn, last, kept
+                    )
 
 
 @compiled
-def pitch_of_leg(own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any) -> float:
-    """Hip pitch of a leg [rad]: one that carries half of the weight stands and turns, one in the air follows slowly."""
+def pitch_of_leg(
+    own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any
+) -> float:
+    """Hip pitch of a leg [rad]: one that carries half of the weight stands and turns, one in the
+    air follows slowly.
+    """
     share = share_right if leg == 1 else 1.0 - share_right
     standing = min(2.0 * share, 1.0)
     following = own.swing_share if standing < 1.0 else 1.0

@@ -1,18 +1,22 @@
-r"""A constant lift of the pelvis in single support: the published hip roll feedforward of THORMANG3.
+r"""A constant lift of the pelvis in single support: the published hip roll feedforward of
+THORMANG3.
 
-In single support the stance hip is commanded φ(t) further, so that the swing side of the pelvis rises. The swing hip
-gets −0.35 φ(t) about the same axis, which takes the swing foot outwards. φ grows from zero at lift-off to all of it
-in the middle of the swing and falls to zero at touch-down. Each half is a polynomial of fifth order from rest to rest:
+In single support the stance hip is commanded φ(t) further, so that the swing side of the pelvis
+rises. The swing hip gets −0.35 φ(t) about the same axis, which takes the swing foot outwards. φ
+grows from zero at lift-off to all of it in the middle of the swing and falls to zero at touch-down.
+Each half is a polynomial of fifth order from rest to rest:
 
 .. math:: \varphi(t) = \varphi_0 \, s(1 - |2 p(t) - 1|), \quad s(x) = 10 x^3 - 15 x^4 + 6 x^5
 
-p is the progress of the swing. A hip roll offset of +φ₀ turns the leg by +φ₀ about x in the pelvis. Where the left foot
-stands, the pelvis turns by −φ₀, and its right side rises. On the right leg the sign is the opposite one.
+p is the progress of the swing. A hip roll offset of +φ₀ turns the leg by +φ₀ about x in the pelvis.
+Where the left foot stands, the pelvis turns by −φ₀, and its right side rises. On the right leg the
+sign is the opposite one.
 
-Source: thor-mang/ROBOTIS-THORMANG-MPC, a fork of ROBOTIS-GIT/ROBOTIS-THORMANG-MPC, has the method and 0.35:
-thormang3_walking_module/src/thormang3_online_walking.cpp, with the joint axes of
-thormang3_kinematics_dynamics/src/kinematics_dynamics.cpp. 0.017 rad is of thor-mang/ROBOTIS-THORMANG-OPC,
-thormang3_foot_step_generator/data/balance_param.yaml; the later thormang3_demo/config/balance_param.yaml has 0.
+Source: thor-mang/ROBOTIS-THORMANG-MPC, a fork of ROBOTIS-GIT/ROBOTIS-THORMANG-MPC, has the method
+and 0.35: thormang3_walking_module/src/thormang3_online_walking.cpp, with the joint axes of
+thormang3_kinematics_dynamics/src/kinematics_dynamics.cpp. 0.017 rad is of
+thor-mang/ROBOTIS-THORMANG-OPC, thormang3_foot_step_generator/data/balance_param.yaml; the later
+thormang3_demo/config/balance_param.yaml has 0.
 """
 
 from typing import Any
@@ -33,10 +37,10 @@ _HIP_ROLL = 1  # of six joints of a leg
 class StanceRollGains(Model):
     """Hip roll feedforward in single support; the defaults are the published values."""
 
-    angle_rad: float = quantity("rad", 0.017, ge=0, le=0.3, description="offset of the stance hip in mid swing")
-    swing_share: float = quantity(
-        "1", 0.35, ge=0, le=1, description="share that the swing hip gets, with the other sign"
-    )
+    angle_rad: float = quantity("rad", 0.017, ge=0, le=0.3)
+    """Offset of the stance hip in mid swing [rad]."""
+    swing_share: float = quantity("1", 0.35, ge=0, le=1)
+    """Share that the swing hip gets, with the other sign [1]."""
 
 
 def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
@@ -56,7 +60,8 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
 
 
 class StanceRoll(PolicyAround):
-    """Any policy of a walker with the hip roll feedforward added, see the module; it has no memory of its own.
+    """Any policy of a walker with the hip roll feedforward added, see the module; it has no memory
+    of its own.
 
     Args:
         policy: What commands the robot.
@@ -64,7 +69,9 @@ class StanceRoll(PolicyAround):
         gains: Angle and share.
     """
 
-    def __init__(self, policy: Policy, model: WalkerModel, gains: StanceRollGains | None = None) -> None:
+    def __init__(
+        self, policy: Policy, model: WalkerModel, gains: StanceRollGains | None = None
+    ) -> None:
         super().__init__(policy, model.observation_table, model.control_period_s)
         self._gains = gains or StanceRollGains()
         self._clock = model.observation_table.group("clock")

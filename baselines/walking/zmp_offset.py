@@ -1,14 +1,15 @@
 r"""ZMP offset: the plan's ZMP is shifted against the mean error of the measured one.
 
-A slope, or a load in a place that nobody knows, moves the center of mass for as long as the robot walks, and the ZMP
-with it. On a slope α that is h α, with the height h of the center of mass. The foot sensors show it, and an integral
-takes it off:
+A slope, or a load in a place that nobody knows, moves the center of mass for as long as the robot
+walks, and the ZMP with it. On a slope α that is h α, with the height h of the center of mass. The
+foot sensors show it, and an integral takes it off:
 
 .. math:: \dot s = -\frac{1}{T} (p - p_{ref}), \quad |s_x|, |s_y| \le s_{max}
 
-s is the shift of the planned ZMP (input `zmp` of the policy inside), p the ZMP by the foot sensors as if the feet lay
-flat on their footholds. T is several steps long: within a step the ZMP is the controller's matter. The sensors show the
-ZMP against the feet, so feet that have drifted from their footholds are not seen.
+s is the shift of the planned ZMP (input `zmp` of the policy inside), p the ZMP by the foot sensors
+as if the feet lay flat on their footholds. T is several steps long: within a step the ZMP is the
+controller's matter. The sensors show the ZMP against the feet, so feet that have drifted from their
+footholds are not seen.
 """
 
 from typing import Any, NamedTuple
@@ -29,12 +30,16 @@ _LEAST_LOAD = 0.05
 class ZmpOffsetGains(Model):
     """How fast and how far the planned ZMP is shifted."""
 
-    time_constant_s: float = quantity("s", 6.0, gt=0, description="time constant T of the integral")
-    limit_m: float = quantity("m", 0.03, gt=0, lt=0.05, description="largest shift forward and sideways")
+    time_constant_s: float = quantity("s", 6.0, gt=0)
+    """Time constant T of the integral [s]."""
+    limit_m: float = quantity("m", 0.03, gt=0, lt=0.05)
+    """Largest shift forward and sideways [m]."""
 
 
 class ZmpOffsetMemory(NamedTuple):
-    """The shift of the ZMP forward and to the left, (num_worlds, 2) [m], and the memory of the policy."""
+    """The shift of the ZMP forward and to the left, (num_worlds, 2) [m], and the memory of the
+    policy.
+    """
 
     shift: Array
     inner: Any
@@ -49,7 +54,9 @@ class ZmpOffset(PolicyAround):
         gains: Gains.
     """
 
-    def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains | None = None) -> None:
+    def __init__(
+        self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains | None = None
+    ) -> None:
         table = model.observation_table
         super().__init__(policy, table, model.control_period_s)
         gains = gains or ZmpOffsetGains()
@@ -66,9 +73,13 @@ class ZmpOffset(PolicyAround):
         return ZmpOffsetMemory(np.zeros((len(rows), 2)), self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> tuple[Array, ZmpOffsetMemory]:
+    def act(
+        self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs
+    ) -> tuple[Array, ZmpOffsetMemory]:
         """Its shift adds to the input `zmp`."""
-        measured = self._sensors.zmp_of_flat_feet(rows[:, self._wrench], self._ankles, self._least_n)
+        measured = self._sensors.zmp_of_flat_feet(
+            rows[:, self._wrench], self._ankles, self._least_n
+        )
         error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
         shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift

@@ -4,19 +4,22 @@ The ZMP p of a pendulum whose center of mass moves by c is [Kajita2003]
 
 .. math:: p = c - \ddot c / \omega^2
 
-A shift that is known over the whole walk has one c that stays bounded. Its Fourier transform is that of p over
-1 + (ν/ω)²: a low-pass filter without phase shift, which looks as far ahead as back. The pelvis is moved by c over feet
-that stay, by inverse kinematics. A learned p makes a plan of its own of the ZMP, as in [Hu2015].
+A shift that is known over the whole walk has one c that stays bounded. Its Fourier transform is
+that of p over 1 + (ν/ω)²: a low-pass filter without phase shift, which looks as far ahead as back.
+The pelvis is moved by c over feet that stay, by inverse kinematics. A learned p makes a plan of its
+own of the ZMP, as in [Hu2015].
 
-A shift of which only the present is known is taken to stay as it is. Then the bounded solution is a first-order lag,
+A shift of which only the present is known is taken to stay as it is. Then the bounded solution is a
+first-order lag,
 
 .. math:: \dot c = \omega (p - c)
 
-and while p changes, the ZMP is shifted by p − ṗ/ω: it comes late by 1/ω, and sets out in the other direction.
+and while p changes, the ZMP is shifted by p − ṗ/ω: it comes late by 1/ω, and sets out in the other
+direction.
 
-[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of Zero-Moment Point", ICRA.
-[Hu2015] K. Hu, C. Ott, D. Lee, "Online Iterative Learning Control of Zero-Moment Point for Biped Walking
-Stabilization", ICRA.
+[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
+Zero-Moment Point", ICRA. [Hu2015] K. Hu, C. Ott, D. Lee, "Online Iterative Learning Control of
+Zero-Moment Point for Biped Walking Stabilization", ICRA.
 """
 
 import math
@@ -53,7 +56,8 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
 
 
 def following_share(omega: float, period_s: float) -> float:
-    """Share of its way that the c of a ZMP shift goes in a period, where the shift stays as it is [1].
+    """Share of its way that the c of a ZMP shift goes in a period, where the shift stays as it is
+    [1].
 
     Args:
         omega: Natural frequency of the pendulum [rad/s].
@@ -63,9 +67,11 @@ def following_share(omega: float, period_s: float) -> float:
 
 
 def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
-    """Motion of the center of mass per motion of the standing pelvis over its feet, x and y, (2,) [1].
+    """Motion of the center of mass per motion of the standing pelvis over its feet, x and y, (2,)
+    [1].
 
-    The legs follow the pelvis by half on average: it is the share of the weight that the pelvis carries along.
+    The legs follow the pelvis by half on average: it is the share of the weight that the pelvis
+    carries along.
     """
     plan = model.plan
     biped = model.biped
@@ -93,7 +99,9 @@ STANCE = record_type(
 
 
 class Stances(NamedTuple):
-    """The legs, a row of `LEGS`, and the planned stances, rows of `STANCE`, over which the pelvis is moved."""
+    """The legs, a row of `LEGS`, and the planned stances, rows of `STANCE`, over which the
+    pelvis is moved.
+    """
 
     legs: Any
     rows: Any
@@ -170,7 +178,8 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
 
 @compiled
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle less hip [m].
+    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle
+    less hip [m].
 
     `elastic_env.rigid.leg_kinematics.leg_angles` has soles of every attitude.
     """
@@ -179,5 +188,7 @@ def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, fl
     shank = legs.shank
     cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = math.acos(min(max(cosine, -1.0), 1.0))
-    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))  # from the line of hip and ankle
+    of_shank = math.atan2(
+        thigh * math.sin(knee), shank + thigh * math.cos(knee)
+    )  # from the line of hip and ankle
     return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee

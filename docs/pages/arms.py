@@ -20,7 +20,10 @@ def one_arm(gallery: Rows) -> str:
     """How far one arm of the gallery sags at rest, with and without compensation."""
     row = next(row for row in gallery if row["robot"] == _FIRST)
     shown = [
-        [f"{1e3 * float(row[f'{kind}{policy}_rms_m']):.1f}" for policy in ("uncompensated", "input")]
+        [
+            f"{1e3 * float(row[f'{kind}{policy}_rms_m']):.1f}"
+            for policy in ("uncompensated", "input")
+        ]
         for kind in ("", "soft_")
     ]
     head = [f"{row['title']}, sag at rest [mm]", "without compensation", "`input`"]
@@ -29,10 +32,14 @@ def one_arm(gallery: Rows) -> str:
 
 
 def link_encoders(episodes: Rows) -> str:
-    """Error of the end effector with and without encoders on the links of an arm, episode by episode."""
+    """Error of the end effector with and without encoders on the links of an arm, episode by
+    episode.
+    """
     rows = []
     for scenario, own in group_by(episodes, lambda row: row["scenario"]).items():
-        errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
+        errors = {
+            p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES
+        }
         base, other = (errors[policy] for policy in _POLICIES)
         ends = bootstrap(
             (base, other),
@@ -43,7 +50,9 @@ def link_encoders(episodes: Rows) -> str:
             rng=np.random.default_rng(0),
         ).confidence_interval
         change = f"{_percent(_change(base, other))} [{_percent(ends.low)}, {_percent(ends.high)}]"
-        rows.append([f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change])
+        rows.append(
+            [f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change]
+        )
     head = ["scenario", *(f"`{policy}` [mm]" for policy in _POLICIES), "change"]
     return page_table(head, rows)
 
@@ -57,7 +66,9 @@ def _percent(value: float | Array) -> str:
 
 
 def arm_identification(rows: Rows) -> str:
-    """How well the stiffness of an arm is found over many logs of known truth, from `tests.identification_trials`."""
+    """How well the stiffness of an arm is found over many logs of known truth, from
+    `tests.identification_trials`.
+    """
     kinds = group_by(rows, lambda row: (row["poses"], row["log"]))
     joints = group_by(rows, lambda row: row["joint"])
     head = ["", *(f"{poses} poses, {log}" for poses, log in kinds)]

@@ -1,4 +1,5 @@
-"""Small tables of comparisons, kept under docs/results: a row per cell and statistic, and the metrics that pages show.
+"""Small tables of comparisons, kept under docs/results: a row per cell and statistic, and the
+metrics that pages show.
 
 python -m docs.pages.keep RUN ...    # docs/results/NAME.csv from the episodes of each run
 """
@@ -29,7 +30,9 @@ _STATISTICS: Mapping[str, Callable[[Sequence[float]], float]] = {
 
 @dataclass(frozen=True)
 class Kept:
-    """The kept part of a comparison: metrics, and statistics over the episodes that did not fail."""
+    """The kept part of a comparison: metrics, and statistics over the episodes that did not
+    fail.
+    """
 
     metrics: Sequence[str]
     statistics: Sequence[str] = ("median",)
@@ -79,12 +82,18 @@ def condense(episodes: Rows, kept: Kept) -> Iterator[list[object]]:
     for names, own in group_by(played, lambda row: tuple(row[name] for name in _PLACE)).items():
         stood = [row for row in own if not row["termination"]]
         for statistic in kept.statistics:
-            values = (_over([row[m] for row in stood], _STATISTICS[statistic]) for m in kept.metrics)
+            values = (
+                _over([row[m] for row in stood], _STATISTICS[statistic]) for m in kept.metrics
+            )
             yield [*names, statistic, len(own), len(own) - len(stood), *values]
 
 
 def _over(values: Sequence[str], statistic: Callable[[Sequence[float]], float]) -> str:
-    return f"{statistic([float(value) for value in values]):.5g}" if values and "" not in values else ""
+    return (
+        f"{statistic([float(value) for value in values]):.5g}"
+        if values and "" not in values
+        else ""
+    )
 
 
 def keep(run: Path, results: Path) -> Path:
@@ -107,7 +116,9 @@ def kept_name(run: Path) -> str:
     """
     config = run / "config.yaml"
     if not config.is_file() or not (run / "episodes.csv").is_file():
-        raise ConfigurationError(f"{run} holds no finished comparison: config.yaml and episodes.csv are expected there")
+        raise ConfigurationError(
+            f"{run} holds no finished comparison: config.yaml and episodes.csv are expected there"
+        )
     name = yaml.safe_load(config.read_text(encoding="utf-8")).get("name")
     if name not in KEPT:
         raise ConfigurationError(
@@ -137,7 +148,9 @@ class Cells:
         """Names in a column, in their order."""
         return list(dict.fromkeys(row[column] for row in self._rows.values()))
 
-    def row(self, policy: str, reference: str, scenario: str, statistic: str = "") -> Mapping[str, str]:
+    def row(
+        self, policy: str, reference: str, scenario: str, statistic: str = ""
+    ) -> Mapping[str, str]:
         """The row of a cell.
 
         Raises:
@@ -159,10 +172,14 @@ def in_table_unit(row: Mapping[str, str], metric: str) -> float:
     return scale * float(row[metric]) if row[metric] else math.nan
 
 
-def format_metrics(row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / ") -> str:
+def format_metrics(
+    row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / "
+) -> str:
     """Metrics side by side with so many decimals, - where there is none."""
     values = (in_table_unit(row, metric) for metric in metrics)
-    return between.join("-" if math.isnan(value) else minus(f"{value:.{decimals}f}") for value in values)
+    return between.join(
+        "-" if math.isnan(value) else minus(f"{value:.{decimals}f}") for value in values
+    )
 
 
 def page_table(head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1) -> str:

@@ -1,6 +1,8 @@
-"""Short films of the docs: the same motion without compensation on the left, and with compensation on the right.
+"""Short films of the docs: the same motion without compensation on the left, and with compensation
+on the right.
 
-`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated WebP.
+`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated
+WebP.
 """
 
 import sys
@@ -37,7 +39,8 @@ class Film:
         condition: What is played; its policy is the one without compensation.
         compensated: The policy on the right.
         begin_s, end_s: What is shown of the episode [s].
-        box: Left, upper, right and lower edge of what is shown [pixels]; caption and legend are left out.
+        box: Left, upper, right and lower edge of what is shown [pixels]; caption and legend are
+            left out.
         width: Of each of the two pictures [pixels].
     """
 
@@ -62,7 +65,9 @@ def films() -> dict[str, Film]:
             (120, 86, 640, 690),
         ),
         "arm": Film(
-            Condition(env="robot", policy=_named("uncompensated"), reference=circle, env_options=robot),
+            Condition(
+                env="robot", policy=_named("uncompensated"), reference=circle, env_options=robot
+            ),
             "input",
             1.0,
             6.0,
@@ -78,12 +83,16 @@ def _named(name: str) -> PolicySpec:
 def frames(film: Film, policy: str, console: Console) -> Iterator[Image]:
     """The pictures of one side."""
     condition = film.condition.replace(policy=_named(policy))
-    env: Any = gymnasium.make(condition.environment.id, render_mode="rgb_array", **condition.arguments)
+    env: Any = gymnasium.make(
+        condition.environment.id, render_mode="rgb_array", **condition.arguments
+    )
     period = env.unwrapped.task.assumed_model.control_period_s
     every = round(1.0 / (_FRAMES_PER_S * period))
     title = "without" if policy == "uncompensated" else "with"
     with closing(env):
-        played = episode(env, make_policy(condition.policy, env), condition, round(film.end_s / period), console)
+        played = episode(
+            env, make_policy(condition.policy, env), condition, round(film.end_s / period), console
+        )
         for step, _ in played:
             if step * period >= film.begin_s and step % every == 0:
                 yield _cut(env.render(), film, f"{title} compensation")

@@ -2,7 +2,8 @@
 
     python -m docs.pages.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
 
-Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
+Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of
+the robot.
 """
 
 import csv
@@ -95,7 +96,9 @@ class AtRest:
         return np.apply_along_axis(self._compensator.command, -1, q_ref)
 
     def links(self, theta: Array, softer: float = 1.0) -> Array:
-        """Angles of the links for angles of the servos, (..., n) [rad]; `softer` is true over assumed stiffness."""
+        """Angles of the links for angles of the servos, (..., n) [rad]; `softer` is true over
+        assumed stiffness.
+        """
         return static_link_angle(
             theta,
             softer * self.stiffness,
@@ -148,7 +151,9 @@ def _rms(values: Array) -> float:
 
 
 def picture(name: str) -> Image:
-    """Home pose without and with compensation, side by side; deviations from the translucent reference are enlarged."""
+    """Home pose without and with compensation, side by side; deviations from the translucent
+    reference are enlarged.
+    """
     robot = AtRest(name)
     home = home_pose(name, robot.hinges)
     links = np.array([robot.links(theta) for theta in (home, robot.commands(home))])
@@ -175,7 +180,11 @@ def write(checkout: Path) -> None:
         table = csv.DictWriter(file, rows[0], lineterminator="\n")
         table.writeheader()
         table.writerows(
-            {column: f"{cell:.6g}" if isinstance(cell, float) else cell for column, cell in row.items()} for row in rows
+            {
+                column: f"{cell:.6g}" if isinstance(cell, float) else cell
+                for column, cell in row.items()
+            }
+            for row in rows
         )
     (docs / "images" / "gallery").mkdir(exist_ok=True)
     for name in GALLERY:

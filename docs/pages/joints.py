@@ -1,4 +1,6 @@
-"""Tables of the testbed's page, from the kept cells of comparisons and from `docs.pages.statics`."""
+"""Tables of the testbed's page, from the kept cells of comparisons and from
+`docs.pages.statics`.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +16,9 @@ _RIVALS = ("input", "dynamic", "friction", "disturbance_observer")
 def paper_testbed(rows: Rows, identified: Rows) -> str:
     """Figs. 5 and 6 of the paper, beside the paper's figures."""
     cells = Cells(rows)
-    (nominal,) = (row for row in identified if row["scenario"] == "nominal" and int(row["seeds"]) > 1)
+    (nominal,) = (
+        row for row in identified if row["scenario"] == "nominal" and int(row["seeds"]) > 1
+    )
     lines = [
         [
             f"Pearson r, median of {nominal['seeds']} seeds",
@@ -23,7 +27,9 @@ def paper_testbed(rows: Rows, identified: Rows) -> str:
         ]
     ]
     for policy in ("uncompensated", "input"):
-        lines.append([f"link error at rest, `{policy}`", f"{_range(cells, policy)} mrad", _PAPER[policy]])
+        lines.append(
+            [f"link error at rest, `{policy}`", f"{_range(cells, policy)} mrad", _PAPER[policy]]
+        )
     return page_table(["figure", "here", "paper"], lines)
 
 
@@ -33,7 +39,9 @@ def _range(cells: Cells, policy: str) -> str:
 
 
 def identification(rows: Rows) -> str:
-    """Stiffness, friction and dead band that the static experiment finds, and how often the interval is right."""
+    """Stiffness, friction and dead band that the static experiment finds, and how often the
+    interval is right.
+    """
     lines = []
     for row in rows:
         if _is_of_damping(row):
@@ -41,7 +49,9 @@ def identification(rows: Rows) -> str:
         seeds = int(row["seeds"])
         low = float(row["identified_min"])
         high = float(row["identified_max"])
-        found = f"{float(row['identified_median']):.1f}" + (f" ({low:.1f} to {high:.1f})" if seeds > 1 else "")
+        found = f"{float(row['identified_median']):.1f}" + (
+            f" ({low:.1f} to {high:.1f})" if seeds > 1 else ""
+        )
         scenario = f"`{row['scenario']}`, {seeds} seeds" if seeds > 1 else f"`{row['scenario']}`"
         line = f"{float(row['line_stiffness_nm_per_rad']):.1f}"
         friction = f"{float(row['friction_nm']):.2f}"
@@ -58,9 +68,9 @@ def identification(rows: Rows) -> str:
     ]
     (nominal,) = (row for row in rows if row["scenario"] == "nominal" and not _is_of_damping(row))
     return (
-        f"{page_table(head, lines)}\n"
-        f"In `nominal` the 95 % interval holds the true K in {nominal['covered']} of {nominal['seeds']} seeds. Its "
-        f"half-width is at most {100 * float(nominal['half_width_most']):.2f} %.\n"
+        f"{page_table(head, lines)}\nIn `nominal` the 95 % interval holds the true K in"
+        f" {nominal['covered']} of {nominal['seeds']} seeds. Its half-width is at most"
+        f" {100 * float(nominal['half_width_most']):.2f} %.\n"
     )
 
 
@@ -88,7 +98,9 @@ def output_compensators(rows: Rows) -> str:
 
 
 def damping(rows: Rows, identified: Rows) -> str:
-    """Effects of the damping of the transmission: the identification, the errors at rest and those in motion."""
+    """Effects of the damping of the transmission: the identification, the errors at rest and
+    those in motion.
+    """
     cells = Cells(rows)
     lines = []
     for row in identified:

@@ -1,4 +1,6 @@
-"""`python -m docs.pages.keep RUN ...`: keep what pages show of comparisons, in docs/results of the checkout."""
+"""`python -m docs.pages.keep RUN ...`: keep what pages show of comparisons, in docs/results of
+the checkout.
+"""
 
 import sys
 from pathlib import Path

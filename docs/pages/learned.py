@@ -1,4 +1,6 @@
-"""Gains by learning as tables of a page, from the `statistics.csv` or the `map.csv` that a comparison wrote."""
+"""Gains by learning as tables of a page, from the `statistics.csv` or the `map.csv` that a
+comparison wrote.
+"""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +42,8 @@ _SMALL = 2.0
 
 @dataclass(frozen=True)
 class LearnedMap:
-    """The change by a residual against the best policy without learning, over two axes, in one metric.
+    """The change by a residual against the best policy without learning, over two axes, in one
+    metric.
 
     Attributes:
         policy: Title of the residual.
@@ -76,7 +79,9 @@ class LearnedMap:
     def table(self) -> str:
         """Changes with x to the right and y upwards."""
         head = [f"{self.y_is} \\ {self.x_is}", *self.x]
-        rows = [[f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)]
+        rows = [
+            [f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)
+        ]
         return page_table(head, rows, words=0)
 
     @property
@@ -87,10 +92,9 @@ class LearnedMap:
         title, _ = _METRICS[self.metric]
         common = max(dict.fromkeys(rivals), key=rivals.count)
         return (
-            f"**{title[:1].upper()}{title[1:]}, {self.policy}.** "
-            f"Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, "
-            f"behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
-            f"{rivals.count(common)} of {len(rivals)} cells."
+            f"**{title[:1].upper()}{title[1:]}, {self.policy}.** Ahead in {verdicts.count('lower')}"
+            f" of {len(verdicts)} cells, behind in {verdicts.count('higher')}. The best policy"
+            f" without learning is {common} in {rivals.count(common)} of {len(rivals)} cells."
         )
 
 
@@ -101,14 +105,23 @@ def learned_maps(path: Path) -> list[LearnedMap]:
         ConfigurationError: It is missing, or has no residual.
     """
     if not path.is_file():
-        raise ConfigurationError(f"{path} is missing; copy it from the run of elastic compare configs/{path.stem}.yaml")
+        raise ConfigurationError(
+            f"{path} is missing; copy it from the run of elastic compare configs/{path.stem}.yaml"
+        )
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     learned = {row["policy"] for row in rows if row["verdict"]}
     if not learned:
-        raise ConfigurationError(f"{path} compares no residual; a map of learning needs one among its policies")
-    keys = dict.fromkeys((row["map"], row["metric"], row["policy"]) for row in rows if row["policy"] in learned)
-    return [LearnedMap.of([row for row in rows if (row["map"], row["metric"], row["policy"]) == key]) for key in keys]
+        raise ConfigurationError(
+            f"{path} compares no residual; a map of learning needs one among its policies"
+        )
+    keys = dict.fromkeys(
+        (row["map"], row["metric"], row["policy"]) for row in rows if row["policy"] in learned
+    )
+    return [
+        LearnedMap.of([row for row in rows if (row["map"], row["metric"], row["policy"]) == key])
+        for key in keys
+    ]
 
 
 def maps_markdown(maps: Iterable[LearnedMap]) -> str:
@@ -119,7 +132,8 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
 def changes_table(
     rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = _BASE
 ) -> str:
-    """Paired changes of residuals over their bases in every scenario and group, from the rows of a `statistics.csv`.
+    """Paired changes of residuals over their bases in every scenario and group, from the rows of a
+    `statistics.csv`.
 
     Args:
         rows: Its rows.
@@ -128,18 +142,34 @@ def changes_table(
         against: What the residuals are compared with, as the rows say it.
     """
     own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
-    own = [row for row in own if row["kind"] == "residual" and (row["scope"] in scopes or not scopes)]
-    titles = {metric: _METRICS[metric] for metric in metrics if any(row["metric"] == metric for row in own)}
+    own = [
+        row for row in own if row["kind"] == "residual" and (row["scope"] in scopes or not scopes)
+    ]
+    titles = {
+        metric: _METRICS[metric]
+        for metric in metrics
+        if any(row["metric"] == metric for row in own)
+    }
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
     lines = []
-    for place, found in group_by(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
+    for place, found in group_by(
+        own, lambda row: (*(row[name] for name in names), row["scope"])
+    ).items():
         by_metric = {row["metric"]: row for row in found}
-        cells = (part for metric, (_, unit) in titles.items() for part in _over_base(by_metric[metric], unit))
+        cells = (
+            part
+            for metric, (_, unit) in titles.items()
+            for part in _over_base(by_metric[metric], unit)
+        )
         lines.append([*place[:-1], _scope(found[0]), *cells])
     head = [
         *names,
         "",
-        *(text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change")),
+        *(
+            text
+            for title, unit in titles.values()
+            for text in (f"base: {title} [{unit}]", "change")
+        ),
     ]
     return page_table(head, lines, words=len(names) + 1)
 
@@ -150,11 +180,14 @@ def beyond_the_best(*tables: Rows) -> str:
     Args:
         tables: Rows of a `statistics.csv` each.
     """
-    return changes_table([row for rows in tables for row in rows], scopes=GROUPS, against=BEST_ANALYTIC)
+    return changes_table(
+        [row for rows in tables for row in rows], scopes=GROUPS, against=BEST_ANALYTIC
+    )
 
 
 def learning_in_short(*tables: Rows) -> str:
-    """Gains of residuals over their bases, in groups of scenarios, each residual on the gait that it was trained on.
+    """Gains of residuals over their bases, in groups of scenarios, each residual on the gait that
+    it was trained on.
 
     Args:
         tables: Rows of a `statistics.csv` each; the motion that comes first counts.
@@ -162,9 +195,15 @@ def learning_in_short(*tables: Rows) -> str:
     metrics = _JUDGED[:2]
     lines = []
     for rows in tables:
-        own = [row for row in rows if row["base_is"] == _BASE and row["reference"] == rows[0]["reference"]]
+        own = [
+            row
+            for row in rows
+            if row["base_is"] == _BASE and row["reference"] == rows[0]["reference"]
+        ]
         cells = {(row["scope"], row["metric"]): row for row in own if row["pooled"] == "True"}
-        changes = [_over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT]
+        changes = [
+            _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
+        ]
         lines.append([own[0]["reference"], f"`{own[0]['base']}`", *changes])
     head = [
         "step",
@@ -182,11 +221,19 @@ def _scope(row: Mapping[str, str]) -> str:
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
-    """Mean of the base in mrad or mm, and the change with its interval; a sign where it is not told from chance."""
+    """Mean of the base in mrad or mm, and the change with its interval; a sign where it is not
+    told from chance.
+    """
     if not row["change"]:
         return f"falls, {row['base_failed']} of {row['base_episodes']}", "-"
     change, low, high = (float(row[name]) for name in ("change", "change_low", "change_high"))
-    verdict = "unclear" if int(row["training_seeds"]) < FEWEST_SEEDS else "none" if low <= 0.0 <= high else "shown"
+    verdict = (
+        "unclear"
+        if int(row["training_seeds"]) < FEWEST_SEEDS
+        else "none"
+        if low <= 0.0 <= high
+        else "shown"
+    )
     base = 1e3 * float(row["base_mean"])
     return (
         f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
@@ -201,6 +248,12 @@ def _without_breaks(interval: str) -> str:
 
 
 def _change(row: Mapping[str, str]) -> str:
-    """Relative change, with a sign where it is not told from chance, and ✕ where a policy failed."""
+    """Relative change, with a sign where it is not told from chance, and ✕ where a policy
+    failed.
+    """
     failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
-    return signed_off(percent(float(row["change"])), row["verdict"]) + failed if row["change"] else f"-{failed}"
+    return (
+        signed_off(percent(float(row["change"])), row["verdict"]) + failed
+        if row["change"]
+        else f"-{failed}"
+    )

@@ -1,4 +1,6 @@
-"""Tables of what a step costs, from the `speed.csv` that `elastic speed` wrote and from the leaderboard."""
+"""Tables of what a step costs, from the `speed.csv` that `elastic speed` wrote and from the
+leaderboard.
+"""
 
 from collections.abc import Sequence
 
@@ -11,13 +13,19 @@ _OURS = "vector env"
 
 
 def vector_environments(*tables: Rows) -> str:
-    """Time of raw physics per world and control step, and how fast the vector environment is beside it."""
+    """Time of raw physics per world and control step, and how fast the vector environment is
+    beside it.
+    """
     lines = []
-    rows = [row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"]
+    rows = [
+        row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"
+    ]
     rows = sorted(rows, key=lambda row: int(row["num_envs"]))
-    for (env, worlds), own in sorted(group_by(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
+    for (env, worlds), own in sorted(
+        group_by(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot
+    ):
         ratios = [f"{float(row['ratio']):.2f}" for row in own if row["contender"].startswith(_OURS)]
-        (raw, *_) = (row for row in own if row["contender"] == _RAW)
+        raw, *_ = (row for row in own if row["contender"] == _RAW)
         if ratios:  # the scalar environment has raw physics of its own
             lines.append([env, worlds, f"{1e6 / float(raw['steps_per_s']):.0f}", *ratios])
     head = [

@@ -1,6 +1,8 @@
-"""Tables of the docs that no comparison plays: identifications, Eq. 12 against Eq. 10, and gravity torques of a stance.
+"""Tables of the docs that no comparison plays: identifications, Eq. 12 against Eq. 10, and gravity
+torques of a stance.
 
-`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some minutes.
+`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some
+minutes.
 """
 
 import sys
@@ -39,7 +41,9 @@ _INWARD_M = 0.02
 def identification(
     scenario: str = "nominal", stiffness: float = 1001.0, damping: float = 10.0, seeds: int = 1
 ) -> dict[str, Any]:
-    """The static experiment with some seeds of the sensor noise, as a row of `identification.csv`."""
+    """The static experiment with some seeds of the sensor noise, as a row of
+    `identification.csv`.
+    """
     env = gymnasium.make_vec(
         "elastic_env/Testbed-v0",
         num_envs=seeds,
@@ -73,13 +77,17 @@ def _spread(found: Sequence[Identification], truth: float) -> dict[str, Any]:
         "identified_min": float(stiffness.min()),
         "identified_max": float(stiffness.max()),
         **medians,
-        "covered": sum(e.stiffness_low_nm_per_rad <= truth <= e.stiffness_high_nm_per_rad for e in found),
+        "covered": sum(
+            e.stiffness_low_nm_per_rad <= truth <= e.stiffness_high_nm_per_rad for e in found
+        ),
         "half_width_most": max(each.half_width for each in found),
     }
 
 
 def output_compensators() -> Iterator[dict[str, Any]]:
-    """Eq. 12 against Newton's method on Eq. 10 at the static positions, rows of `output_compensator.csv`."""
+    """Eq. 12 against Newton's method on Eq. 10 at the static positions, rows of
+    `output_compensator.csv`.
+    """
     env: Any = gymnasium.make("elastic_env/Testbed-v0", scenario="ideal")
     gravity = make_gravity(env.unwrapped.assumed_model)
     hold = Hold()
@@ -104,7 +112,9 @@ def output_compensators() -> Iterator[dict[str, Any]]:
 
 
 def stance_torques() -> Iterator[dict[str, Any]]:
-    """Gravity torque of the left leg on one foot by each reading of Eq. 4, rows of `gravity_torque.csv`."""
+    """Gravity torque of the left leg on one foot by each reading of Eq. 4, rows of
+    `gravity_torque.csv`.
+    """
     env: Any = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal")
     model = env.unwrapped.assumed_model
     for method in ("com", "ankle", "lumped"):
@@ -113,8 +123,15 @@ def stance_torques() -> Iterator[dict[str, Any]]:
             zmp = model.biped.footholds[0] - [0.0, inward]
             observation = np.zeros((1, len(model.observation_table)))
             observation[:, model.observation_table.group("zmp_reference")] = zmp
-            torque = make_gravity(model, method).at(observation).gravity_torque(_stance(model, zmp)[None])[0]
-            row |= {f"{place}_{name}_nm": float(torque[LEG_JOINTS.index(f"l_{name}")]) for name in _JOINTS}
+            torque = (
+                make_gravity(model, method)
+                .at(observation)
+                .gravity_torque(_stance(model, zmp)[None])[0]
+            )
+            row |= {
+                f"{place}_{name}_nm": float(torque[LEG_JOINTS.index(f"l_{name}")])
+                for name in _JOINTS
+            }
         yield row
     env.close()
 
@@ -139,7 +156,10 @@ def main(arguments: Sequence[str]) -> None:
         ("output_compensator", output_compensators()),
         ("identification", (identification(**each) for each in IDENTIFIED)),
     ):
-        rounded = [{key: f"{v:.5g}" if isinstance(v, float) else v for key, v in row.items()} for row in rows]
+        rounded = [
+            {key: f"{v:.5g}" if isinstance(v, float) else v for key, v in row.items()}
+            for row in rows
+        ]
         print(f"wrote {write_records(rounded, results / f'{name}.csv')}")
 
 

@@ -32,19 +32,27 @@ def rows(console: Console) -> list[dict[str, Any]]:
         env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
         period = env.unwrapped.task.assumed_model.control_period_s
         share = env.unwrapped.task.plan.share
-        for step, info in episode(env, make_policy(condition.policy, env), condition, round(END_S / period), console):
+        for step, info in episode(
+            env, make_policy(condition.policy, env), condition, round(END_S / period), console
+        ):
             time_s = (step + 1) * period
             if time_s >= BEGIN_S and (step + 1) % EVERY == 0:
                 row = found.setdefault(time_s, {"time_s": f"{time_s - BEGIN_S:.2f}"})
                 row["single_support"] = int(share[step + 1] in (0.0, 1.0))
-                row |= {f"{policy}_{c.signal}": f"{float(info[c.signal.rpartition('_')[0]]):.4g}" for c in CHARTS}
+                row |= {
+                    f"{policy}_{c.signal}": f"{float(info[c.signal.rpartition('_')[0]]):.4g}"
+                    for c in CHARTS
+                }
         env.close()
     return list(found.values())
 
 
 def main(arguments: Sequence[str]) -> None:
     """Write the table: [CHECKOUT], by default the working directory."""
-    print(f"wrote {write_records(rows(Console()), Path(*arguments) / 'docs' / 'results' / 'step.csv')}")
+    print(
+        "wrote"
+        f" {write_records(rows(Console()), Path(*arguments) / 'docs' / 'results' / 'step.csv')}"
+    )
 
 
 if __name__ == "__main__":

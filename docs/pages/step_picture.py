@@ -1,4 +1,5 @@
-"""Pelvis error and ZMP deviation over a step, without and with compensation, as an SVG for phones, light and dark.
+"""Pelvis error and ZMP deviation over a step, without and with compensation, as an SVG for phones,
+light and dark.
 
 `python -m docs.pages` draws it from docs/results/step.csv. `python -m docs.pages.step` writes
 that table.
@@ -20,13 +21,15 @@ _RIGHT = 408
 _TOP = 34
 _HEIGHT = 124
 _GAP = 56
-_HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}"
+_HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}"
+width="{width}" height="{height}"
 role="img" aria-label="{label}">
 <style>
   text {{ font: 14px sans-serif; fill: #737d88; }}
   .title {{ font-weight: bold; }} .right {{ text-anchor: end; }} .middle {{ text-anchor: middle; }}
   .curve {{ fill: none; stroke-width: 2.5; stroke-linejoin: round; }}
-  .grid {{ stroke: #737d88; stroke-opacity: 0.3; }} .support {{ fill: #737d88; fill-opacity: 0.16; }}
+  .grid {{ stroke: #737d88; stroke-opacity: 0.3; }}
+  .support {{ fill: #737d88; fill-opacity: 0.16; }}
 </style>"""
 
 
@@ -55,7 +58,8 @@ def step_svg(rows: Rows) -> str:
     """The picture.
 
     Args:
-        rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals of the charts.
+        rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals of
+            the charts.
     """
     height = _TOP + len(CHARTS) * (_HEIGHT + _GAP)
     label = "Pelvis error and ZMP deviation over a step of 3 s, without and with compensation"
@@ -80,23 +84,33 @@ def _draw(chart: Chart, rows: Rows, top: float) -> list[str]:
     begin = x(alone[0])
     end = x(alone[-1])
     parts = [
-        f'<rect class="support" x="{begin:.1f}" y="{top}" width="{end - begin:.1f}" height="{_HEIGHT}"/>',
+        (
+            f'<rect class="support" x="{begin:.1f}" y="{top}" width="{end - begin:.1f}"'
+            f' height="{_HEIGHT}"/>'
+        ),
         f'<text x="{_LEFT}" y="{top - 10}" class="title">{chart.title}</text>',
         f'<text x="{(begin + end) / 2:.1f}" y="{bottom + 18}" class="middle">one foot</text>',
     ]
     for tick in chart.ticks:
-        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_RIGHT}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>')
+        parts.append(
+            f'<line class="grid" x1="{_LEFT}" x2="{_RIGHT}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
+        )
         parts.append(f'<text x="{_LEFT - 6}" y="{y(tick) + 5:.1f}" class="right">{tick:g}</text>')
-    parts += [f'<text x="{x(t):.1f}" y="{bottom + 18}" class="middle">{t:g}</text>' for t in range(1, int(times[-1]))]
+    parts += [
+        f'<text x="{x(t):.1f}" y="{bottom + 18}" class="middle">{t:g}</text>'
+        for t in range(1, int(times[-1]))
+    ]
     for policy, colour in _COLOURS.items():
         points = [
-            (x(time), y(1e3 * float(row[f"{policy}_{chart.signal}"]))) for time, row in zip(times, rows, strict=True)
+            (x(time), y(1e3 * float(row[f"{policy}_{chart.signal}"])))
+            for time, row in zip(times, rows, strict=True)
         ]
         path = "L".join(f"{px:.1f} {py:.1f}" for px, py in points)
         parts.append(f'<path class="curve" stroke="{colour}" d="M{path}"/>')
     names = ((policy, _RIGHT - 138 if policy == WITHOUT else _RIGHT) for policy in _TITLES)
     parts += [
-        f'<text x="{at}" y="{top - 10}" class="right" style="fill: {_COLOURS[policy]}">{_TITLES[policy]}</text>'
+        f'<text x="{at}" y="{top - 10}" class="right" style="fill:'
+        f' {_COLOURS[policy]}">{_TITLES[policy]}</text>'
         for policy, at in names
     ]
     return parts

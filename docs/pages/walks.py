@@ -2,13 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 
-from docs.pages.cells import Cells, Rows, failure_counts, format_metrics, in_table_unit, minus, page_table
+from docs.pages.cells import (
+    Cells,
+    Rows,
+    failure_counts,
+    format_metrics,
+    in_table_unit,
+    minus,
+    page_table,
+)
 from train.evaluate.standings import Standing
 
 PELVIS = "pelvis_error_rms_rad"
 ZMP = "zmp_deviation_rms_m"
 
-_ROLL, _PITCH = (tuple(f"pelvis_{axis}_{kind}_rad" for kind in ("rms", "peak")) for axis in ("roll", "pitch"))
+_ROLL, _PITCH = (
+    tuple(f"pelvis_{axis}_{kind}_rad" for kind in ("rms", "peak")) for axis in ("roll", "pitch")
+)
 _ZMPS = (ZMP, "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
 _EARLY = "early_touchdown_mean_s"
 _FRAME = "frame_error_mean_m"
@@ -48,7 +58,9 @@ def _walk(row: Mapping[str, str]) -> str:
 
 
 def paper_walks(rows: Rows, others: Rows) -> str:
-    """Roll, pitch, ZMP deviation and early touch-down of every baseline in the gaits of the paper and faster."""
+    """Roll, pitch, ZMP deviation and early touch-down of every baseline in the gaits of the
+    paper and faster.
+    """
     cells = Cells(rows)
     fast = Cells(others)
     places = [
@@ -58,7 +70,9 @@ def paper_walks(rows: Rows, others: Rows) -> str:
         for policy in cells.names("policy")
         if cells.has(policy, reference, scenario)
     ]
-    places += [(fast, policy, reference, "ideal") for reference in ("1.6 s", "1.1 s") for policy in _FAST]
+    places += [
+        (fast, policy, reference, "ideal") for reference in ("1.6 s", "1.1 s") for policy in _FAST
+    ]
     lines = [
         [
             reference,
@@ -80,34 +94,50 @@ def _paper_walk(row: Mapping[str, str]) -> list[str]:
     fell, episodes = failure_counts(row)
     if fell == episodes:
         return [f"{fell} of {episodes} fell" if episodes > 1 else "fell", *["–"] * 3]
-    angles = (f"{in_table_unit(row, rms):.2f} / {in_table_unit(row, peak):.1f}" for rms, peak in (_ROLL, _PITCH))
+    angles = (
+        f"{in_table_unit(row, rms):.2f} / {in_table_unit(row, peak):.1f}"
+        for rms, peak in (_ROLL, _PITCH)
+    )
     return [*angles, format_metrics(row, _ZMPS, 1, ", "), format_metrics(row, [_EARLY], 0)]
 
 
 def local_frame(rows: Rows) -> str:
-    """Error of the local frame, and jump of the estimated center of mass, at the support changes."""
+    """Error of the local frame, and jump of the estimated center of mass, at the support
+    changes.
+    """
     cells = Cells(rows)
     lines = []
     references = cells.names("reference")
     for policy in cells.names("policy"):
         found = [cells.row(policy, reference, "nominal") for reference in references]
         if all(row[_FRAME] for row in found) and not policy.endswith("_open"):
-            lines.append([f"`{policy}`", *(format_metrics(row, [m], 1) for m in (_FRAME, _JUMP) for row in found)])
+            lines.append(
+                [
+                    f"`{policy}`",
+                    *(format_metrics(row, [m], 1) for m in (_FRAME, _JUMP) for row in found),
+                ]
+            )
     head = ["", *(f"{what}, {reference}" for what in ("e", "jump") for reference in references)]
     return page_table(head, lines)
 
 
 def sensitivity(rows: Rows) -> str:
-    """Effects of changes of robot, gait or controller on the walk, with and without compensation."""
+    """Effects of changes of robot, gait or controller on the walk, with and without
+    compensation.
+    """
     cells = Cells(rows)
     changes = list(dict.fromkeys(policy.partition(": ")[2] for policy in cells.names("policy")))
     columns = [
-        (policy, scenario) for scenario in cells.names("scenario") for policy in ("uncompensated", "input_output")
+        (policy, scenario)
+        for scenario in cells.names("scenario")
+        for policy in ("uncompensated", "input_output")
     ]
     lines = []
     for change in changes:
         places = [(f"{policy}: {change}", "3 s", scenario) for policy, scenario in columns]
-        lines.append([change, *(_sway(cells.row(*place)) if cells.has(*place) else "–" for place in places)])
+        lines.append(
+            [change, *(_sway(cells.row(*place)) if cells.has(*place) else "–" for place in places)]
+        )
     head = ["", *(f"`{policy}`, `{scenario}`" for policy, scenario in columns)]
     return page_table(head, lines)
 
@@ -132,8 +162,13 @@ def gravity_torques(rows: Rows) -> str:
     joints = ("hip_roll", "ankle_roll", "knee")
     lines = []
     for row in rows:
-        own = ([float(row[f"{place}_{joint}_nm"]) for joint in joints] for place in ("ankle", "inward"))
-        torques = (" / ".join(minus(f"{torque:.1f}").replace("−0.0", "0.0") for torque in leg) for leg in own)
+        own = (
+            [float(row[f"{place}_{joint}_nm"]) for joint in joints] for place in ("ankle", "inward")
+        )
+        torques = (
+            " / ".join(minus(f"{torque:.1f}").replace("−0.0", "0.0") for torque in leg)
+            for leg in own
+        )
         lines.append([f"`{row['method']}`: {meaning[row['method']]}", *torques])
     head = ["", "ZMP under the ankle: hip roll / ankle roll / knee", "ZMP 0.02 m inward"]
     return page_table(head, lines)
@@ -150,7 +185,8 @@ def drawn_robots(rows: Rows) -> str:
             policy if " " in policy else f"`{policy}`",
             *(
                 " / ".join(
-                    f"{1e3 * float(own[metric][name]):.1f}" for name in ("mean", "interquartile_mean", "worst_tenth")
+                    f"{1e3 * float(own[metric][name]):.1f}"
+                    for name in ("mean", "interquartile_mean", "worst_tenth")
                 )
                 for metric in (PELVIS, ZMP)
             ),
@@ -164,7 +200,9 @@ def drawn_robots(rows: Rows) -> str:
 
 
 def imu_errors(rows: Rows) -> str:
-    """Pelvis error, ZMP deviation and error of the IMU without and with the errors of the device."""
+    """Pelvis error, ZMP deviation and error of the IMU without and with the errors of the
+    device.
+    """
     cells = Cells(rows)
     metrics = (PELVIS, ZMP, "imu_error_rms_rad")
     lines = []
@@ -187,7 +225,10 @@ def published_controllers(standings: Sequence[Standing]) -> str:
     lines = [
         [
             f"`{policy}`",
-            *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)]) for scope in _MIXTURE),
+            *(
+                _mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)])
+                for scope in _MIXTURE
+            ),
         ]
         for policy in _PUBLISHED
     ]
@@ -197,7 +238,11 @@ def published_controllers(standings: Sequence[Standing]) -> str:
 
 def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
     """Scores of `iterative` on each robot, beside its base."""
-    found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s" and not s.is_group}
+    found = {
+        (s.policy, s.scope, s.metric): s
+        for s in standings
+        if s.reference == "3 s" and not s.is_group
+    }
     scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
     lines = [
         [

@@ -1,10 +1,12 @@
-"""Pages of the documentation whose figures come from the results beside them, and from nowhere else.
+"""Pages of the documentation whose figures come from the results beside them, and from nowhere
+else.
 
     python -m docs.pages          # README.md and docs/*.md from docs/results
 
-A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
-within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
-The tool writes all of them anew. A test fails where a page and the results disagree.
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard:
+end -->`. A figure within a sentence stands between `<!-- = paper; input_output; 3 s; nominal;
+pelvis_roll_rms_rad -->` and `<!-- / -->`. The tool writes all of them anew. A test fails where a
+page and the results disagree.
 """
 
 import re
@@ -72,7 +74,9 @@ TABLES = {
         for name, kept in KEPT.items()
     },
     **{
-        f"speed_{env}": f"copy it from speed.csv after `elastic speed --env {env} --num-envs 64 1 16 256 1024`"
+        f"speed_{env}": (
+            f"copy it from speed.csv after `elastic speed --env {env} --num-envs 64 1 16 256 1024`"
+        )
         for env in ("walker", "testbed")
     },
     "cluster": "python -m tests.cluster_trials measures it",
@@ -116,12 +120,18 @@ class Results:
 
 
 def walks_beside_the_paper(walks: Rows) -> str:
-    """Largest roll and pitch of the walks in `nominal` without and with compensation, and those of the paper."""
+    """Largest roll and pitch of the walks in `nominal` without and with compensation, and those
+    of the paper.
+    """
     rows = []
     for row in walks:
-        if row["scenario"] == "nominal" and row["policy"] in PAPER_PELVIS and row[_PEAKS[0]]:  # else the testbed's
+        if (
+            row["scenario"] == "nominal" and row["policy"] in PAPER_PELVIS and row[_PEAKS[0]]
+        ):  # else the testbed's
             roll, pitch = (f"{1e3 * float(row[name]):.1f}" for name in _PEAKS)
-            rows.append([row["reference"], _TITLES[row["policy"]], roll, pitch, PAPER_PELVIS[row["policy"]]])
+            rows.append(
+                [row["reference"], _TITLES[row["policy"]], roll, pitch, PAPER_PELVIS[row["policy"]]]
+            )
     head = ["step period", "largest error of the pelvis [mrad]", "roll", "pitch", "paper"]
     return page_table(head, rows, words=2)
 
@@ -161,7 +171,8 @@ def gallery_table(gallery: Rows) -> str:
 def gallery_pictures(gallery: Rows) -> str:
     """Pictures of the robots of the gallery, each under its name."""
     return "\n".join(
-        f"**{row['title']}**\n\n![{row['title']} without and with compensation](images/gallery/{row['robot']}.png)\n"
+        f"**{row['title']}**\n\n![{row['title']} without and with"
+        f" compensation](images/gallery/{row['robot']}.png)\n"
         for row in gallery
     )
 
@@ -214,7 +225,9 @@ PARTS: Mapping[str, Part] = {
     "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
-    "speed of vector environments": _of(speeds.vector_environments, "speed_walker", "speed_testbed"),
+    "speed of vector environments": _of(
+        speeds.vector_environments, "speed_walker", "speed_testbed"
+    ),
     "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
     "costs of cells": _of(speeds.costs_of_cells, "cluster"),
     "named policies": Part((), lambda _: policy_table()),
@@ -246,7 +259,8 @@ def figure(results: Results, place: str, now: str) -> str:
 
     Args:
         results: The results.
-        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first one.
+        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first
+            one.
         now: The text between its marks.
 
     Raises:
@@ -255,7 +269,9 @@ def figure(results: Results, place: str, now: str) -> str:
     table, *cell, metric = [part.strip() for part in place.split("; ")]
     statistic = cell.pop() if len(cell) == 4 else ""
     if table not in results.tables or len(cell) != 3:
-        raise ConfigurationError(f"{place!r} is no figure: give table; policy; reference; scenario; statistic; metric")
+        raise ConfigurationError(
+            f"{place!r} is no figure: give table; policy; reference; scenario; statistic; metric"
+        )
     row = Cells(results.tables[table]).row(*cell, statistic=statistic)
     decimals = len(now.partition(".")[2])
     return minus(f"{in_table_unit(row, metric):.{decimals}f}")
@@ -268,20 +284,25 @@ def marks(part: str) -> tuple[str, str]:
 
 def has_parts(text: str) -> bool:
     """True if a page has a mark of any part or figure."""
-    return _FIGURE.search(text) is not None or any(mark in text for part in PARTS for mark in marks(part))
+    return _FIGURE.search(text) is not None or any(
+        mark in text for part in PARTS for mark in marks(part)
+    )
 
 
 def page_with(text: str, results: Results) -> str:
     """A page with every part and every figure between its marks written anew.
 
     Raises:
-        ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
+        ConfigurationError: It has no marks of any part, or not both of a part, each once and in
+            order.
     """
     parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
     for part in parts or ([] if _FIGURE.search(text) else PARTS):
         begin, end = marks(part)
         if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-            raise ConfigurationError(f"a page for the {part} needs the lines {begin!r} and {end!r}, each once")
+            raise ConfigurationError(
+                f"a page for the {part} needs the lines {begin!r} and {end!r}, each once"
+            )
         before, _, rest = text.partition(begin)
         text = f"{before}{begin}\n\n{PARTS[part].text(results)}\n{end}{rest.partition(end)[2]}"
     return _FIGURE.sub(lambda m: f"<!-- = {m[1]} -->{figure(results, m[1], m[2])}<!-- / -->", text)
@@ -290,7 +311,12 @@ def page_with(text: str, results: Results) -> str:
 def reads(text: str) -> set[str]:
     """Names of the results that a page shows."""
     shown = {name for part, own in PARTS.items() if marks(part)[0] in text for name in own.reads}
-    shown |= {name for picture, own in PICTURES.items() if f"images/{picture}" in text for name in own.reads}
+    shown |= {
+        name
+        for picture, own in PICTURES.items()
+        if f"images/{picture}" in text
+        for name in own.reads
+    }
     return shown | {place.partition("; ")[0] for place, _ in _FIGURE.findall(text)}
 
 
@@ -303,7 +329,11 @@ def policy_table() -> str:
 def pages(root: Path) -> list[Path]:
     """Pages under a checkout that show results."""
     candidates = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
-    return [page for page in candidates if page.is_file() and has_parts(page.read_text(encoding="utf-8"))]
+    return [
+        page
+        for page in candidates
+        if page.is_file() and has_parts(page.read_text(encoding="utf-8"))
+    ]
 
 
 def main(arguments: Sequence[str]) -> None:

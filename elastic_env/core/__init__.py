@@ -1,1 +1,3 @@
-"""What every room uses: errors, validated models, text formats, tables of signals, rows of worlds, compilation."""
+"""What every room uses: errors, validated models, text formats, tables of signals, rows of
+worlds, compilation.
+"""

@@ -1,12 +1,14 @@
-"""Functions that Numba compiles: arithmetic row by row, without what NumPy takes for each operation on small arrays.
+"""Functions that Numba compiles: arithmetic row by row, without what NumPy takes for each operation
+on small arrays.
 
-Numba compiles them when they are first called with arrays of a kind. It keeps the code beside the source file or in the
-user's cache folder, by the file of the function that was called. So a kernel stands in one file with all that it calls,
-and takes sizes from types, not from constants of other files; a test sees to that. Sums run in the order that is
-written and no operation is fused with another. So a row's result does not depend on how many rows there are.
+Numba compiles them when they are first called with arrays of a kind. It keeps the code beside the
+source file or in the user's cache folder, by the file of the function that was called. So a kernel
+stands in one file with all that it calls, and takes sizes from types, not from constants of other
+files; a test sees to that. Sums run in the order that is written and no operation is fused with
+another. So a row's result does not depend on how many rows there are.
 
-The logger `elastic_env.core.compiled` says at level INFO that a function of ours is compiled, and nothing where it is
-loaded. So a program can say why its first use takes long.
+The logger `elastic_env.core.compiled` says at level INFO that a function of ours is compiled, and
+nothing where it is loaded. So a program can say why its first use takes long.
 """
 
 import logging
@@ -23,15 +25,21 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 _LOG = logging.getLogger(__name__)
-_KEPT = "compiling, once after an installation or an update: the first use takes some seconds longer"
-_NOT_KEPT = "compiling, for some seconds in every program: there is no folder to keep it that can be written"
+_KEPT = (
+    "compiling, once after an installation or an update: the first use takes some seconds longer"
+)
+_NOT_KEPT = (
+    "compiling, for some seconds in every program: there is no folder to keep it that can be"
+    " written"
+)
 _said_of: dict[Any, str] = {}
 """What is logged of a function, by its Python code."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a function of arrays and numbers; its own Python code is the attribute `py_func`."""
-    # as in NumPy, what is divided by zero is infinite or nan; nobody calls it from C, which saves some compiling
+    # as in NumPy, what is divided by zero is infinite or nan; nobody calls it from C, which saves
+    # some compiling
     options: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
     _said_of[function] = _KEPT
     try:
@@ -63,20 +71,25 @@ def record_type(**fields: Any) -> np.dtype[Any]:
     Args:
         **fields: Shape of each field of numbers, () for a number; bool for a truth value.
     """
-    parts = [(name, np.bool_) if shape is bool else (name, np.float64, shape) for name, shape in fields.items()]
+    parts = [
+        (name, np.bool_) if shape is bool else (name, np.float64, shape)
+        for name, shape in fields.items()
+    ]
     return np.dtype((np.record, parts))
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a formula of a kernel that NumPy's arrays need too: Python calls it as it is, kernels compile it."""
+    """Decorate a formula of a kernel that NumPy's arrays need too: Python calls it as it is,
+    kernels compile it.
+    """
     return register_jitable(error_model="numpy")(function)
 
 
 def compile_now(function: Callable[..., Any], *arguments: Any) -> None:
     """Call a function so that all that it needs is compiled, or loaded, before it is needed.
 
-    This happens in a thread of its own. The compiler calls Python back from C code, where the exception of a signal
-    such as Ctrl-C would be lost. The main thread, which gets signals, waits.
+    This happens in a thread of its own. The compiler calls Python back from C code, where the
+    exception of a signal such as Ctrl-C would be lost. The main thread, which gets signals, waits.
     """
 
     def call() -> None:

@@ -1,17 +1,25 @@
 """Validated, immutable parameter models, and YAML files that become them.
 
 Every parameter of the project is a field of a `Model`: it carries its unit and its bounds, a wrong
-value raises an error that names the field, the unit, the bound and what was given, and an unknown key
-lists the keys that exist.
+value raises an error that names the field, the unit, the bound and what was given, and an unknown
+key lists the keys that exist.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+)
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
@@ -25,7 +33,9 @@ from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 ModelT = TypeVar("ModelT", bound="Model")
 
 
-def quantity(unit: str, default: Any = ..., *, description: str | None = None, **bounds: Any) -> Any:
+def quantity(
+    unit: str, default: Any = ..., *, description: str | None = None, **bounds: Any
+) -> Any:
     """A physical parameter of a `Model`.
 
     Args:
@@ -39,9 +49,11 @@ def quantity(unit: str, default: Any = ..., *, description: str | None = None, *
 
 
 def plain_numbers(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's numbers and lists, also within lists, tuples and mappings.
+    """NumPy's numbers and arrays as Python's numbers and lists, also within lists, tuples and
+    mappings.
 
-    A number of less than double precision becomes what it is written as: 1.6 and not 1.600000023841858.
+    A number of less than double precision becomes what it is written as: 1.6 and not
+    1.600000023841858.
     """
     match value:
         case np.ndarray():
@@ -61,16 +73,24 @@ def plain_numbers(value: Any) -> Any:
 
 
 def _with_strict_numbers(schema: Any) -> Any:
-    """A schema of Pydantic's whose numbers are strict wherever they stand, and may be NumPy's; lists may be arrays."""
+    """A schema of Pydantic's whose numbers are strict wherever they stand, and may be NumPy's;
+    lists may be arrays.
+    """
     if isinstance(schema, list | tuple):
         return type(schema)(_with_strict_numbers(part) for part in schema)
     if not isinstance(schema, dict) or schema.get("strict"):
         return schema
     of_values = "default", "expected", "metadata"
-    own: Any = {key: part if key in of_values else _with_strict_numbers(part) for key, part in schema.items()}
-    convert = {"float": plain_numbers, "int": _whole, "list": plain_numbers, "tuple": plain_numbers}.get(
-        own.get("type")
-    )
+    own: Any = {
+        key: part if key in of_values else _with_strict_numbers(part)
+        for key, part in schema.items()
+    }
+    convert = {
+        "float": plain_numbers,
+        "int": _whole,
+        "list": plain_numbers,
+        "tuple": plain_numbers,
+    }.get(own.get("type"))
     if own.get("type") in ("float", "int"):
         own["strict"] = True
     return own if convert is None else no_info_before_validator_function(convert, own)
@@ -89,7 +109,11 @@ class Model(BaseModel):
     """
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, use_attribute_docstrings=True
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+        use_attribute_docstrings=True,
     )
 
     def __init__(self, /, **values: Any) -> None:
@@ -99,18 +123,31 @@ class Model(BaseModel):
             raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
 
     @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Take the line breaks of docstrings out of descriptions."""
+        super().__pydantic_init_subclass__(**kwargs)
+        for field in cls.model_fields.values():
+            if field.description is not None:
+                paragraphs = re.split(r"\n\s*\n", field.description)
+                field.description = "\n\n".join(" ".join(part.split()) for part in paragraphs)
+
+    @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Pydantic's schema with strict numbers."""
         return _with_strict_numbers(handler(source))
 
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
-        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+        return type(self)(
+            **{**{name: getattr(self, name) for name in type(self).model_fields}, **changes}
+        )
 
 
 def _is_text(value: str) -> str:
     if NO_TEXT.search(value):
-        raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
+        raise ValueError(
+            f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}"
+        )
     return value
 
 
@@ -127,7 +164,9 @@ _BYTES = 4
 """Most bytes of a character in UTF-8."""
 
 
-def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None) -> ModelT:
+def load_yaml(
+    path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None
+) -> ModelT:
     """Read a YAML file into a validated model.
 
     Args:
@@ -149,7 +188,11 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
 
 
 def load_json(
-    path: Path, model: type[ModelT], what: str, missing: Callable[[str], str], within: Path | None = None
+    path: Path,
+    model: type[ModelT],
+    what: str,
+    missing: Callable[[str], str],
+    within: Path | None = None,
 ) -> ModelT:
     """Read a JSON file into a validated model.
 
@@ -161,7 +204,8 @@ def load_json(
         within: Folder that the file must lie in, after all links; None for anywhere.
 
     Raises:
-        ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the model.
+        ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the
+            model.
     """
     try:
         content = parse_json(read_bounded(path, _BYTES * LARGEST_JSON, within).decode("utf-8"))
@@ -172,11 +216,15 @@ def load_json(
     except ValueError as error:
         raise ConfigurationError(f"{shortened(path)} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{shortened(path)} must be a mapping, got {type(content).__name__}")
+        raise ConfigurationError(
+            f"{shortened(path)} must be a mapping, got {type(content).__name__}"
+        )
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(f"{shortened(path)} describes no {what}: {error.named()}") from None
+        raise ConfigurationError(
+            f"{shortened(path)} describes no {what}: {error.named()}"
+        ) from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
@@ -213,7 +261,9 @@ def _text_of(file: Path) -> str:
         if file.is_dir():
             raise ConfigurationError(f"{shortened(file)} is a folder, a YAML file is needed")
         if not file.exists():
-            known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+            known = (
+                sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+            )
             listing = f"; found beside it: {listed(known)}" if known else configurations_are(file)
             raise ConfigurationError(f"no configuration file at {shortened(file)}{listing}")
         return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")

@@ -21,8 +21,8 @@ class Problem:
 
     Attributes:
         path: Where it stands.
-        form: What the sentence says: of a parameter what it must be, of a model a rule that its parameters break, a
-            parameter that it has not, or one that it lacks.
+        form: What the sentence says: of a parameter what it must be, of a model a rule that its
+            parameters break, a parameter that it has not, or one that it lacks.
         text: The rest of the sentence.
     """
 
@@ -56,7 +56,9 @@ _LONGEST_SAID = 1900
 
 def dotted(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
-    return ".".join(part if isinstance(part, str) and len(part) < 100 else shown(part) for part in path)
+    return ".".join(
+        part if isinstance(part, str) and len(part) < 100 else shown(part) for part in path
+    )
 
 
 class ModelError(ConfigurationError):
@@ -77,8 +79,12 @@ class ModelError(ConfigurationError):
         return self.named(self.model)
 
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
-        """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
-        sentences = list(dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems))
+        """All problems, one per line, in the words of who wrote a file or options; arguments as
+        `Problem.sentence`.
+        """
+        sentences = list(
+            dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems)
+        )
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
         fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
         said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
@@ -86,7 +92,9 @@ class ModelError(ConfigurationError):
         return "\n".join([*said, *more])
 
 
-def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]) -> list[Problem]:
+def problems_of(
+    model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]
+) -> list[Problem]:
     """Problems that a validation found, those of models within the model among them.
 
     Args:
@@ -94,10 +102,16 @@ def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[
         error: What Pydantic says.
         values: What was given.
     """
-    return [found for problem in error.errors(include_url=False) for found in _problems(model, problem, values)]
+    return [
+        found
+        for problem in error.errors(include_url=False)
+        for found in _problems(model, problem, values)
+    ]
 
 
-def _problems(model: type[BaseModel], problem: Mapping[str, Any], values: Mapping[str, Any]) -> list[Problem]:
+def _problems(
+    model: type[BaseModel], problem: Mapping[str, Any], values: Mapping[str, Any]
+) -> list[Problem]:
     path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
     cause = problem.get("ctx", {}).get("error")
     if isinstance(cause, ModelError):  # of a model within this one
@@ -123,13 +137,17 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
     if bounds := _bounds(model, path):
         requirement = f"be {bounds}"
     elif kind := _REQUIREMENTS.get(problem["type"]):
-        requirement = kind.format(entries="entry" if 1 in context.values() else "entries", **context)
+        requirement = kind.format(
+            entries="entry" if 1 in context.values() else "entries", **context
+        )
     else:
         requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     meaning = meaning_of(field) if field is not None else ""
     in_brackets = f" ({meaning})" if meaning else ""
-    return Problem(path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}")
+    return Problem(
+        path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}"
+    )
 
 
 _REQUIREMENTS = {
@@ -148,7 +166,9 @@ _REQUIREMENTS = {
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
-    """A location without what Pydantic adds to it: the member of a union that it tried, or that a tag chose."""
+    """A location without what Pydantic adds to it: the member of a union that it tried, or that
+    a tag chose.
+    """
     path: list[str | int] = []
     for number, part in enumerate(location):
         inside: Any = None
@@ -166,7 +186,9 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
 
 
 def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
-    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one without."""
+    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one
+    without.
+    """
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     constraints = [
@@ -175,7 +197,11 @@ def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
         for key, sign in signs.items()
         if hasattr(constraint, key)
     ]
-    whole = field is not None and "int" in str(field.annotation) and "float" not in str(field.annotation)
+    whole = (
+        field is not None
+        and "int" in str(field.annotation)
+        and "float" not in str(field.annotation)
+    )
     kind = "a whole number" if whole else "a finite number"
     return f"{kind} {' and '.join(constraints)}" if constraints else ""
 

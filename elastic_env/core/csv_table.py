@@ -1,4 +1,6 @@
-"""Tables of numbers from a user's CSV file: a header, then rows of finite numbers, of bounded size."""
+"""Tables of numbers from a user's CSV file: a header, then rows of finite numbers, of bounded
+size.
+"""
 
 import csv
 import math
@@ -49,11 +51,14 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
         example: Columns that a header may have, for messages.
 
     Raises:
-        ConfigurationError: The file is missing, too large or no CSV file, or holds something else than finite numbers.
+        ConfigurationError: The file is missing, too large or no CSV file, or holds something else
+            than finite numbers.
     """
     size = _size(file, what, example)
     if size > LARGEST_BYTES:
-        raise ConfigurationError(f"{shortened(file)} must have at most {LARGEST_BYTES} bytes, it has {size}")
+        raise ConfigurationError(
+            f"{shortened(file)} must have at most {LARGEST_BYTES} bytes, it has {size}"
+        )
     try:
         with file.open(newline="", encoding="utf-8-sig") as text:
             return _parsed(file, text, row, most_rows, example)
@@ -79,16 +84,21 @@ def _size(file: Path, what: str, example: str) -> int:
         ) from None
     if not stat.S_ISREG(found.st_mode):
         raise ConfigurationError(
-            f"{shortened(file)} must be a plain file, it is a folder, a pipe or a device; give a CSV file"
+            f"{shortened(file)} must be a plain file, it is a folder, a pipe or a device; give a"
+            " CSV file"
         )
     return found.st_size
 
 
 def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) -> Table:
-    lines = (cells for cells in csv.reader(_bounded(file, text)) if any(cell.strip() for cell in cells))
+    lines = (
+        cells for cells in csv.reader(_bounded(file, text)) if any(cell.strip() for cell in cells)
+    )
     header = next(lines, None)
     if header is None:
-        raise ConfigurationError(f"{shortened(file)} is empty; its first line must name columns such as {example}")
+        raise ConfigurationError(
+            f"{shortened(file)} is empty; its first line must name columns such as {example}"
+        )
     names = _names(file, header)
     values = array("d")
     count = 0
@@ -98,7 +108,9 @@ def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) ->
         _append(values, file, f"{row} {count}", names, cells)
     if not 0 < count <= most_rows:
         more = f"more than {most_rows}" if count else "0"
-        raise ConfigurationError(f"{shortened(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}")
+        raise ConfigurationError(
+            f"{shortened(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
+        )
     return Table(names, np.frombuffer(values, dtype=np.float64).reshape(count, len(names)).copy())
 
 
@@ -107,7 +119,8 @@ def _bounded(file: Path, text: TextIO) -> Iterator[str]:
     while line := text.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
             raise ConfigurationError(
-                f"{shortened(file)} must have lines of at most {_LONGEST_LINE} characters; is it a CSV file?"
+                f"{shortened(file)} must have lines of at most {_LONGEST_LINE} characters; is it a"
+                " CSV file?"
             )
         yield line
 
@@ -122,20 +135,29 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
     if len(names) == 1:
         for separator, called in _SEPARATORS.items():
             if separator in names[0]:
-                raise ConfigurationError(f"the columns of {shortened(file)} are separated by {called}; {_CURE}")
+                raise ConfigurationError(
+                    f"the columns of {shortened(file)} are separated by {called}; {_CURE}"
+                )
     if len(names) > MOST_COLUMNS:
-        raise ConfigurationError(f"{shortened(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}")
+        raise ConfigurationError(
+            f"{shortened(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
+        )
     if "" in names:
         raise ConfigurationError(
-            f"column {names.index('') + 1} of {shortened(file)} has no name; give it one, or take the column out"
+            f"column {names.index('') + 1} of {shortened(file)} has no name; give it one, or take"
+            " the column out"
         )
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise ConfigurationError(f"{shortened(file)} has the column {shown(name)[1:-1]} twice; keep one of them")
+        raise ConfigurationError(
+            f"{shortened(file)} has the column {shown(name)[1:-1]} twice; keep one of them"
+        )
     return names
 
 
-def _append(values: "array[float]", file: Path, where: str, names: tuple[str, ...], cells: list[str]) -> None:
+def _append(
+    values: "array[float]", file: Path, where: str, names: tuple[str, ...], cells: list[str]
+) -> None:
     """Add the finite numbers of a row."""
     if len(cells) != len(names):
         raise ConfigurationError(f"{shortened(file)}, {where}: {_ragged(names, cells)}")
@@ -146,8 +168,9 @@ def _append(values: "array[float]", file: Path, where: str, names: tuple[str, ..
             value = math.nan
         if not math.isfinite(value):
             raise ConfigurationError(
-                f"{shortened(file)} must hold a header and rows of numbers: {where}, column {shown(name)[1:-1]}: "
-                f"a finite number is needed, got {shown(cell)}; {_cure_of(cell)}"
+                f"{shortened(file)} must hold a header and rows of numbers: {where}, column"
+                f" {shown(name)[1:-1]}: a finite number is needed, got {shown(cell)};"
+                f" {_cure_of(cell)}"
             )
         values.append(value)
 
@@ -157,7 +180,11 @@ def _ragged(names: tuple[str, ...], cells: list[str]) -> str:
     for separator, called in _SEPARATORS.items():
         if any(separator in cell for cell in cells):
             return f"its values are separated by {called}; {_CURE}"
-    hint = "; were its numbers written with decimal commas? Write points" if len(cells) == 2 * len(names) else ""
+    hint = (
+        "; were its numbers written with decimal commas? Write points"
+        if len(cells) == 2 * len(names)
+        else ""
+    )
     return f"{len(names)} values are needed, one a column, got {len(cells)}{hint}"
 
 
@@ -167,4 +194,6 @@ def _cure_of(cell: str) -> str:
         float(cell.replace(",", "."))
     except ValueError:
         return "give a number, or delete the line"
-    return "write the number with a point" if "," in cell else "measure it again, or delete the line"
+    return (
+        "write the number with a point" if "," in cell else "measure it again, or delete the line"
+    )

@@ -1,8 +1,9 @@
-"""Random generators of an episode: for the robot, which can walk again, and for what happens to it then.
+"""Random generators of an episode: for the robot, which can walk again, and for what happens to it
+then.
 
-A robot is what lasts: its joints, the offsets of its sensors, the ground under it, and where a motion is drawn, the
-motion. A trial is what does not: noise, pushes. `reset(options={"robot_seed": s})` begins a trial of the robot that
-`reset(seed=s)` draws, under noise of its own.
+A robot is what lasts: its joints, the offsets of its sensors, the ground under it, and where a
+motion is drawn, the motion. A trial is what does not: noise, pushes. `reset(options={"robot_seed":
+s})` begins a trial of the robot that `reset(seed=s)` draws, under noise of its own.
 """
 
 from collections.abc import Callable
@@ -29,11 +30,14 @@ class EpisodeRandom:
     def draw_trial(self, draw: Callable[[np.random.Generator], T]) -> T:
         """Something that differs from trial to trial.
 
-        It is drawn of both, so that what is drawn of the robot afterwards is the same in all its trials.
+        It is drawn of both, so that what is drawn of the robot afterwards is the same in all its
+        trials.
         """
         drawn = draw(self.robot)
         return drawn if self.trial is None else draw(self.trial)
 
     def noise(self) -> np.random.Generator:
         """A generator of its own for noise."""
-        return np.random.default_rng(self.draw_trial(lambda generator: int(generator.integers(2**63))))
+        return np.random.default_rng(
+            self.draw_trial(lambda generator: int(generator.integers(2**63)))
+        )

@@ -11,7 +11,8 @@ from elastic_env.core.installed import install_command
 
 _LONGEST_SHOWN = 200
 """Characters of a user's text in an error."""
-_LONGEST_LINE, _LONGEST_LIST = 2000, 1000
+_LONGEST_LINE = 2000
+_LONGEST_LIST = 1000
 """Characters of a line, and of names that are listed in it."""
 
 
@@ -19,7 +20,8 @@ class ElasticError(ValueError):
     """Base of every error that this project raises on purpose.
 
     Attributes:
-        exit_code: What the command `elastic` ends with: 2 for a wrong input, 3 where the system failed.
+        exit_code: What the command `elastic` ends with: 2 for a wrong input, 3 where the system
+            failed.
 
     A word or a quoted text of more than 200 characters is shortened, since it is a user's.
     """
@@ -54,7 +56,9 @@ class MissingExtraError(ConfigurationError):
 
 def missing_extra(package: str, extra: str, purpose: str) -> MissingExtraError:
     """The error for an optional package that is not there, with the command that installs it."""
-    return MissingExtraError(f"{purpose} needs the package {package}; install it with: {install_command(extra)}")
+    return MissingExtraError(
+        f"{purpose} needs the package {package}; install it with: {install_command(extra)}"
+    )
 
 
 class _Shown(reprlib.Repr):
@@ -84,7 +88,8 @@ def shown(value: Any) -> str:
 
 
 def shortened(text: object, longest: int = _LONGEST_SHOWN) -> str:
-    """Text of a user's as an error shows it without quotes, such as a path: its begin and end, where it is long.
+    """Text of a user's as an error shows it without quotes, such as a path: its begin and end,
+    where it is long.
 
     Args:
         text: It.
@@ -98,7 +103,10 @@ def shortened(text: object, longest: int = _LONGEST_SHOWN) -> str:
 
 
 _PIECE = re.compile(r"(?<!\w)'[^'\n]*'(?!\w)|\S+")
-"""A quoted text, or a word. Quotes are paired from the left, so that nothing between two of them counts as one."""
+"""A quoted text, or a word.
+
+Quotes are paired from the left, so that nothing between two of them counts as one.
+"""
 
 
 def readable(text: str) -> str:
@@ -134,7 +142,11 @@ def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> 
 def choices_listed(name: object, choices: Iterable[str]) -> str:
     """The names that exist, and the one that is closest to what was given."""
     known = list(choices)
-    close = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, n=1) if isinstance(name, str) else []
+    close = (
+        difflib.get_close_matches(name[:_LONGEST_SHOWN], known, n=1)
+        if isinstance(name, str)
+        else []
+    )
     hint = f" Did you mean {shown(close[0])}?" if close else ""
     return f"choose one of: {listed(known)}.{hint}"
 

@@ -23,7 +23,9 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
         ConfigurationError: It is no plain file, is larger, or leads out of the folder.
     """
     if within is not None and leads_out(path, within):
-        raise ConfigurationError(f"{_short_path(path)} is a link out of its folder; copy the file there")
+        raise ConfigurationError(
+            f"{_short_path(path)} is a link out of its folder; copy the file there"
+        )
     _require_plain(path, path.stat(), most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -43,13 +45,17 @@ def _require_plain(path: Path, found: os.stat_result, most_bytes: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise ConfigurationError(f"{_short_path(path)} must be a plain file, it is a pipe, a socket or a device")
+        raise ConfigurationError(
+            f"{_short_path(path)} must be a plain file, it is a pipe, a socket or a device"
+        )
     if found.st_size > most_bytes:
         raise _too_large(path, most_bytes, str(found.st_size))
 
 
 def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
-    return ConfigurationError(f"{_short_path(path)} must have at most {most_bytes} bytes, it has {has}")
+    return ConfigurationError(
+        f"{_short_path(path)} must have at most {most_bytes} bytes, it has {has}"
+    )
 
 
 def _short_path(path: Path) -> str:
@@ -57,7 +63,8 @@ def _short_path(path: Path) -> str:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file beside its place and move it there, when it is on the disk; a failure leaves nothing new.
+    """Write a file beside its place and move it there, when it is on the disk; a failure leaves
+    nothing new.
 
     A link at its place is replaced; what it leads to stays as it is.
 
@@ -71,7 +78,9 @@ def write_whole(path: Path, content: bytes | str) -> None:
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         fresh.unlink(missing_ok=True)
-        descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)  # follows no link
+        descriptor = os.open(
+            fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666
+        )  # follows no link
         with os.fdopen(descriptor, "wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
         flush(fresh)

@@ -10,7 +10,11 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 def checkout() -> Path | None:
     """Folder of the checkout that this code runs from; None for an installed package."""
-    return _ROOT if (_ROOT / "constraints.txt").is_file() and (_ROOT / "pyproject.toml").is_file() else None
+    return (
+        _ROOT
+        if (_ROOT / "constraints.txt").is_file() and (_ROOT / "pyproject.toml").is_file()
+        else None
+    )
 
 
 def install_command(extra: str) -> str:
@@ -37,7 +41,8 @@ def _packages_of(extra: str) -> list[str]:
 
 
 def configurations_are(file: Path) -> str:
-    """Where the configurations are, for an error about one that does not exist; empty where none of them is meant.
+    """Where the configurations are, for an error about one that does not exist; empty where none of
+    them is meant.
 
     Args:
         file: The one that was named.
@@ -52,8 +57,8 @@ def configurations_are(file: Path) -> str:
         return f"; those of elastic-env are in {own.parent}"
     shipped = [str(found.locate()) for found in _files() if found.suffix == ".yaml"]
     return (
-        "; the folder configs is in the source of elastic-env and not in the installed package: copy it from there. "
-        f"With the package come {', '.join(shipped) or 'none'}"
+        "; the folder configs is in the source of elastic-env and not in the installed package:"
+        f" copy it from there. With the package come {', '.join(shipped) or 'none'}"
     )
 
 

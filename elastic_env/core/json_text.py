@@ -1,4 +1,6 @@
-"""JSON of bounded size, with finite numbers and text that a file can hold: what others may have written."""
+"""JSON of bounded size, with finite numbers and text that a file can hold: what others may have
+written.
+"""
 
 import json
 import math
@@ -14,14 +16,18 @@ def parse_json(text: str) -> Any:
     """Content of a text in JSON.
 
     Raises:
-        ValueError: It is not JSON, is longer or deeper than the limits, or holds a key twice, a number that is not
-            finite or too long, or text with zero bytes.
+        ValueError: It is not JSON, is longer or deeper than the limits, or holds a key twice, a
+            number that is not finite or too long, or text with zero bytes.
     """
     if len(text) > LARGEST_JSON:
         raise ValueError(f"it must have at most {LARGEST_JSON} characters, got {len(text)}")
     try:
         content = json.loads(
-            text, parse_int=_whole, parse_float=_real, parse_constant=_real, object_pairs_hook=_mapping
+            text,
+            parse_int=_whole,
+            parse_float=_real,
+            parse_constant=_real,
+            object_pairs_hook=_mapping,
         )
     except RecursionError:
         raise _TOO_DEEP from None

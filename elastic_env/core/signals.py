@@ -1,4 +1,6 @@
-"""Named arrays that know their units: the one description of what an observation or an action holds."""
+"""Named arrays that know their units: the one description of what an observation or an action
+holds.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +32,8 @@ class Signal:
     Attributes:
         name, unit, meaning: In words.
         low, high: Values that it can take.
-        kind: Whether sensors show it, the plan has it, or it was commanded; None for what follows from these.
+        kind: Whether sensors show it, the plan has it, or it was commanded; None for what follows
+            from these.
         mirrored: What it is in the mirror; None where nobody has said so.
     """
 
@@ -51,7 +54,8 @@ class SignalGroup:
         name: Of the field. Its columns are called `name.part`, a single one has the name alone.
         signals: Its columns.
         shape: Of the field.
-        noise: Standard deviation of each column in a scenario, one number or all; None for what no sensor shows.
+        noise: Standard deviation of each column in a scenario, one number or all; None for what no
+            sensor shows.
     """
 
     name: str
@@ -130,16 +134,21 @@ class SignalTable:
         return indices
 
     def group(self, name: str) -> slice:
-        """Where the signal of that name stands, or the signals whose names begin with it and a dot, in order.
+        """Where the signal of that name stands, or the signals whose names begin with it and a dot,
+        in order.
 
         Raises:
             ConfigurationError: There is none, or they are not neighbours.
         """
         found = [i for i, own in enumerate(self.names) if own == name or own.startswith(f"{name}.")]
         if not found:
-            raise unknown_name("signal", name, dict.fromkeys(own.split(".")[0] for own in self.names))
+            raise unknown_name(
+                "signal", name, dict.fromkeys(own.split(".")[0] for own in self.names)
+            )
         if found != list(range(found[0], found[-1] + 1)):
-            raise ConfigurationError(f"the columns of {name!r} must be neighbours, they are {found}")
+            raise ConfigurationError(
+                f"the columns of {name!r} must be neighbours, they are {found}"
+            )
         return slice(found[0], found[-1] + 1)
 
     def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:
@@ -151,7 +160,10 @@ class SignalTable:
 
 def renamed(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
     """The same quantities by another way, under the name of another group."""
-    return tuple(replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None) for signal in signals)
+    return tuple(
+        replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None)
+        for signal in signals
+    )
 
 
 NO_SIGNALS = SignalTable(())

@@ -1,4 +1,6 @@
-"""Files of arrays that others may have written: safetensors, of bounded size, with real numbers alone."""
+"""Files of arrays that others may have written: safetensors, of bounded size, with real numbers
+alone.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,8 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
     """Tensors of a file of safetensors, and the content of the file that they were read from.
 
     Raises:
-        ConfigurationError: It is missing, cut short, too large, something else, holds other than real numbers, or is
-            a link that leads out of its folder.
+        ConfigurationError: It is missing, cut short, too large, something else, holds other than
+            real numbers, or is a link that leads out of its folder.
     """
     try:
         content = read_bounded(path, _MOST_BYTES, within=path.parent)
@@ -27,10 +29,12 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
             kind = shown(tensor["dtype"])[1:-1]
             if kind not in _FILE_TYPES:
                 raise ConfigurationError(
-                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {kind}"
+                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)},"
+                    f" got {kind}"
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(
-            f"{shortened(path)} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
+            f"{shortened(path)} cannot be read: it is missing, cut short or something else"
+            f" ({error}); copy it anew"
         ) from None

@@ -1,4 +1,5 @@
-"""YAML as configurations need it: plain data of bounded size, and nothing that YAML 1.1 makes of text.
+"""YAML as configurations need it: plain data of bounded size, and nothing that YAML 1.1 makes of
+text.
 
 What `yaml_of` and `yaml_line` write, `parse_yaml` reads.
 
@@ -28,9 +29,11 @@ NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one too.
+    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one
+    too.
 
-    PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast as PyYAML's.
+    PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast
+    as PyYAML's.
     """
 
     # dates stay text: a list of the resolvers of its own
@@ -56,25 +59,39 @@ class _Loader(Composer, yaml.CSafeLoader):
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            raise _refusal(event, f"mappings and lists must be nested at most {DEEPEST_NESTING} deep")
+            raise _refusal(
+                event, f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
+            )
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
             _require_names(self, node)
         self._sizes[id(node)] = size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
         if size > MOST_VALUES:
-            raise _refusal(event, f"it must hold at most {MOST_VALUES} values, aliases counted as what they stand for")
+            raise _refusal(
+                event,
+                f"it must hold at most {MOST_VALUES} values, aliases counted as what they"
+                " stand for",
+            )
         return node
 
     def construct_number(self, node: Any) -> int | float:
         """A number of bounded length."""
         text = self.construct_scalar(node)
         if len(text) > LONGEST_NUMBER:
-            raise _refusal(node, f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
+            raise _refusal(
+                node, f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}"
+            )
         try:
-            return self.construct_yaml_int(node) if node.tag == f"{_TAG}int" else self.construct_yaml_float(node)
+            return (
+                self.construct_yaml_int(node)
+                if node.tag == f"{_TAG}int"
+                else self.construct_yaml_float(node)
+            )
         except ValueError:
-            raise _refusal(node, f"{text!r} is no number; put text that looks like one in quotes") from None
+            raise _refusal(
+                node, f"{text!r} is no number; put text that looks like one in quotes"
+            ) from None
 
 
 _Loader.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
@@ -83,11 +100,12 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values, and None.
+    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values,
+    and None.
 
     Raises:
-        yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as objects, zero bytes,
-            or a key twice.
+        yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as
+            objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
         raise yaml.YAMLError(f"it must have at most {LARGEST_TEXT} characters, got {len(text)}")
@@ -100,12 +118,18 @@ def parse_yaml(text: str) -> Any:
         loader.dispose()
 
 
-_PATTERN = re.compile(r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?""")
+_PATTERN = re.compile(
+    r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?"""
+)
 
 
 def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
-    """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an alias."""
-    lines = [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
+    """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an
+    alias.
+    """
+    lines = (
+        [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
+    )
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
@@ -120,7 +144,9 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3, or would fold."""
+    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3,
+    or would fold.
+    """
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Text; with escapes where it holds line ends or other characters that do not print."""
@@ -132,20 +158,31 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
 
 
 def yaml_of(content: Any) -> str:
-    """Plain data as YAML that `parse_yaml` reads: mappings with text as keys, lists, text, numbers and the like."""
+    """Plain data as YAML that `parse_yaml` reads: mappings with text as keys, lists, text,
+    numbers and the like.
+    """
     return yaml.dump(content, Dumper=_Dumper, allow_unicode=True, sort_keys=False)
 
 
 def yaml_line(name: str, value: Any, comment: str) -> str:
-    """An entry of a mapping with a comment behind it, on a line of its own; a long name takes two lines.
+    """An entry of a mapping with a comment behind it, on a line of its own; a long name takes two
+    lines.
 
     Args:
         name: Key of the entry, any text that a file can hold.
         value: Plain data without a mapping or list in it that holds another one.
         comment: Its characters that do not print become spaces.
     """
-    flow = None if isinstance(value, dict | list) else False  # None: only what holds no mapping or list
-    text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=_NO_FOLDING)
+    flow = (
+        None if isinstance(value, dict | list) else False
+    )  # None: only what holds no mapping or list
+    text = yaml.dump(
+        {name: value},
+        Dumper=_Dumper,
+        allow_unicode=True,
+        default_flow_style=flow,
+        width=_NO_FOLDING,
+    )
     printed = "".join(char if char.isprintable() else " " for char in comment)
     return f"{text.rstrip()}  # {printed}"
 
@@ -153,7 +190,10 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
 def _require_plain(event: Any) -> None:
     """Refuse tags, and text that no file can hold."""
     if event.tag not in (None, "!", f"{_TAG}str"):
-        raise _refusal(event, f"the tag {event.tag.replace(_TAG, '!!')[:100]!r} has no meaning here; leave it out")
+        raise _refusal(
+            event,
+            f"the tag {event.tag.replace(_TAG, '!!')[:100]!r} has no meaning here; leave it out",
+        )
     if isinstance(event, yaml.ScalarEvent) and NO_TEXT.search(event.value):
         raise _refusal(event, "text must hold neither zero bytes nor halves of characters")
 
@@ -165,10 +205,20 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
         if key.tag == f"{_TAG}merge":
             continue
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
-            what = repr(loader.construct_object(key)) if isinstance(key, yaml.ScalarNode) else f"a {key.id}"
-            raise _refusal(key, f"the name of a parameter must be text, got {what}; put it in quotes if it is meant")
+            what = (
+                repr(loader.construct_object(key))
+                if isinstance(key, yaml.ScalarNode)
+                else f"a {key.id}"
+            )
+            raise _refusal(
+                key,
+                f"the name of a parameter must be text, got {what}; put it in quotes if it is"
+                " meant",
+            )
         if key.value in seen:
-            raise _refusal(key, f"the key {key.value[:100]!r} stands twice in one mapping; keep one of them")
+            raise _refusal(
+                key, f"the key {key.value[:100]!r} stands twice in one mapping; keep one of them"
+            )
         seen.add(key.value)
 
 

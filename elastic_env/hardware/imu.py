@@ -156,7 +156,9 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         AttitudeError: Nothing comes that is an attitude.
     """
 
-    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0) -> None:
+    def __init__(
+        self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0
+    ) -> None:
         self.port = port
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
@@ -166,7 +168,11 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             self._shared = self._start(port, baudrate)
             deadline = time.monotonic() + wait_s
             while self._shared.get() is None:
-                if self._process is None or self._process.poll() is not None or time.monotonic() > deadline:
+                if (
+                    self._process is None
+                    or self._process.poll() is not None
+                    or time.monotonic() > deadline
+                ):
                     raise self._silence()
                 time.sleep(0.01)
         except BaseException:

@@ -31,7 +31,9 @@ class SafetyLimits(Model):
     margin_rad: float = _within("rad", 0.05, 0, 0.5, "how far beyond that range a position may lie")
     slew_rad_s: float = _within("rad/s", 3.0, 0.01, 10, "fastest change of the goal")
     speed_rad_s: float = _within("rad/s", 4.5, 0.01, 10, "measured speed that stops the motion")
-    following_error_rad: float = _within("rad", 0.35, 1e-3, 1.5, "distance from the goal that stops it")
+    following_error_rad: float = _within(
+        "rad", 0.35, 1e-3, 1.5, "distance from the goal that stops it"
+    )
     temperature_c: float = _within("°C", 80.0, 1, 80, "temperature above which the motion stops")
     torque_nm: float = _within(
         "N·m", LARGEST_TORQUE_NM, 0.1, LARGEST_TORQUE_NM, "torque, by the current, that stops it"
@@ -58,29 +60,41 @@ class HardwareSettings(Model):
     port: str
     """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
     servo_id: int = _within("1", 1, 0, LARGEST_ID, "id of the servo")
-    baudrate: int = _within("bit/s", 3_000_000, LOWEST_RATE, HIGHEST_RATE, "rate of the servo's bus")
+    baudrate: int = _within(
+        "bit/s", 3_000_000, LOWEST_RATE, HIGHEST_RATE, "rate of the servo's bus"
+    )
     direction: Literal[1, -1] = 1
     """Sign of the joint angle against the servo's."""
-    zero_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI, description="servo angle where the pendulum hangs")
+    zero_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI)
+    """Servo angle where the pendulum hangs [rad]."""
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
-    imu_baudrate: int = _within("bit/s", 115_200, LOWEST_RATE, HIGHEST_RATE, "rate of the IMU's port")
+    imu_baudrate: int = _within(
+        "bit/s", 115_200, LOWEST_RATE, HIGHEST_RATE, "rate of the IMU's port"
+    )
     imu_oldest_s: float = _within("s", 0.05, 0.01, 1, "age at which an attitude counts as missing")
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
-    imu_offset_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI, description="what it shows where q is 0")
+    imu_offset_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI)
+    """What it shows where q is 0 [rad]."""
     largest_deflection_rad: float = _within("rad", 0.2, 1e-3, 1, "bend that stops it, by the IMU")
-    approach_rad_s: float = _within("rad/s", 0.2, 0.01, 2, "peak speed to the start and back to rest")
+    approach_rad_s: float = _within(
+        "rad/s", 0.2, 0.01, 2, "peak speed to the start and back to rest"
+    )
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()
 
     @model_validator(mode="after")
     def _ports_differ(self) -> Self:
-        if self.imu_port is not None and os.path.realpath(self.imu_port) == os.path.realpath(self.port):
-            raise ValueError(f"servo and IMU each have a port of their own, got {self.port} for both")
+        if self.imu_port is not None and os.path.realpath(self.imu_port) == os.path.realpath(
+            self.port
+        ):
+            raise ValueError(
+                f"servo and IMU each have a port of their own, got {self.port} for both"
+            )
         return self
 
     @model_validator(mode="after")

@@ -1,4 +1,5 @@
-"""The actuator of the paper, Dynamixel PRO H54-200-S500-R, as an elastic joint, with the source of every number.
+"""The actuator of the paper, Dynamixel PRO H54-200-S500-R, as an elastic joint, with the source of
+every number.
 
 | parameter | value | source |
 |---|---|---|
@@ -12,7 +13,7 @@
 | D | 10 N·m·s/rad | our assumption: not published; `docs/testbed.md` shows the sensitivity from 5 to 50 |
 | servo | 18000, 250 | position gain and upper joint damping of the DYROS-JET MuJoCo model; real scaling unpublished |
 | integrator | 0.1 s | our assumption: the real cascade has one, its time constant is not published |
-"""
+"""  # noqa: E501
 
 import math
 
@@ -24,7 +25,8 @@ BACKLASH_BOUND_RAD = 1.75e-3
 ENCODER_COUNTS_PER_TURN = 501_923
 """Counts of the motor encoder per turn of the output."""
 
-TORQUE_PER_CURRENT, LOSS_NM = 4.338, 2.694
+TORQUE_PER_CURRENT = 4.338
+LOSS_NM = 2.694
 """The measured line: slope [N·m/A], and torque that does not reach the output [N·m]."""
 
 _ROTOR_INERTIA_KG_M2 = 33.3e-7

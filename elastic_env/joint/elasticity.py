@@ -2,12 +2,12 @@ r"""The elastic joint: a rotor behind a spring, a damper and a dead band.
 
     servo → rotor (θ, B) → K, D, backlash → link (q) ← friction, gravity
 
-The deflection is δ = θ − q (Eq. 2), the joint torque τ_J what the transmission passes to the link; at rest
-τ_J equals the gravity torque τ_g up to the friction on the link. All functions work on (..., n) arrays, so that one
-joint, one robot and a batch of robots are the same formula.
+The deflection is δ = θ − q (Eq. 2), the joint torque τ_J what the transmission passes to the link;
+at rest τ_J equals the gravity torque τ_g up to the friction on the link. All functions work on
+(..., n) arrays, so that one joint, one robot and a batch of robots are the same formula.
 
-[Spong1987] M. W. Spong, "Modeling and Control of Elastic Joint Robots", J. Dyn. Sys., Meas., Control 109(4).
-Eq. n: the paper that this project reproduces (see the README).
+[Spong1987] M. W. Spong, "Modeling and Control of Elastic Joint Robots", J. Dyn. Sys., Meas.,
+Control 109(4). Eq. n: the paper that this project reproduces (see the README).
 """
 
 from typing import Self
@@ -36,20 +36,27 @@ class Servo(Model):
     .. math::
         \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \int (u - \theta) dt, \pm \tau_{max})
 
-    A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like this PID. The
-    integrator lets it hold its angle without steady-state error. Against wind-up it is clamped to what it can be
-    needed for: the torque limit on top of k_v θ̇ at the speed limit.
-    """
+    A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like
+    this PID. The integrator lets it hold its angle without steady-state error. Against wind-up it
+    is clamped to what it can be needed for: the torque limit on top of k_v θ̇ at the speed limit.
+    """  # noqa: E501
 
-    position_gain: float = quantity("N·m/rad", gt=0, description="k_p, position gain")
-    velocity_gain: float = quantity("N·m·s/rad", 0.0, ge=0, description="k_v, velocity gain")
-    integral_gain: float = quantity("N·m/(rad·s)", 0.0, ge=0, description="k_i, integral gain, 0 for none")
-    torque_limit: float = quantity("N·m", gt=0, description="largest torque of the servo at the output")
-    speed_limit: float = quantity("rad/s", gt=0, description="no-load speed of the servo at the output")
+    position_gain: float = quantity("N·m/rad", gt=0)
+    """k_p, position gain [N·m/rad]."""
+    velocity_gain: float = quantity("N·m·s/rad", 0.0, ge=0)
+    """k_v, velocity gain [N·m·s/rad]."""
+    integral_gain: float = quantity("N·m/(rad·s)", 0.0, ge=0)
+    """k_i, integral gain, 0 for none [N·m/(rad·s)]."""
+    torque_limit: float = quantity("N·m", gt=0)
+    """Largest torque of the servo at the output [N·m]."""
+    speed_limit: float = quantity("rad/s", gt=0)
+    """No-load speed of the servo at the output [rad/s]."""
 
     @property
     def integral_limit(self) -> float:
-        """Largest magnitude of the integral of the position error [rad·s]; 0 without an integrator."""
+        """Largest magnitude of the integral of the position error [rad·s]; 0 without an
+        integrator.
+        """
         if self.integral_gain == 0.0:
             return 0.0
         return (self.torque_limit + self.velocity_gain * self.speed_limit) / self.integral_gain
@@ -62,21 +69,29 @@ class ElasticJoint(Model):
     `elastic_env.joint.make_elastic.make_elastic`.
     """
 
-    stiffness: float = quantity("N·m/rad", gt=0, description="K, stiffness of the transmission")
-    damping: float = quantity("N·m·s/rad", 0.0, ge=0, description="D, damping of the transmission")
-    rotor_inertia: float = quantity("kg·m²", gt=0, description="B, rotor inertia reflected to the output")
-    backlash: float = quantity("rad", 0.0, ge=0, description="width of the dead band of the deflection")
-    coulomb_friction: float = quantity("N·m", 0.0, ge=0, description="dry friction on the link side of the spring")
-    viscous_friction: float = quantity("N·m·s/rad", 0.0, ge=0, description="viscous friction on the link side")
-    encoder_counts_per_turn: int | None = quantity(
-        "1", None, gt=0, description="motor encoder, counts per turn of the output; None for continuous"
-    )
-    servo: Servo | None = quantity("1", None, description="position servo on the rotor; None to add no actuator")
+    stiffness: float = quantity("N·m/rad", gt=0)
+    """K, stiffness of the transmission [N·m/rad]."""
+    damping: float = quantity("N·m·s/rad", 0.0, ge=0)
+    """D, damping of the transmission [N·m·s/rad]."""
+    rotor_inertia: float = quantity("kg·m²", gt=0)
+    """B, rotor inertia reflected to the output [kg·m²]."""
+    backlash: float = quantity("rad", 0.0, ge=0)
+    """Width of the dead band of the deflection [rad]."""
+    coulomb_friction: float = quantity("N·m", 0.0, ge=0)
+    """Dry friction on the link side of the spring [N·m]."""
+    viscous_friction: float = quantity("N·m·s/rad", 0.0, ge=0)
+    """Viscous friction on the link side [N·m·s/rad]."""
+    encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
+    """Motor encoder, counts per turn of the output; None for continuous [1]."""
+    servo: Servo | None = quantity("1", None)
+    """Position servo on the rotor; None to add no actuator [1]."""
 
     @model_validator(mode="after")
     def _backlash_is_small(self) -> Self:
         if self.backlash >= np.pi:
-            raise ValueError(f"backlash must be below half a turn, {np.pi:.4f} rad, got {self.backlash}")
+            raise ValueError(
+                f"backlash must be below half a turn, {np.pi:.4f} rad, got {self.backlash}"
+            )
         return self
 
 
@@ -102,12 +117,15 @@ def joint_torque(
         τ_J, (..., n) [N·m]; positive drives the link forward.
     """
     if np.any(backlash):
-        deflection = np.sign(deflection) * np.maximum(np.abs(deflection) - np.asarray(backlash) / 2.0, 0.0)
+        deflection = np.sign(deflection) * np.maximum(
+            np.abs(deflection) - np.asarray(backlash) / 2.0, 0.0
+        )
     return stiffness * deflection + damping * deflection_rate
 
 
 def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter = 0.0) -> Array:
-    r"""Deflection at rest under a joint torque, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band towards the load.
+    r"""Deflection at rest under a joint torque, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band
+    towards the load.
 
     Args:
         torque: τ_J, (..., n) [N·m]; at rest the gravity torque.
@@ -118,7 +136,11 @@ def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter =
         δ = θ − q, (..., n) [rad]; positive where the motor side leads.
     """
     wound = torque / stiffness
-    return wound if isinstance(backlash, float) and backlash == 0.0 else wound + np.sign(torque) * backlash / 2.0
+    return (
+        wound
+        if isinstance(backlash, float) and backlash == 0.0
+        else wound + np.sign(torque) * backlash / 2.0
+    )
 
 
 def static_link_angle(
@@ -130,10 +152,11 @@ def static_link_angle(
     max_iterations: int = 50,
     unique: bool = True,
 ) -> Array:
-    r"""Link angle at rest for a motor angle: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q = θ.
+    r"""Link angle at rest for a motor angle: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q =
+    θ.
 
-    Where the load bends a spring far, Newton's steps may fail or end at another equilibrium. There the load grows from
-    zero, see `follow_load`.
+    Where the load bends a spring far, Newton's steps may fail or end at another equilibrium. There
+    the load grows from zero, see `follow_load`.
 
     Args:
         theta: Motor side, (..., n) [rad].
@@ -142,15 +165,15 @@ def static_link_angle(
         torque_gradient: ∂τ_g/∂q, from (..., n) to (..., n, n) [N·m/rad].
         tolerance: Largest residual of Eq. 10 that is accepted [rad].
         max_iterations: Newton steps before the load is followed.
-        unique: Whether an equilibrium on a soft spring must be the only one. If not, the one that a growing load leads
-            to is taken.
+        unique: Whether an equilibrium on a soft spring must be the only one. If not, the one that a
+            growing load leads to is taken.
 
     Returns:
         q, (..., n) [rad].
 
     Raises:
-        ElasticError: The load overcomes a spring: there is no equilibrium that a growing load leads to, or there are
-            several.
+        ElasticError: The load overcomes a spring: there is no equilibrium that a growing load leads
+            to, or there are several.
     """
     K = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), theta.shape)
     q = np.array(theta, dtype=np.float64)
@@ -166,18 +189,22 @@ def static_link_angle(
         gradient = torque_gradient(q) / K[..., None]
         step, is_singular = _solved(gradient, residual / K)
         is_lost = is_singular | ~(np.abs(step) < _LARGEST_STEP_RAD).all(axis=-1, keepdims=True)
-        is_soft = is_soft | ((open_rows | (iteration == 0)) & _may_fold(gradient)) | (open_rows & is_lost)
+        is_soft = (
+            is_soft | ((open_rows | (iteration == 0)) & _may_fold(gradient)) | (open_rows & is_lost)
+        )
         open_rows = open_rows & ~is_lost
         q = np.where(open_rows, q - step, q)
     is_soft = is_soft | open_rows | (np.abs(q - theta).max(axis=-1, keepdims=True) > _FAR_RAD)
     if not is_soft.any():
         return q
-    found = follow_load(theta, 1.0 / K, torque, torque_gradient, tolerance=tolerance, rows=is_soft, unique=unique)
+    found = follow_load(
+        theta, 1.0 / K, torque, torque_gradient, tolerance=tolerance, rows=is_soft, unique=unique
+    )
     if (lost := found.lost).any():
         worst = float(np.abs(residual / K)[lost[..., 0]].max())
         raise ElasticError(
-            f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {worst:.3g} rad, required "
-            f"{tolerance:.3g} rad; {found.reason(1.0 / K)}"
+            f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {worst:.3g} rad,"
+            f" required {tolerance:.3g} rad; {found.reason(1.0 / K)}"
         )
     is_same = ~open_rows & (np.abs(found.q - q).max(axis=-1, keepdims=True) < _SAME_RAD)
     return np.where(is_soft & ~is_same, found.q, q)
@@ -195,14 +222,15 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
         x, (..., n) [rad].
 
     Raises:
-        ElasticError: K + ∂τ_g/∂q is singular: gravity balances the spring and no deflection is stable.
+        ElasticError: K + ∂τ_g/∂q is singular: gravity balances the spring and no deflection is
+            stable.
     """
     # every row by its own stiffness: the size of K says nothing about singularity
     solution, is_singular = _solved(torque_gradient / stiffness[..., None], torque / stiffness)
     if is_singular.any():
         raise ElasticError(
-            "K + ∂τ_g/∂q is singular: gravity cancels the stiffness "
-            f"(smallest K {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"
+            "K + ∂τ_g/∂q is singular: gravity cancels the stiffness (smallest K"
+            f" {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"
         )
     return solution
 
@@ -226,7 +254,9 @@ def _solved(relative_gradient: Array, right: Array) -> tuple[Array, BoolArray]:
         solution = np.linalg.solve(matrix, right[..., None])[..., 0]
     except np.linalg.LinAlgError:
         is_zero = np.linalg.det(matrix)[..., None] == 0.0
-        solution = np.linalg.solve(np.where(is_zero[..., None], np.eye(n), matrix), right[..., None])[..., 0]
+        solution = np.linalg.solve(
+            np.where(is_zero[..., None], np.eye(n), matrix), right[..., None]
+        )[..., 0]
         solution = np.where(is_zero, np.inf, solution)
     is_large: BoolArray = ~np.all(np.abs(solution) < np.pi, axis=-1, keepdims=True)
     if not is_large.any():

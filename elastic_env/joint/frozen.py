@@ -1,4 +1,6 @@
-"""A model of the joints that matter: all other joints are held in place, so that only named hinges move."""
+"""A model of the joints that matter: all other joints are held in place, so that only named
+hinges move.
+"""
 
 from collections.abc import Collection
 
@@ -14,10 +16,11 @@ _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
 def frozen(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
-    """A copy of a specification in which all joints but the named hinges are held where the first keyframe has them.
+    """A copy of a specification in which all joints but the named hinges are held where the first
+    keyframe has them.
 
-    Held joints are taken out and their bodies put in place. Actuators, sensors, tendons and constraints of held joints
-    go with them, and so do all keyframes and all sensors.
+    Held joints are taken out and their bodies put in place. Actuators, sensors, tendons and
+    constraints of held joints go with them, and so do all keyframes and all sensors.
 
     Args:
         spec: Any specification on a fixed base; it is not changed.
@@ -30,7 +33,10 @@ def frozen(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
     require_known_torque(model, list(joints))
     held = copy_without_keys(spec)
     of_joints = [*held.sensors, *held.equalities, *held.tendons, *held.tuples]
-    for element in [*of_joints, *(a for a in held.actuators if a.trntype not in _ON_JOINT or a.target not in joints)]:
+    for element in [
+        *of_joints,
+        *(a for a in held.actuators if a.trntype not in _ON_JOINT or a.target not in joints),
+    ]:
         held.delete(element)
     _put_bodies_in_place(held, model, joints, home_of(model))
     return held
@@ -44,7 +50,9 @@ def copy_without_keys(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     return copied
 
 
-def _put_bodies_in_place(spec: mujoco.MjSpec, model: mujoco.MjModel, joints: Collection[str], home: Array) -> None:
+def _put_bodies_in_place(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, joints: Collection[str], home: Array
+) -> None:
     """Move every body by its held joints, and take these out."""
     bodies = sorted(spec.bodies, key=lambda body: body.id)
     by_joint = {joint.id: joint for joint in spec.joints}
@@ -52,17 +60,20 @@ def _put_bodies_in_place(spec: mujoco.MjSpec, model: mujoco.MjModel, joints: Col
         own = range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])
         if all(model.joint(j).name in joints for j in own):
             continue
-        R, p = _matrix(model.body_quat[b]), model.body_pos[b].copy()
+        R = _matrix(model.body_quat[b])
+        p = model.body_pos[b].copy()
         before: list[int] = []
         for j in own:
             if model.joint(j).name in joints:
                 before.append(j)
                 continue
             R_moved, p_moved = _displacement(model, j, home)
-            R, p = R @ R_moved, p + R @ p_moved
+            p = p + R @ p_moved
+            R = R @ R_moved
             for i in before:  # they turned about axes that the held joint now moves
                 hinge = by_joint[i]
-                hinge.axis, hinge.pos = R_moved.T @ hinge.axis, R_moved.T @ (hinge.pos - p_moved)
+                hinge.axis = R_moved.T @ hinge.axis
+                hinge.pos = R_moved.T @ (hinge.pos - p_moved)
             spec.delete(by_joint[j])
         _place(bodies[b], R, p)
 
@@ -73,13 +84,16 @@ def _place(body: mujoco.MjsBody, R: Array, p: Array) -> None:
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, R.ravel())
-    body.pos, body.quat = p, quaternion
+    body.pos = p
+    body.quat = quaternion
 
 
 def _displacement(model: mujoco.MjModel, joint: int, home: Array) -> tuple[Array, Array]:
     """Rotation and translation by which a joint moves its body from where the model is drawn."""
     at = model.jnt_qposadr[joint]
-    way, axis, anchor = home[at] - model.qpos0[at], model.jnt_axis[joint], model.jnt_pos[joint]
+    way = home[at] - model.qpos0[at]
+    axis = model.jnt_axis[joint]
+    anchor = model.jnt_pos[joint]
     if model.jnt_type[joint] == _SLIDE:
         return np.eye(3), way * axis
     quaternion = np.zeros(4)

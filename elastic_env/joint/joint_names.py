@@ -1,4 +1,6 @@
-"""Names that an elastic joint gives to its parts, and where its angles stand in a compiled model."""
+"""Names that an elastic joint gives to its parts, and where its angles stand in a compiled
+model.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,7 +45,9 @@ class JointAddresses:
         """Look the joints up by name, in a model of the tendon or the rigid form."""
         link = [model.joint(name) for name in joints]
         known = {model.joint(i).name for i in range(model.njnt)}
-        motor = [model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints]
+        motor = [
+            model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints
+        ]
         return cls(
             theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
             q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),

@@ -1,7 +1,8 @@
-"""What people say of elastic joints, in a file of YAML or in a mapping: K, servo, friction, `held`, by name or pattern.
+"""What people say of elastic joints, in a file of YAML or in a mapping: K, servo, friction, `held`,
+by name or pattern.
 
-This is the only reader of such files. `elastic_env/Robot-v0` and `baselines.PositionCompensator` take what it returns,
-so that a file means the same to both.
+This is the only reader of such files. `elastic_env/Robot-v0` and `baselines.PositionCompensator`
+take what it returns, so that a file means the same to both.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -16,16 +17,21 @@ from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 
 GivenJoints = str | Path | Mapping[str, Any]
-"""A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad], "rigid" or "held"."""
+"""A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad],
+"rigid" or "held".
+"""
 HELD = "held"
 """Value of a joint that nobody commands: it stays where the model's first keyframe has it."""
 RIGID = "rigid"
 """Value of a joint without a spring; the same as an infinite stiffness."""
 SOFTEST = 1e-9
-"""Least stiffness and position gain; below it nothing is a joint, and 1/K is no number [N·m/rad]."""
+"""Least stiffness and position gain; below it nothing is a joint, and 1/K is no number
+[N·m/rad].
+"""
 CURE = (
-    "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static poses and writes a "
-    "file for `joints`; `elastic identify --robot MODEL --plan 20` proposes poses"
+    "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static"
+    " poses and writes a file for `joints`; `elastic identify --robot MODEL --plan 20` proposes"
+    " poses"
 )
 """Where a stiffness comes from, for errors."""
 
@@ -33,51 +39,53 @@ CURE = (
 class ServoSettings(Model):
     """What is known of a servo; the rest comes from the model's actuator, or from defaults.
 
-    A position gain without an integral gain is a servo that gives way under a load. A servo of which neither is said,
-    and that the model has not either, holds its angle.
+    A position gain without an integral gain is a servo that gives way under a load. A servo of
+    which neither is said, and that the model has not either, holds its angle.
     """
 
-    position_gain: float | None = quantity(
-        "N·m/rad", None, gt=0, description="k_p; default that of the model's position actuator, else 50 K"
-    )
-    velocity_gain: float | None = quantity(
-        "N·m·s/rad",
-        None,
-        ge=0,
-        description="k_v; default what damps the model's actuator, else critical damping",
-    )
-    integral_gain: float | None = quantity(
-        "N·m/(rad·s)",
-        None,
-        ge=0,
-        description="k_i; default 0 beside a position gain, else that of the model's actuator, else 5 k_p per second",
-    )
-    torque_limit: float | None = quantity(
-        "N·m",
-        None,
-        gt=0,
-        description="default the model's force range, else what holds three times the weight and gives 20 rad/s²",
-    )
-    speed_limit: float | None = quantity("rad/s", None, gt=0, description="no-load speed; default a turn a second")
+    position_gain: float | None = quantity("N·m/rad", None, gt=0)
+    """k_p; default that of the model's position actuator, else 50 K [N·m/rad]."""
+    velocity_gain: float | None = quantity("N·m·s/rad", None, ge=0)
+    """k_v; default what damps the model's actuator, else critical damping [N·m·s/rad]."""
+    integral_gain: float | None = quantity("N·m/(rad·s)", None, ge=0)
+    """k_i; default 0 beside a position gain, else that of the model's actuator, else 5 k_p per
+    second [N·m/(rad·s)].
+    """
+    torque_limit: float | None = quantity("N·m", None, gt=0)
+    """Default the model's force range, else what holds three times the weight and gives 20
+    rad/s² [N·m].
+    """
+    speed_limit: float | None = quantity("rad/s", None, gt=0)
+    """No-load speed; default a turn a second [rad/s]."""
 
     @model_validator(mode="after")
     def _pushes(self) -> Self:
         if self.position_gain is not None and self.position_gain < SOFTEST:
-            raise ValueError(f"position_gain must be at least {SOFTEST:g} [N·m/rad], got {self.position_gain:g}")
+            raise ValueError(
+                f"position_gain must be at least {SOFTEST:g} [N·m/rad], got {self.position_gain:g}"
+            )
         return self
 
     def over(self, found: "ServoSettings") -> "ServoSettings":
         """These settings where they say something, else what was found in the model.
 
-        A position gain that is given is that of another servo than the model's, of which nothing but the limit is left.
+        A position gain that is given is that of another servo than the model's, of which nothing
+        but the limit is left.
         """
         if self.position_gain is not None:
-            return self.replace(integral_gain=0.0 if self.integral_gain is None else self.integral_gain)
-        said = {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
+            return self.replace(
+                integral_gain=0.0 if self.integral_gain is None else self.integral_gain
+            )
+        said = {
+            name: value
+            for name in type(self).model_fields
+            if (value := getattr(self, name)) is not None
+        }
         return found.replace(**said)
 
     def sagging_gain(self, joint: str) -> float:
-        """k_p of a servo that gives way under a load, infinite for one that holds its angle [N·m/rad].
+        """k_p of a servo that gives way under a load, infinite for one that holds its angle
+        [N·m/rad].
 
         Args:
             joint: Whose servo it is, for the error.
@@ -91,8 +99,8 @@ class ServoSettings(Model):
             return float("inf")
         if self.position_gain is None:
             raise ConfigurationError(
-                f"the servo of joint {joint!r} gives way under a load, as its integral_gain is 0; say its "
-                "position_gain [N·m/rad] beside it"
+                f"the servo of joint {joint!r} gives way under a load, as its integral_gain is 0;"
+                " say its position_gain [N·m/rad] beside it"
             )
         return self.position_gain
 
@@ -100,37 +108,30 @@ class ServoSettings(Model):
 class JointSettings(Model):
     """What is known of a joint; all but K has a default."""
 
-    stiffness: float = quantity(
-        "N·m/rad",
-        gt=0,
-        allow_inf_nan=True,
-        description="K, stiffness of the transmission, without a default; infinite for a rigid joint",
-    )
-    damping: float | None = quantity(
-        "N·m·s/rad", None, ge=0, description="D; default a damping ratio of 0.17, or what brings the links to rest"
-    )
-    rotor_inertia: float | None = quantity(
-        "kg·m²", None, gt=0, description="B; default the model's armature, else K/(100 rad/s)² or that of the links"
-    )
-    coulomb_friction: float | None = quantity(
-        "N·m", None, ge=0, description="dry friction on the link; default the model's frictionloss"
-    )
-    viscous_friction: float | None = quantity(
-        "N·m·s/rad",
-        None,
-        ge=0,
-        description="viscous friction on the link; default the joint's damping, unless it damps the servo",
-    )
-    backlash: float = quantity("rad", 0.0, ge=0, description="dead band; default none, as the scenario has one")
-    encoder_counts_per_turn: int | None = quantity(
-        "1", None, gt=0, description="motor encoder, counts per turn of the output; default continuous"
-    )
+    stiffness: float = quantity("N·m/rad", gt=0, allow_inf_nan=True)
+    """K, stiffness of the transmission, without a default; infinite for a rigid joint [N·m/rad]."""
+    damping: float | None = quantity("N·m·s/rad", None, ge=0)
+    """D; default a damping ratio of 0.17, or what brings the links to rest [N·m·s/rad]."""
+    rotor_inertia: float | None = quantity("kg·m²", None, gt=0)
+    """B; default the model's armature, else K/(100 rad/s)² or that of the links [kg·m²]."""
+    coulomb_friction: float | None = quantity("N·m", None, ge=0)
+    """Dry friction on the link; default the model's frictionloss [N·m]."""
+    viscous_friction: float | None = quantity("N·m·s/rad", None, ge=0)
+    """Viscous friction on the link; default the joint's damping, unless it damps the servo
+    [N·m·s/rad].
+    """
+    backlash: float = quantity("rad", 0.0, ge=0)
+    """Dead band; default none, as the scenario has one [rad]."""
+    encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
+    """Motor encoder, counts per turn of the output; default continuous [1]."""
     servo: ServoSettings = ServoSettings()
 
     @model_validator(mode="after")
     def _is_stiff(self) -> Self:
         if not self.stiffness >= SOFTEST:
-            raise ValueError(f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}")
+            raise ValueError(
+                f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}"
+            )
         return self
 
     @property
@@ -144,7 +145,8 @@ def read_joints(
 ) -> dict[str, JointSettings | None]:
     """Settings of the hinges that are named, in the order of the model; None for one that is held.
 
-    A name goes before patterns, and a later pattern before an earlier one. Hinges that nothing names are left out.
+    A name goes before patterns, and a later pattern before an earlier one. Hinges that nothing
+    names are left out.
 
     Args:
         given: File or mapping.
@@ -152,7 +154,8 @@ def read_joints(
         others: Its further joints, which may be held and nothing else.
 
     Raises:
-        ConfigurationError: No file or mapping, a name or pattern of no joint, or a value that cannot be.
+        ConfigurationError: No file or mapping, a name or pattern of no joint, or a value that
+            cannot be.
     """
     mapping = _mapping(given)
     for key, value in mapping.items():
@@ -168,7 +171,9 @@ def read_joints(
 
 
 def key_of(mapping: Iterable[str], name: str) -> str | None:
-    """The key that stands for a joint: its name, else the last pattern that fits it; None where none does."""
+    """The key that stands for a joint: its name, else the last pattern that fits it; None where
+    none does.
+    """
     fitting = [key for key in mapping if isinstance(key, str) and _fits(name, key)]
     return name if name in fitting else next(reversed(fitting), None)
 
@@ -186,8 +191,8 @@ def _mapping(given: GivenJoints) -> Mapping[str, Any]:
         return given
     if not isinstance(given, str | Path):
         raise ConfigurationError(
-            f"joints must be a YAML file or a mapping such as {{'*': {{'stiffness': 1000}}}}, got {shown(given)}. "
-            f"{CURE}"
+            "joints must be a YAML file or a mapping such as {'*': {'stiffness': 1000}}, got"
+            f" {shown(given)}. {CURE}"
         )
     return read_mapping(Path(given))
 
@@ -198,12 +203,16 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return None
     if isinstance(value, JointSettings):
         return value
-    own = value if isinstance(value, Mapping) else {"stiffness": np.inf if _is(value, RIGID) else value}
+    own = (
+        value
+        if isinstance(value, Mapping)
+        else {"stiffness": np.inf if _is(value, RIGID) else value}
+    )
     if own.get("stiffness") is None:
         beside = f" beside {shown(list(own))}" if isinstance(value, Mapping) else ""
         raise ConfigurationError(
-            f"stiffness of joint {name!r} is missing{beside}; write 'stiffness: K' [N·m/rad]: joint {name!r} needs its "
-            f"stiffness K, or the value {HELD} or {RIGID}. {CURE}"
+            f"stiffness of joint {name!r} is missing{beside}; write 'stiffness: K' [N·m/rad]: joint"
+            f" {name!r} needs its stiffness K, or the value {HELD} or {RIGID}. {CURE}"
         )
     if _is(own["stiffness"], RIGID):
         own = {**own, "stiffness": np.inf}

@@ -11,7 +11,9 @@ from elastic_env.joint.joint_names import JointAddresses, link_name, servo_name
 
 @dataclass(frozen=True)
 class Keyframes:
-    """The keyframes of the rigid model, and its joints and actuators in the order of their vectors."""
+    """The keyframes of the rigid model, and its joints and actuators in the order of their
+    vectors.
+    """
 
     model: mujoco.MjModel
     joints: list[mujoco.MjsJoint]
@@ -23,7 +25,9 @@ def take_keyframes(spec: mujoco.MjSpec) -> Keyframes | None:
     if not spec.keys:
         return None
     model = spec.compile()
-    keyframes = Keyframes(model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id))
+    keyframes = Keyframes(
+        model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id)
+    )
     for key in list(spec.keys):
         spec.delete(key)
     return keyframes
@@ -33,15 +37,22 @@ def give_keyframes(spec: mujoco.MjSpec, keyframes: Keyframes | None, joints: lis
     """Add the keyframes again, with rotors at their link angles and servos holding them."""
     if keyframes is None:
         return
-    rigid, model = keyframes.model, spec.compile()
+    rigid = keyframes.model
+    model = spec.compile()
     series = [name for name in joints if any(t.name == link_name(name) for t in spec.tendons)]
     for k in range(rigid.nkey):
-        qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
+        qpos = model.qpos0.copy()
+        qvel = np.zeros(model.nv)
         for old, joint in enumerate(keyframes.joints):
             new = joint.id
-            qpos[_range(model.jnt_qposadr, new, model.nq)] = rigid.key_qpos[k, _range(rigid.jnt_qposadr, old, rigid.nq)]
-            qvel[_range(model.jnt_dofadr, new, model.nv)] = rigid.key_qvel[k, _range(rigid.jnt_dofadr, old, rigid.nv)]
-        act, ctrl = np.zeros(model.na), np.zeros(model.nu)
+            qpos[_range(model.jnt_qposadr, new, model.nq)] = rigid.key_qpos[
+                k, _range(rigid.jnt_qposadr, old, rigid.nq)
+            ]
+            qvel[_range(model.jnt_dofadr, new, model.nv)] = rigid.key_qvel[
+                k, _range(rigid.jnt_dofadr, old, rigid.nv)
+            ]
+        act = np.zeros(model.na)
+        ctrl = np.zeros(model.nu)
         for old, actuator in enumerate(keyframes.actuators):
             if actuator.id < 0 or actuator.name not in {a.name for a in spec.actuators}:
                 continue  # replaced by a servo
@@ -51,20 +62,30 @@ def give_keyframes(spec: mujoco.MjSpec, keyframes: Keyframes | None, joints: lis
         for name in joints:
             _start_undeflected(model, name, qpos, qvel, ctrl, name in series)
         spec.add_key(
-            name=rigid.key(k).name, time=rigid.key_time[k], qpos=qpos, qvel=qvel, act=act, ctrl=ctrl,
-            mpos=rigid.key_mpos[k].ravel(), mquat=rigid.key_mquat[k].ravel(),
-        )  # fmt: skip
+            name=rigid.key(k).name,
+            time=rigid.key_time[k],
+            qpos=qpos,
+            qvel=qvel,
+            act=act,
+            ctrl=ctrl,
+            mpos=rigid.key_mpos[k].ravel(),
+            mquat=rigid.key_mquat[k].ravel(),
+        )
 
 
-def _start_undeflected(model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool) -> None:
+def _start_undeflected(
+    model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool
+) -> None:
     """θ = q, θ̇ = q̇ and the servo's command at the link angle, in one keyframe's vectors."""
     at = JointAddresses.of(model, [name])
-    qpos[at.theta], qvel[at.theta_dot] = qpos[at.q], qvel[at.q_dot]
+    qpos[at.theta] = qpos[at.q]
+    qvel[at.theta_dot] = qvel[at.q_dot]
     servos = {model.actuator(i).name: i for i in range(model.nactuator)}
     if servo_name(name) in servos:
         ctrl[_ctrl_range(model, servos[servo_name(name)])] = qpos[at.theta]
     if series:
-        qpos[at.q], qvel[at.q_dot] = 0.0, 0.0
+        qpos[at.q] = 0.0
+        qvel[at.q_dot] = 0.0
 
 
 def _range(starts: IntArray, index: int, total: int) -> slice:
@@ -74,7 +95,10 @@ def _range(starts: IntArray, index: int, total: int) -> slice:
 
 
 def _ctrl_range(model: mujoco.MjModel, index: int) -> slice:
-    return slice(int(model.actuator_ctrladr[index]), int(model.actuator_ctrladr[index] + model.actuator_ctrlnum[index]))
+    return slice(
+        int(model.actuator_ctrladr[index]),
+        int(model.actuator_ctrladr[index] + model.actuator_ctrlnum[index]),
+    )
 
 
 def _act_range(model: mujoco.MjModel, index: int) -> slice:

@@ -1,4 +1,5 @@
-"""The one judgement of what a compensator can know of a model: which joints move, and what else acts on them.
+"""The one judgement of what a compensator can know of a model: which joints move, and what else
+acts on them.
 
 Everything that a model has is either part of the torque at rest, held, or refused with its name.
 """
@@ -14,13 +15,18 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import require_sound
 
 MOST_ELASTIC = 80
-"""Joints that are commanded; whether the physics follows them takes a time that grows with their cube."""
+"""Joints that are commanded; whether the physics follows them takes a time that grows with their
+cube.
+"""
 
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _WRAP_JOINT, _WRAP_SITE, _WRAP_SPHERE, _WRAP_CYLINDER = (
-    int(getattr(mujoco.mjtWrap, f"mjWRAP_{kind}")) for kind in ("JOINT", "SITE", "SPHERE", "CYLINDER")
+    int(getattr(mujoco.mjtWrap, f"mjWRAP_{kind}"))
+    for kind in ("JOINT", "SITE", "SPHERE", "CYLINDER")
 )
-_EQ_JOINT, _EQ_TENDON = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
+_EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
+_EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
 _TENDON, _SITE, _SLIDERCRANK = (
     int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("TENDON", "SITE", "SLIDERCRANK")
 )
@@ -48,8 +54,8 @@ def has_nameless_hinge(model: mujoco.MjModel) -> bool:
 def nameless_hinge() -> ConfigurationError:
     """The error for a hinge without a name that is to be elastic."""
     return ConfigurationError(
-        "a hinge of the model has no name; give each one, the stiffness is by name, or name the joints that are "
-        "elastic: the others are held"
+        "a hinge of the model has no name; give each one, the stiffness is by name, or name the"
+        " joints that are elastic: the others are held"
     )
 
 
@@ -76,22 +82,29 @@ def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list
     return without_fingers(model, names, named)
 
 
-def without_fingers(model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]) -> list[str]:
-    """The joints without the fingers that the model couples and that nobody names; arguments as `commanded_hinges`."""
+def without_fingers(
+    model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]
+) -> list[str]:
+    """The joints without the fingers that the model couples and that nobody names; arguments as
+    `commanded_hinges`.
+    """
     joints = list(joints)
     fingers = [name for name in coupled_fingers(model) if name in joints and name not in named]
     if fingers:
         warnings.warn(
-            f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints are elastic",
+            f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints"
+            " are elastic",
             stacklevel=5,
         )
     return [name for name in joints if name not in fingers]
 
 
 def coupled_fingers(model: mujoco.MjModel) -> list[str]:
-    """Hinges of grippers whose fingers follow one another: joints that equalities couple, side by side at the end.
+    """Hinges of grippers whose fingers follow one another: joints that equalities couple, side by
+    side at the end.
 
-    Two fingers are on different branches, and carry no other joint. Coupled joints within the arm are none.
+    Two fingers are on different branches, and carry no other joint. Coupled joints within the arm
+    are none.
     """
     groups: list[set[int]] = []
     for e in _active(model):
@@ -117,8 +130,8 @@ def require_fixed_base(model: mujoco.MjModel) -> None:
     for j in range(model.njnt):
         if model.jnt_type[j] not in (_HINGE, _SLIDE):
             raise ConfigurationError(
-                f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base, hinges and slides are needed: "
-                "the torque of a floating robot depends on its contacts"
+                f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base, hinges and"
+                " slides are needed: the torque of a floating robot depends on its contacts"
             )
 
 
@@ -130,7 +143,8 @@ def require_few(joints: Collection[str]) -> None:
     """
     if len(joints) > MOST_ELASTIC:
         raise ConfigurationError(
-            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that matter"
+            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that"
+            " matter"
         )
 
 
@@ -142,8 +156,9 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         joints: Hinges that are commanded; all others are held.
 
     Raises:
-        ConfigurationError: A joint does not exist, is no hinge or is named twice; the base floats; or a constraint, a
-            tendon, a drive that is not on a joint, a deformable body, a plugin, wind or a flag acts on the joints.
+        ConfigurationError: A joint does not exist, is no hinge or is named twice; the base floats;
+            or a constraint, a tendon, a drive that is not on a joint, a deformable body, a plugin,
+            wind or a flag acts on the joints.
     """
     require_sound(model, "the model")
     require_fixed_base(model)
@@ -153,27 +168,29 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         acts = _acted_on(model, e)
         if acts & ids:
             raise ConfigurationError(
-                f"the model has an equality constraint of {_ends_of(model, e)}, whose torque is not known in advance; "
-                f"take it out of the model{_or_hold(model, acts & ids, ids)}"
+                f"the model has an equality constraint of {_ends_of(model, e)}, whose torque is not"
+                f" known in advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
             )
     for t in range(model.ntendon):
         if _pulls(model, t) and (acts := _joints_of_tendon(model, t) & ids):
             raise ConfigurationError(
-                f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or inertia; the torque "
-                f"of tendons with stiffness is not compensated; take it out of the model{_or_hold(model, acts, ids)}"
+                f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or"
+                " inertia; the torque of tendons with stiffness is not compensated; take it out of"
+                f" the model{_or_hold(model, acts, ids)}"
             )
     for a in range(model.nu):
         if acts := _driven_beside_joints(model, a) & ids:
             raise ConfigurationError(
-                f"the model's actuator {model.actuator(a).name!r} drives {_names(model, acts)} by "
-                f"{_TRANSMISSIONS[int(model.actuator_trntype[a])]}, which is not compensated; drive each joint by an "
-                f"actuator of its own, or take this one out of the model{_or_hold(model, acts, ids)}"
+                f"the model's actuator {model.actuator(a).name!r} drives {_names(model, acts)} by"
+                f" {_TRANSMISSIONS[int(model.actuator_trntype[a])]}, which is not compensated;"
+                " drive each joint by an actuator of its own, or take this one out of the"
+                f" model{_or_hold(model, acts, ids)}"
             )
     for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
         if int(j) in ids:
             raise ConfigurationError(
-                f"joint {model.joint(int(j)).name!r} has a spring whose torque is not linear, which is not "
-                "compensated; give it one number"
+                f"joint {model.joint(int(j)).name!r} has a spring whose torque is not linear, which"
+                " is not compensated; give it one number"
             )
     _require_inertia(model, joints)
 
@@ -189,11 +206,15 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
     known = {name: j for j in range(model.njnt) if (name := model.joint(j).name)}
     require_known("joint", joints, known)
     if len(set(joints)) != len(joints) or not joints:
-        raise ConfigurationError(f"joints must name at least one joint, and each once, got {shown(list(joints))}")
+        raise ConfigurationError(
+            f"joints must name at least one joint, and each once, got {shown(list(joints))}"
+        )
     require_few(joints)
     for name in joints:
         if model.jnt_type[known[name]] != _HINGE:
-            raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; elastic joints are hinges")
+            raise ConfigurationError(
+                f"joint {name!r} of the rigid model is no hinge; elastic joints are hinges"
+            )
     return {known[name] for name in joints}
 
 
@@ -201,20 +222,24 @@ def _require_flags(model: mujoco.MjModel) -> None:
     for bit, flag in _FLAGS.items():
         if int(model.opt.disableflags) & bit:
             raise ConfigurationError(
-                f'the model has <flag {flag}="disable"/> in <option>, with which its joints do not bend as they do on '
-                "a robot; take the flag out" + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
+                f'the model has <flag {flag}="disable"/> in <option>, with which its joints do not'
+                " bend as they do on a robot; take the flag out"
+                + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
             )
     if model.nflex:
         raise ConfigurationError(
-            "the model has a deformable body (flex), whose forces on the links are not known in advance; take it out"
+            "the model has a deformable body (flex), whose forces on the links are not known in"
+            " advance; take it out"
         )
     if (model.body_plugin >= 0).any() or (model.actuator_plugin >= 0).any():
         raise ConfigurationError(
-            "the model has a plugin of a body or an actuator, whose forces are not known in advance; take it out"
+            "the model has a plugin of a body or an actuator, whose forces are not known in"
+            " advance; take it out"
         )
     if model.opt.wind.any() and (model.opt.density > 0.0 or model.opt.viscosity > 0.0):
         raise ConfigurationError(
-            "the model has wind, whose force on the links is not compensated; take `wind` out of <option>"
+            "the model has wind, whose force on the links is not compensated; take `wind` out of"
+            " <option>"
         )
 
 
@@ -240,7 +265,8 @@ def _acted_on(model: mujoco.MjModel, equality: int) -> set[int]:
 
 
 def _ends_of(model: mujoco.MjModel, equality: int) -> str:
-    kind, of = int(model.eq_type[equality]), model.eq_objtype[equality]
+    kind = int(model.eq_type[equality])
+    of = model.eq_objtype[equality]
     read = model.joint if kind == _EQ_JOINT else model.tendon if kind == _EQ_TENDON else model.body
     if of == mujoco.mjtObj.mjOBJ_SITE:
         read = model.site
@@ -270,9 +296,16 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     """Joints with which the length of a tendon changes."""
     joints: set[int] = set()
     bodies: list[int] = []
-    of_body = {_WRAP_SITE: model.site_bodyid, _WRAP_SPHERE: model.geom_bodyid, _WRAP_CYLINDER: model.geom_bodyid}
-    for at in range(int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon])):
-        kind, one = int(model.wrap_type[at]), int(model.wrap_objid[at])
+    of_body = {
+        _WRAP_SITE: model.site_bodyid,
+        _WRAP_SPHERE: model.geom_bodyid,
+        _WRAP_CYLINDER: model.geom_bodyid,
+    }
+    for at in range(
+        int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon])
+    ):
+        kind = int(model.wrap_type[at])
+        one = int(model.wrap_objid[at])
         if kind == _WRAP_JOINT:
             joints.add(one)
         elif kind in of_body:
@@ -282,9 +315,12 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 def _pulls(model: mujoco.MjModel, tendon: int) -> bool:
     own = (
-        model.tendon_stiffness, model.tendon_stiffnesspoly, model.tendon_damping, model.tendon_frictionloss,
+        model.tendon_stiffness,
+        model.tendon_stiffnesspoly,
+        model.tendon_damping,
+        model.tendon_frictionloss,
         model.tendon_armature,
-    )  # fmt: skip
+    )
     return any(np.any(values[tendon]) for values in own)
 
 
@@ -295,7 +331,9 @@ def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
     if kind == _TENDON:
         return _joints_of_tendon(model, first)
     if kind in (_SITE, _SLIDERCRANK):
-        return _between(model, [int(model.site_bodyid[site]) if site >= 0 else 0 for site in (first, second)])
+        return _between(
+            model, [int(model.site_bodyid[site]) if site >= 0 else 0 for site in (first, second)]
+        )
     return set()
 
 
@@ -307,8 +345,9 @@ def _or_hold(model: mujoco.MjModel, acts: set[int], moving: set[int]) -> str:
     lines = ", ".join(f"'{name}: held'" for name in names[:8])
     more = ", ..." if len(names) > 8 else ""
     return (
-        f", or hold the joints on which it acts: in the file of joints (`joints`, --stiffness joints.yaml) write "
-        f"'\"*\": K', {lines}{more}; PositionCompensator takes `joints` without them"
+        ", or hold the joints on which it acts: in the file of joints (`joints`, --stiffness"
+        f" joints.yaml) write '\"*\": K', {lines}{more}; PositionCompensator takes `joints` without"
+        " them"
     )
 
 
@@ -321,7 +360,9 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
-    """Whether coupled joints are fingers: on two branches at least, and with no other joint beyond them."""
+    """Whether coupled joints are fingers: on two branches at least, and with no other joint
+    beyond them.
+    """
     bodies = {int(model.jnt_bodyid[j]) for j in group}
     carried = {j for j in range(model.njnt) if _chain(model, int(model.jnt_bodyid[j])) & group}
     first = [body for body in bodies if not _chain(model, int(model.body_parentid[body])) & group]
@@ -347,7 +388,8 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         scaled = links / np.outer(scale, scale)
         if not np.isfinite(scaled).all():
             raise ConfigurationError(
-                "the masses and inertias of the model are too large to compute with; see their units"
+                "the masses and inertias of the model are too large to compute with; see their"
+                " units"
             )
         values, vectors = np.linalg.eigh(scaled)
         smallest.append((values[0], vectors[:, 0]))
@@ -355,6 +397,7 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     if value < _SINGULAR:
         names = " and ".join(joints[int(i)] for i in np.argsort(-np.abs(vector))[:2])
         raise ConfigurationError(
-            f"the links that {names} move have no inertia of their own, or two joints have one axis; give each link "
-            "between two joints its mass and inertia, and each joint its own axis"
+            f"the links that {names} move have no inertia of their own, or two joints have one"
+            " axis; give each link between two joints its mass and inertia, and each joint its own"
+            " axis"
         )

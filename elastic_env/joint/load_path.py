@@ -1,9 +1,10 @@
 r"""Equilibria of links on soft springs, by a load that grows from zero.
 
-The link angle q at rest solves q = θ − C τ(q) with the compliance C = K⁻¹. Where the load bends a spring far, the
-equation may have several solutions, and Newton's steps from θ may fail or end at any of them. With the share λ of the
-load from 0 to 1, the solutions of q = θ − λ C τ(q) form a path from θ. Along it 1 + λ C ∂τ/∂q has positive eigenvalues
-as long as the pose is stable. Where one of them reaches zero, the link tips over and the path ends.
+The link angle q at rest solves q = θ − C τ(q) with the compliance C = K⁻¹. Where the load bends a
+spring far, the equation may have several solutions, and Newton's steps from θ may fail or end at
+any of them. With the share λ of the load from 0 to 1, the solutions of q = θ − λ C τ(q) form a path
+from θ. Along it 1 + λ C ∂τ/∂q has positive eigenvalues as long as the pose is stable. Where one of
+them reaches zero, the link tips over and the path ends.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +37,8 @@ class LoadPath:
         load: Share of the load there, (..., 1); 1 where the path leads to an equilibrium.
         joint: Joint that gives way most easily there, (...).
         other: Another stable equilibrium of that joint, nan where none is known, (...) [rad].
-        lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others may not be complete.
+        lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others
+            may not be complete.
     """
 
     q: Array
@@ -59,12 +61,13 @@ class LoadPath:
         question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
         if self.load[row] < 1.0:
             return (
-                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q becomes singular: the "
-                "link tips over, and which pose it comes to rest in is not known"
+                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
+                " becomes singular: the link tips over, and which pose it comes to rest in is not"
+                " known"
             )
         return (
-            f"{question} The pose is bistable: the link can rest at {self.q[(*row, joint)]:.4g} rad and at "
-            f"{self.other[row]:.4g} rad"
+            f"{question} The pose is bistable: the link can rest at {self.q[(*row, joint)]:.4g} rad"
+            f" and at {self.other[row]:.4g} rad"
         )
 
 
@@ -95,7 +98,9 @@ def follow_load(
         unique: Whether to look for other equilibria.
         finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
     """
-    springs = _Springs(theta, np.broadcast_to(compliance, theta.shape), torque, torque_gradient, tolerance)
+    springs = _Springs(
+        theta, np.broadcast_to(compliance, theta.shape), torque, torque_gradient, tolerance
+    )
     is_open = np.ones((*theta.shape[:-1], 1), dtype=np.bool_) if rows is None else rows
     q = theta
     load = np.where(is_open, 0.0, 1.0)
@@ -135,7 +140,9 @@ class _Springs:
     tolerance: float
 
     def settle(self, start: Array, load: Array, rows: BoolArray) -> tuple[Array, BoolArray]:
-        """Equilibria under shares of the load by Newton's steps, and which rows have a stable one near the start."""
+        """Equilibria under shares of the load by Newton's steps, and which rows have a stable
+        one near the start.
+        """
         C = load * self.compliance
         q = start
         is_good = rows
@@ -143,7 +150,9 @@ class _Springs:
         for _ in range(_MOST_NEWTON_STEPS):
             residual = q - self.theta + C * self.torque(q)
             matrix = self._matrix(q, C, is_good)
-            is_good = is_good & (np.real(np.linalg.eigvals(matrix)).min(axis=-1, keepdims=True) > 0.0)
+            is_good = is_good & (
+                np.real(np.linalg.eigvals(matrix)).min(axis=-1, keepdims=True) > 0.0
+            )
             size = self.tolerance * (1.0 + np.abs(q).max(axis=-1, keepdims=True))
             is_done = is_done | (np.abs(residual).max(axis=-1, keepdims=True) <= size)
             moves = is_good & ~is_done
@@ -163,8 +172,12 @@ class _Springs:
         least = np.real(values).argmin(axis=-1)[..., None, None]
         return np.abs(np.take_along_axis(vectors, least, axis=-1)[..., 0]).argmax(axis=-1)
 
-    def others(self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None) -> tuple[IntArray, Array]:
-        """Joints that can rest elsewhere, and where, nan for none: found along each joint alone, then of all joints."""
+    def others(
+        self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None
+    ) -> tuple[IntArray, Array]:
+        """Joints that can rest elsewhere, and where, nan for none: found along each joint alone,
+        then of all joints.
+        """
         n = q.shape[-1]
         lowest, highest = (np.full(n, -np.inf), np.full(n, np.inf)) if within is None else within
         other = np.full(q.shape[:-1], np.nan)
@@ -178,18 +191,30 @@ class _Springs:
                 begin = q.copy()
                 begin[..., i] = np.where(is_new[..., 0], start, q[..., i])
                 found, is_stable = self.settle(begin, whole, is_new)
-                is_other = is_new & is_stable & (np.abs(found - q).max(axis=-1, keepdims=True) > _OTHER_RAD)
-                is_other = is_other & (np.abs(found - self.theta) <= _WOUND_RAD).all(axis=-1, keepdims=True)
-                is_other = is_other & ((found >= lowest) & (found <= highest)).all(axis=-1, keepdims=True)
+                is_other = (
+                    is_new
+                    & is_stable
+                    & (np.abs(found - q).max(axis=-1, keepdims=True) > _OTHER_RAD)
+                )
+                is_other = is_other & (np.abs(found - self.theta) <= _WOUND_RAD).all(
+                    axis=-1, keepdims=True
+                )
+                is_other = is_other & ((found >= lowest) & (found <= highest)).all(
+                    axis=-1, keepdims=True
+                )
                 other = np.where(is_other[..., 0], found[..., i], other)
                 joint = np.where(is_other[..., 0], i, joint)
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:
-        """Angles of joint i at which its spring and its load balance stably while the others stay, nan for none."""
+        """Angles of joint i at which its spring and its load balance stably while the others
+        stay, nan for none.
+        """
         moved = q.copy()
         values = []
-        angles = self.theta[..., i] + np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS).reshape(-1, *[1] * (q.ndim - 1))
+        angles = self.theta[..., i] + np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS).reshape(
+            -1, *[1] * (q.ndim - 1)
+        )
         for angle in angles:
             moved[..., i] = angle
             values.append((moved - self.theta + self.compliance * self.torque(moved))[..., i])
@@ -204,4 +229,8 @@ class _Springs:
     def _matrix(self, q: Array, C: Array, rows: BoolArray) -> Array:
         """1 + C ∂τ/∂q of some rows, (..., n, n), and 1 of the others."""
         own = np.eye(q.shape[-1]) + C[..., None] * self.torque_gradient(q)
-        return np.where(rows[..., None] & np.isfinite(own).all(axis=(-2, -1), keepdims=True), own, np.eye(q.shape[-1]))
+        return np.where(
+            rows[..., None] & np.isfinite(own).all(axis=(-2, -1), keepdims=True),
+            own,
+            np.eye(q.shape[-1]),
+        )

@@ -2,11 +2,12 @@
 
 Three forms of the same joint:
 
-* `tendon` (default): the rotor is a hinge `<joint>_motor` of its own with armature B, and a fixed tendon
-  `<joint>_spring` of length θ − q couples it to the link's hinge: K, D, and backlash as the spring's dead band.
-  The link's hinge keeps its name, axis, limits and everything that refers to it.
-* `series`: two collinear hinges on the link's body, θ = `<joint>_motor` and q − θ = `<joint>`; the link angle is
-  the length of the tendon `<joint>_link`. Slower; kept for checking the tendon form.
+* `tendon` (default): the rotor is a hinge `<joint>_motor` of its own with armature B, and a fixed
+  tendon `<joint>_spring` of length θ − q couples it to the link's hinge: K, D, and backlash as the
+  spring's dead band. The link's hinge keeps its name, axis, limits and everything that refers to
+  it.
+* `series`: two collinear hinges on the link's body, θ = `<joint>_motor` and q − θ = `<joint>`; the
+  link angle is the length of the tendon `<joint>_link`. Slower; kept for checking the tendon form.
 * `rigid`: no spring; the rotor's inertia is the hinge's armature.
 
 Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
@@ -35,7 +36,9 @@ ActuatorRule = Literal["keep", "replace"]
 _JOINT = mujoco.mjtTrn.mjTRN_JOINT
 _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-_ROTOR_MASS = 1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+_ROTOR_MASS = (
+    1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+)
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -49,35 +52,38 @@ def make_elastic(
 ) -> mujoco.MjSpec:
     """A copy of a specification in which the named hinges are elastic.
 
-    What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction is added to it),
-    sensors and equalities on the link angle, actuators on the rotor. Its armature, which stands for the rotor, is
-    replaced by the rotor inertia. Keyframes get the rotors at their link angles, without deflection.
+    What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction
+    is added to it), sensors and equalities on the link angle, actuators on the rotor. Its armature,
+    which stands for the rotor, is replaced by the rotor inertia. Keyframes get the rotors at their
+    link angles, without deflection.
 
-    The elastic model follows its springs at the physics step of the model. The integrator becomes `implicitfast` where
-    the model's own does not follow them. MuJoCo's automatic reset is off, so that a divergence shows as NaN in the
-    state and as a warning in `data.warning`. A model that starts anew would look as if it were well. With dampers,
-    `implicitfast` moves a joint as if rotor and link each had the inertia D times the physics step more: choose a step
-    for which that is small.
+    The elastic model follows its springs at the physics step of the model. The integrator becomes
+    `implicitfast` where the model's own does not follow them. MuJoCo's automatic reset is off, so
+    that a divergence shows as NaN in the state and as a warning in `data.warning`. A model that
+    starts anew would look as if it were well. With dampers, `implicitfast` moves a joint as if
+    rotor and link each had the inertia D times the physics step more: choose a step for which that
+    is small.
 
     Args:
-        spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see `read_model`. It is not
-            changed. Set its physics step before.
+        spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
+            `read_model`. It is not changed. Set its physics step before.
         joints: Parameters by hinge name.
         form: "tendon", "series" or "rigid", see the module.
-        actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where there is none;
-            "replace" deletes them and adds the servo.
+        actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where
+            there is none; "replace" deletes them and adds the servo.
 
     Returns:
         The elastic specification, ready to compile.
 
     Raises:
-        ConfigurationError: The model cannot be read or compiled; unknown form or hinge, a joint that is no hinge, a
-            name that is already taken, or parameters that the series form cannot represent. Or `implicitfast` does not
-            follow the joints either at the physics step of the model; the message names the largest step at which it
-            does.
+        ConfigurationError: The model cannot be read or compiled; unknown form or hinge, a joint
+            that is no hinge, a name that is already taken, or parameters that the series form
+            cannot represent. Or `implicitfast` does not follow the joints either at the physics
+            step of the model; the message names the largest step at which it does.
 
     Warns:
-        UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its actuators.
+        UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its
+            actuators.
     """
     require_few(joints)
     elastic = transformed(read_model(spec).spec, joints, form, actuators)
@@ -87,9 +93,13 @@ def make_elastic(
 
 
 def transformed(
-    spec: mujoco.MjSpec, joints: Mapping[str, ElasticJoint], form: Form = "tendon", actuators: ActuatorRule = "keep"
+    spec: mujoco.MjSpec,
+    joints: Mapping[str, ElasticJoint],
+    form: Form = "tendon",
+    actuators: ActuatorRule = "keep",
 ) -> mujoco.MjSpec:
-    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then.
+    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at
+    their stability then.
 
     The integrator and the automatic reset are those of the given specification.
     """
@@ -105,29 +115,36 @@ def transformed(
 
 
 def _choose_integrator(spec: mujoco.MjSpec) -> None:
-    """Let the integrator be `implicitfast` where the model's own does not follow the joints; refuse if neither does."""
+    """Let the integrator be `implicitfast` where the model's own does not follow the joints;
+    refuse if neither does.
+    """
     model = compiled_spec(spec, "the elastic model")
     if is_stable(model):
         return
     tried = [mujoco.mjtIntegrator(model.opt.integrator), _IMPLICITFAST]
-    names = " and ".join(dict.fromkeys(integrator.name.removeprefix("mjINT_") for integrator in tried))
+    names = " and ".join(
+        dict.fromkeys(integrator.name.removeprefix("mjINT_") for integrator in tried)
+    )
     step = f"at a physics step of {model.opt.timestep:g} s"
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
         raise ConfigurationError(
-            f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most "
-            f"{with_room(largest_stable_timestep(model)):g} s before they are made elastic, or give them more damping"
+            f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most"
+            f" {with_room(largest_stable_timestep(model)):g} s before they are made elastic, or"
+            " give them more damping"
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {tried[0].name.removeprefix('mjINT_')} {step}; the elastic model has the "
-        "integrator IMPLICITFAST, which follows them",
+        f"the elastic joints explode with {tried[0].name.removeprefix('mjINT_')} {step}; the"
+        " elastic model has the integrator IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 
 
 def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
-    """Write out springs that are given as time constants: they follow from inertias that the transform changes."""
+    """Write out springs that are given as time constants: they follow from inertias that the
+    transform changes.
+    """
     given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
     if given:
         model = compiled_spec(spec, "the specification")
@@ -141,11 +158,17 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
     hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
     require_known("hinge", [name], hinges)
-    taken = {j.name for j in spec.joints} | {t.name for t in spec.tendons} | {a.name for a in spec.actuators}
+    taken = (
+        {j.name for j in spec.joints}
+        | {t.name for t in spec.tendons}
+        | {a.name for a in spec.actuators}
+    )
     taken |= {motor_name(name)} & {b.name for b in spec.bodies}
     for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):
         if derived in taken:
-            raise ConfigurationError(f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?")
+            raise ConfigurationError(
+                f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"
+            )
     return spec.joint(name)
 
 
@@ -169,26 +192,46 @@ def _transform(
 
 
 def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
-    """A body for the rotor beside the link's. Where it is does not matter: it has no mass, only the armature."""
+    """A body for the rotor beside the link's.
+
+    Where it is does not matter: it has no mass, only the armature.
+    """
     body = hinge.parent
     parent = body.parent if isinstance(body.parent, mujoco.MjsBody) else spec.worldbody
-    # from a specification of its own, so that the model's defaults, units and bounds of mass do not apply to it
+    # from a specification of its own, so that the model's defaults, units and bounds of mass do not
+    # apply to it
     blank = mujoco.MjSpec()
     blank.compiler.degree = hinge.compiler.degree
     rotor = blank.worldbody.add_body(
-        name=motor_name(""), mass=_ROTOR_MASS, ipos=[0.0] * 3, inertia=[_ROTOR_MASS] * 3, explicitinertial=True
+        name=motor_name(""),
+        mass=_ROTOR_MASS,
+        ipos=[0.0] * 3,
+        inertia=[_ROTOR_MASS] * 3,
+        explicitinertial=True,
     )
     if spec.option.density > 0.0 or spec.option.viscosity > 0.0:
-        # without a geom, drag acts on the box of equal inertia, which for a massless rotor is as large as 2 m
+        # without a geom, drag acts on the box of equal inertia, which for a massless rotor is as
+        # large as 2 m
         rotor.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-9, 0.0, 0.0], mass=0.0, group=6, contype=0, conaffinity=0,
-            fluid_ellipsoid=1, fluid_coefs=[0.0] * 5,
-        )  # fmt: skip
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[1e-9, 0.0, 0.0],
+            mass=0.0,
+            group=6,
+            contype=0,
+            conaffinity=0,
+            fluid_ellipsoid=1,
+            fluid_coefs=[0.0] * 5,
+        )
     return parent.add_frame().attach_body(rotor, hinge.name, "")
 
 
-def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody) -> mujoco.MjsJoint:
-    """The rotor's hinge. Every attribute is set: the model's default class must not leak into the rotor."""
+def _add_rotor(
+    hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody
+) -> mujoco.MjsJoint:
+    """The rotor's hinge.
+
+    Every attribute is set: the model's default class must not leak into the rotor.
+    """
     limits = _in_radians(hinge, hinge.range)
     rotor = body.add_joint(
         name=motor_name(hinge.name),
@@ -199,15 +242,18 @@ def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody
         springref=hinge.ref,
         armature=joint.rotor_inertia,
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-        range=limits,  # not enforced, so not converted either; for actuators that inherit their range
+        range=limits,  # not enforced, so not converted; for actuators that inherit their range
         actfrclimited=hinge.actfrclimited,
         actfrcrange=hinge.actfrcrange,
         frictionloss=0.0,
         group=hinge.group,
     )
     rotor.stiffness = rotor.damping = np.zeros(3)
-    rotor.springyield, rotor.actgravcomp = 0.0, False
-    ref = float(_in_radians(hinge, hinge.ref))  # of an attached model the unit may differ from the rotor's
+    rotor.springyield = 0.0
+    rotor.actgravcomp = False
+    ref = float(
+        _in_radians(hinge, hinge.ref)
+    )  # of an attached model the unit may differ from the rotor's
     rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
     rotor.springdamper = np.zeros(2)
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -216,13 +262,17 @@ def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody
 
 
 def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
-    """An angle of the specification, which may be written in degrees, as the compiled model has it."""
+    """An angle of the specification, which may be written in degrees, as the compiled model has
+    it.
+    """
     return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
 
 
 def _blank_tendon(spec: mujoco.MjSpec, name: str) -> mujoco.MjsTendon:
     """A tendon without any spring, damper, friction or limit that a default class may hold."""
-    tendon = spec.add_tendon(name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0)
+    tendon = spec.add_tendon(
+        name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0
+    )
     tendon.stiffness = tendon.damping = np.zeros(3)
     tendon.springlength = np.zeros(2)
     tendon.springyield = 0.0
@@ -253,30 +303,38 @@ def _split_hinge(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoin
     body = hinge.parent
     if body.joints[-1].name != hinge.name:
         raise ConfigurationError(
-            f"the series form needs {hinge.name!r} to be the last joint of its body {body.name!r}, which ends with "
-            f"{body.joints[-1].name!r}; use the tendon form"
+            f"the series form needs {hinge.name!r} to be the last joint of its body {body.name!r},"
+            f" which ends with {body.joints[-1].name!r}; use the tendon form"
         )
     if joint.backlash > 0.0:
         raise ConfigurationError(
-            f"the series form has a linear spring, but backlash of {hinge.name!r} is {joint.backlash} rad; "
-            "use the tendon form"
+            f"the series form has a linear spring, but backlash of {hinge.name!r} is"
+            f" {joint.backlash} rad; use the tendon form"
         )
     _add_rotor(hinge, joint, body)
     link = _blank_tendon(spec, link_name(hinge.name))
     link.wrap_joint(motor_name(hinge.name), 1.0)
     link.wrap_joint(hinge.name, 1.0)
-    link.limited, link.range = hinge.limited, _in_radians(hinge, hinge.range)
-    link.stiffness, link.damping = np.array(hinge.stiffness), np.array(hinge.damping)
+    link.limited = hinge.limited
+    link.range = _in_radians(hinge, hinge.range)
+    link.stiffness = np.array(hinge.stiffness)
+    link.damping = np.array(hinge.damping)
     link.springlength = _in_radians(hinge, np.full(2, hinge.springref))
     link.frictionloss = hinge.frictionloss
     _add_friction(link, joint)
-    hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
-    hinge.frictionloss, hinge.armature, hinge.ref, hinge.springref = 0.0, 0.0, 0.0, 0.0
+    hinge.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    hinge.range = np.zeros(2)
+    hinge.frictionloss = 0.0
+    hinge.armature = 0.0
+    hinge.ref = 0.0
+    hinge.springref = 0.0
     hinge.stiffness = np.array([joint.stiffness, 0.0, 0.0])
     hinge.damping = np.array([joint.damping, 0.0, 0.0])
 
 
-def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule) -> None:
+def _drive(
+    spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule
+) -> None:
     """Put the hinge's actuators, or the servo, on the driven joint."""
     existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
     for actuator in existing:
@@ -290,8 +348,8 @@ def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rul
     elif servo is not None:
         kept = ", ".join(repr(actuator.name) for actuator in existing)
         warnings.warn(
-            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose actuators='replace' "
-            "for the servo in its place, or give the joint servo=None",
+            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose"
+            " actuators='replace' for the servo in its place, or give the joint servo=None",
             stacklevel=4,
         )
 
@@ -305,11 +363,15 @@ def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
 
 def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
-    sensors = [s for s in spec.sensors if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator]
+    sensors = [
+        s
+        for s in spec.sensors
+        if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator
+    ]
     if sensors and servo is None:
         raise ConfigurationError(
-            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced; give the joint "
-            f"{joint!r} a servo, or delete the sensor"
+            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"
+            f" give the joint {joint!r} a servo, or delete the sensor"
         )
     for sensor in sensors:
         sensor.objname = servo_name(joint)
@@ -317,11 +379,16 @@ def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Ser
 
 def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> None:
     actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
-    actuator.damping, actuator.armature = np.zeros(3), 0.0
-    actuator.delay, actuator.nsample = 0.0, 0
-    actuator.actlimited, actuator.actrange = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
-    actuator.actearly, actuator.inheritrange = False, 0.0
-    actuator.ctrlrange, actuator.cranklength = np.zeros(2), 0.0
+    actuator.damping = np.zeros(3)
+    actuator.armature = 0.0
+    actuator.delay = 0.0
+    actuator.nsample = 0
+    actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    actuator.actrange = np.zeros(2)
+    actuator.actearly = False
+    actuator.inheritrange = 0.0
+    actuator.ctrlrange = np.zeros(2)
+    actuator.cranklength = 0.0
     actuator.set_to_pid(
         kp=servo.position_gain,
         kv=servo.velocity_gain,

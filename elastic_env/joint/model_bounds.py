@@ -1,4 +1,6 @@
-"""Bounds of a model, counted on its XML before MuJoCo builds it: a small file must not ask for much time or memory."""
+"""Bounds of a model, counted on its XML before MuJoCo builds it: a small file must not ask for
+much time or memory.
+"""
 
 import math
 import stat
@@ -7,7 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError, shown
-from elastic_env.joint.model_text import DEEPEST, LARGEST_BYTES, ModelText, decoded, name_of, parse_xml, read_bytes
+from elastic_env.joint.model_text import (
+    DEEPEST,
+    LARGEST_BYTES,
+    ModelText,
+    decoded,
+    name_of,
+    parse_xml,
+    read_bytes,
+)
 
 MOST_JOINTS = 500
 MOST_BODIES = 2_000
@@ -43,7 +53,9 @@ _LARGEST = (
     (None, ("nsample",), 1_000),
     (None, ("actdim",), 100),
 )
-"""Tags (None for all), attributes whose numbers are multiplied, and the largest product of their magnitudes."""
+"""Tags (None for all), attributes whose numbers are multiplied, and the largest product of their
+magnitudes.
+"""
 _PREFIXES = ("nuser_", "iterations", "_iterations", "_initpoints")
 _MOST_OF_OTHERS = 10_000
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
@@ -58,7 +70,8 @@ def require_bounds(model: ModelText) -> None:
     """Refuse a model that is larger than any robot.
 
     Raises:
-        ConfigurationError: A count, a size or a file is beyond its bound, or files include one another in a circle.
+        ConfigurationError: A count, a size or a file is beyond its bound, or files include one
+            another in a circle.
     """
     counts = _Counts(model)
     if model.is_urdf:
@@ -85,7 +98,11 @@ class _Counts:
         """Count a URDF, whose links nest in MuJoCo as they are joined."""
         self._bound("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
         self._bound("bodies", len(robot.findall("link")), MOST_BODIES)
-        self._bound("joints", sum(joint.get("type") != "fixed" for joint in robot.findall("joint")), MOST_JOINTS)
+        self._bound(
+            "joints",
+            sum(joint.get("type") != "fixed" for joint in robot.findall("joint")),
+            MOST_JOINTS,
+        )
         for element in robot.iter():
             self._require_numbers(element)
         for mesh in robot.iter("mesh"):
@@ -94,17 +111,28 @@ class _Counts:
     def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
         """Count a document of MJCF; `files` are those in which it is included."""
         for compiler in root.iter("compiler"):
-            self._folders += [compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")]
+            self._folders += [
+                compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
+            ]
         self._walk(root, files, 1.0, in_world=False, depth=len(files))
 
-    def _walk(self, element: ET.Element, files: tuple[Path, ...], copies: float, in_world: bool, depth: int) -> None:
+    def _walk(
+        self,
+        element: ET.Element,
+        files: tuple[Path, ...],
+        copies: float,
+        in_world: bool,
+        depth: int,
+    ) -> None:
         tag = element.tag
         if depth > DEEPEST:
-            raise ConfigurationError(f"{self.model.name} must be nested at most {DEEPEST} elements deep, with includes")
+            raise ConfigurationError(
+                f"{self.model.name} must be nested at most {DEEPEST} elements deep, with includes"
+            )
         if tag in _SOFT:
             raise ConfigurationError(
-                f"{self.model.name} has a deformable body (<{tag}>), whose forces on the links are not known in "
-                "advance; take it out of the model"
+                f"{self.model.name} has a deformable body (<{tag}>), whose forces on the links are"
+                " not known in advance; take it out of the model"
             )
         if tag == "replicate":
             copies *= max(_number(element.get("count", "1")), 1.0)
@@ -131,11 +159,15 @@ class _Counts:
         for part in element:
             self._walk(part, files, copies, in_world, depth + 1)
 
-    def _include(self, name: str, files: tuple[Path, ...], copies: float, in_world: bool, depth: int) -> None:
+    def _include(
+        self, name: str, files: tuple[Path, ...], copies: float, in_world: bool, depth: int
+    ) -> None:
         root, path = self._document(name, files)
         if root is not None:
             for compiler in root.iter("compiler"):
-                self._folders += [compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")]
+                self._folders += [
+                    compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
+                ]
             for part in root:
                 self._walk(part, (*files, path), copies, in_world, depth + 1)
 
@@ -146,7 +178,9 @@ class _Counts:
             self._attached[element.get("name") or Path(name).stem] = root
             self._walk(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
 
-    def _attach(self, element: ET.Element, files: tuple[Path, ...], copies: float, depth: int) -> None:
+    def _attach(
+        self, element: ET.Element, files: tuple[Path, ...], copies: float, depth: int
+    ) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
             bodies = [body for body in root.iter("body") if body.get("name") == element.get("body")]
@@ -161,12 +195,16 @@ class _Counts:
             return None, self.model.folder
         path = path.resolve()
         if path in files:
-            raise ConfigurationError(f"{self.model.name} includes {name_of(path)} within itself; take the circle out")
+            raise ConfigurationError(
+                f"{self.model.name} includes {name_of(path)} within itself; take the circle out"
+            )
         text, _ = decoded(read_bytes(path, "included model"), name_of(path))
         return parse_xml(text, name_of(path)), path
 
     def _add_asset(self, name: str) -> None:
-        """A mesh or picture, which has to be a regular file of bounded size; one that is missing is judged later."""
+        """A mesh or picture, which has to be a regular file of bounded size; one that is missing
+        is judged later.
+        """
         for folder in self._folders:
             path = self.model.folder / folder / name
             if not name or path in self._assets or not _exists(path):
@@ -176,7 +214,9 @@ class _Counts:
             if stat.S_ISDIR(facts.st_mode):
                 continue
             if not stat.S_ISREG(facts.st_mode):
-                raise ConfigurationError(f"{self.model.name} names {name_of(path)}, which is no regular file")
+                raise ConfigurationError(
+                    f"{self.model.name} names {name_of(path)}, which is no regular file"
+                )
             self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
             self.asset_bytes += facts.st_size
             self._bound("bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES)
@@ -184,7 +224,8 @@ class _Counts:
             self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
 
     def _require_numbers(self, element: ET.Element) -> None:
-        tag, values = element.tag, element.attrib
+        tag = element.tag
+        values = element.attrib
         for tags, names, most in _LARGEST:
             if (tags is None or tag in tags) and any(name in values for name in names):
                 numbers = [number for name in names for number in _numbers(values.get(name, ""))]
@@ -193,27 +234,31 @@ class _Counts:
             if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
                 self._bound(f"{name} of <{tag}>", _product(_numbers(value)), _MOST_OF_OTHERS)
             if name != "name" and _has_nan(value):
-                raise ConfigurationError(f"{name} of <{tag}> in {self.model.name} must be numbers, got {shown(value)}")
+                raise ConfigurationError(
+                    f"{name} of <{tag}> in {self.model.name} must be numbers, got {shown(value)}"
+                )
         if tag == "texture" and {"width", "height"} <= set(values):
             self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
             self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
-            self._bound("as params of a mesh", max(_numbers(values["params"]), default=0.0), _FINEST)
+            self._bound(
+                "as params of a mesh", max(_numbers(values["params"]), default=0.0), _FINEST
+            )
         if tag == "size" and "memory" in values:
             self._bound("memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY)
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
                 raise ConfigurationError(
-                    f"timestep of <lengthrange> in {self.model.name} must be at least {_SHORTEST_STEP_S:g} s, "
-                    f"got {step:g}"
+                    f"timestep of <lengthrange> in {self.model.name} must be at least"
+                    f" {_SHORTEST_STEP_S:g} s, got {step:g}"
                 )
 
     def _bound(self, what: str, value: float, most: float) -> None:
         if not value <= most:
             raise ConfigurationError(
-                f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has {value:.15g} or more; "
-                "give a smaller model"
+                f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has"
+                f" {value:.15g} or more; give a smaller model"
             )
 
 

@@ -1,4 +1,5 @@
-"""The one reader of rigid models that others wrote: MJCF and URDF, files and texts, specifications, compiled models.
+"""The one reader of rigid models that others wrote: MJCF and URDF, files and texts, specifications,
+compiled models.
 
 Whoever reads a model reads it here, so that all accept and refuse the same ones, in the same words.
 """
@@ -20,24 +21,40 @@ from elastic_env.joint.model_bounds import require_bounds
 from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
 GivenModel = str | Path | mujoco.MjSpec | mujoco.MjModel
-"""A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or what MuJoCo compiled."""
+"""A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or what MuJoCo
+compiled.
+"""
 
 Result = TypeVar("Result")
 
 _SPECIFICATION = "the specification"
 _CURES = {
-    "mass and inertia of moving bodies": "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero",
-    "inertia must": "the inertia must be that of a body: positive, and no main value above the sum of the other two",
-    "inertia matrix": "the inertia must be that of a body: positive, and no main value above the sum of the other two",
-    "Error opening file": "put the mesh where the model names it, or take its shape out and give the link's inertia",
-    "no decoder found": "MuJoCo reads meshes of STL, OBJ and MSH; convert it, or take its shape out",
+    "mass and inertia of moving bodies": (
+        "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero"
+    ),
+    "inertia must": (
+        "the inertia must be that of a body: positive, and no main value above the sum of the"
+        " other two"
+    ),
+    "inertia matrix": (
+        "the inertia must be that of a body: positive, and no main value above the sum of the"
+        " other two"
+    ),
+    "Error opening file": (
+        "put the mesh where the model names it, or take its shape out and give the link's inertia"
+    ),
+    "no decoder found": (
+        "MuJoCo reads meshes of STL, OBJ and MSH; convert it, or take its shape out"
+    ),
     "bad format in attribute": "it must be a number",
     "range[0] should be smaller": "the lower limit must be below the upper one",
     "Could not allocate memory": "make the sizes in <size> smaller",
 }
 """What to do about errors of MuJoCo, by a part of their text."""
 _LONGEST_ERROR = 400
-_SHAPES, _READABLE, _PACKAGE = ("visual", "collision"), (".stl", ".obj"), "package://"
+_SHAPES = ("visual", "collision")
+_READABLE = (".stl", ".obj")
+_PACKAGE = "package://"
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
 _OF_FILES = ("meshdir", "texturedir", "assetdir")
@@ -63,7 +80,8 @@ class ReadModel:
 def compiled_model(model: GivenModel) -> mujoco.MjModel:
     """A compiled rigid model.
 
-    Shapes of a URDF are left out, so that no mesh has to be there; links that are fixed to others keep their names.
+    Shapes of a URDF are left out, so that no mesh has to be there; links that are fixed to others
+    keep their names.
 
     Args:
         model: See `GivenModel`.
@@ -80,31 +98,39 @@ def compiled_model(model: GivenModel) -> mujoco.MjModel:
 def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     """The specification of a rigid model, which compiles.
 
-    Shapes of a URDF weigh and touch nothing. A mesh that is missing is left out where no mass comes from it.
+    Shapes of a URDF weigh and touch nothing. A mesh that is missing is left out where no mass comes
+    from it.
 
     Args:
         model: See `GivenModel`; a compiled model has no specification. It is not changed.
         shapes: Whether the shapes of a URDF are wanted, for pictures.
 
     Raises:
-        ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes from a lost mesh.
+        ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes
+            from a lost mesh.
     """
     if isinstance(model, mujoco.MjSpec):
         given: Any = model
-        return _without_lost_meshes(lambda: from_mujoco(given.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
+        return _without_lost_meshes(
+            lambda: from_mujoco(given.copy, _SPECIFICATION, "copy"), _SPECIFICATION
+        )
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
-            "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf), or its "
-            "mujoco.MjSpec"
+            "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf),"
+            " or its mujoco.MjSpec"
         )
     if not isinstance(model, str | Path):
         raise ConfigurationError(
-            "a model must be a file of MJCF (.xml) or URDF (.urdf), the text of one, a mujoco.MjSpec or a "
-            f"mujoco.MjModel, got {shown(model)}"
+            "a model must be a file of MJCF (.xml) or URDF (.urdf), the text of one, a"
+            f" mujoco.MjSpec or a mujoco.MjModel, got {shown(model)}"
         )
     text = read_model_text(model)
     require_bounds(text)
-    return _of_urdf(text, shapes) if text.is_urdf else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
+    return (
+        _of_urdf(text, shapes)
+        if text.is_urdf
+        else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
+    )
 
 
 def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
@@ -122,32 +148,35 @@ def require_sound(model: mujoco.MjModel, name: str) -> None:
     """Refuse numbers that MuJoCo takes and that no robot has.
 
     Raises:
-        ConfigurationError: A mass, an inertia or a property of a joint is not finite or negative, or a joint's lower
-            limit is above its upper one.
+        ConfigurationError: A mass, an inertia or a property of a joint is not finite or negative,
+            or a joint's lower limit is above its upper one.
     """
     for what, values, element in (
-        ("mass", model.body_mass, model.body), ("inertia", model.body_inertia, model.body),
+        ("mass", model.body_mass, model.body),
+        ("inertia", model.body_inertia, model.body),
         ("armature", model.dof_armature[model.jnt_dofadr], model.joint),
         ("damping", model.dof_damping[model.jnt_dofadr], model.joint),
         ("frictionloss", model.dof_frictionloss[model.jnt_dofadr], model.joint),
         ("stiffness", model.jnt_stiffness, model.joint),
-    ):  # fmt: skip
+    ):
         sound = np.isfinite(values) & (np.asarray(values) >= 0.0)
         wrong = np.flatnonzero(~(sound.all(axis=1) if sound.ndim > 1 else sound))
         if wrong.size:
             kind = "body" if element == model.body else "joint"
             raise ConfigurationError(
-                f"{what} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite and >= 0, "
-                f"got {shown(np.ravel(values[wrong[0]]).tolist())}"
+                f"{what} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite and >="
+                f" 0, got {shown(np.ravel(values[wrong[0]]).tolist())}"
             )
     if not np.isfinite(model.opt.gravity).all():
-        raise ConfigurationError(f"gravity of {name} must be finite [m/s²], got {shown(model.opt.gravity.tolist())}")
+        raise ConfigurationError(
+            f"gravity of {name} must be finite [m/s²], got {shown(model.opt.gravity.tolist())}"
+        )
     for j in range(model.njnt):
         low, high = map(float, model.jnt_range[j])
         if low > high or np.isnan(low + high):
             raise ConfigurationError(
-                f"the limits of joint {model.joint(j).name!r} of {name} contradict themselves: {low:g} to {high:g}; "
-                "the lower limit must be below the upper one"
+                f"the limits of joint {model.joint(j).name!r} of {name} contradict themselves:"
+                f" {low:g} to {high:g}; the lower limit must be below the upper one"
             )
 
 
@@ -158,7 +187,8 @@ def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
 
     Args:
         robot: Root of the URDF; it is changed.
-        folder: Folder of the URDF, in and above which packages of meshes are looked for; None for no shapes.
+        folder: Folder of the URDF, in and above which packages of meshes are looked for; None for
+            no shapes.
 
     Returns:
         Meshes of links that are not drawn.
@@ -176,7 +206,9 @@ def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
 
 
 def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
-    """The specification of a URDF. Links that are fixed to others keep their names; shapes weigh and touch nothing.
+    """The specification of a URDF.
+
+    Links that are fixed to others keep their names; shapes weigh and touch nothing.
 
     Args:
         robot: Root of the URDF with shapes that MuJoCo reads, see `keep_shapes`; it is changed.
@@ -195,7 +227,9 @@ def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
     text = ET.tostring(robot, encoding="unicode")
     spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text), name, "read")
     for mesh in spec.meshes:
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a mesh that is not closed has no volume
+        mesh.inertia = (
+            mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        )  # a mesh that is not closed has no volume
     for geom in spec.geoms:
         geom.mass = geom.contype = geom.conaffinity = 0
     return spec
@@ -227,7 +261,8 @@ def _require_unique_names(text: ModelText) -> None:
         twice = [name for name, count in names.items() if count > 1 and name]
         if twice:
             raise ConfigurationError(
-                f"{text.name} has the {kind} {shown(twice[0])} {names[twice[0]]} times; give each {kind} its own name"
+                f"{text.name} has the {kind} {shown(twice[0])} {names[twice[0]]} times; give each"
+                f" {kind} its own name"
             )
 
 
@@ -237,15 +272,20 @@ def _require_tree(text: ModelText) -> None:
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):
         name = shown(joint.get("name", ""))
-        ends = [element.get("link", "") if (element := joint.find(end)) is not None else "" for end in _ENDS]
+        ends = [
+            element.get("link", "") if (element := joint.find(end)) is not None else ""
+            for end in _ENDS
+        ]
         for end, link in zip(_ENDS, ends, strict=True):
             if link not in links:
                 raise ConfigurationError(
-                    f"joint {name} of {text.name} needs a {end} that is a link of it, got {shown(link)}"
+                    f"joint {name} of {text.name} needs a {end} that is a link of it, got"
+                    f" {shown(link)}"
                 )
         if ends[1] in parents:
             raise ConfigurationError(
-                f"link {shown(ends[1])} of {text.name} is the child of two joints; a URDF is a tree, cut the loop"
+                f"link {shown(ends[1])} of {text.name} is the child of two joints; a URDF is a"
+                " tree, cut the loop"
             )
         parents[ends[1]] = ends[0]
     for link in parents:
@@ -254,7 +294,9 @@ def _require_tree(text: ModelText) -> None:
             seen.add(link)
             link = parents[link]
         if link in seen:
-            raise ConfigurationError(f"the links of {text.name} are joined in a circle at {shown(link)}; cut the loop")
+            raise ConfigurationError(
+                f"the links of {text.name} are joined in a circle at {shown(link)}; cut the loop"
+            )
 
 
 _ENDS = ("parent", "child")
@@ -272,9 +314,11 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
 
 
 def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
-    """A specification that compiles: without its meshes and pictures, where these are why it does not.
+    """A specification that compiles: without its meshes and pictures, where these are why it does
+    not.
 
-    What is compiled is read for that alone: a copy of a specification hides elements whose references are wrong.
+    What is compiled is read for that alone: a copy of a specification hides elements whose
+    references are wrong.
     """
     try:
         model = compiled_spec(read(), name)
@@ -290,12 +334,14 @@ def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadMo
     if heavy:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
         for body in heavy:  # of any mass: would it compile if the meshes were there?
-            body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
+            body.mass = 1.0
+            body.inertia = np.ones(3)
+            body.explicitinertial = True
     model = compiled_spec(spec.copy(), name)
     if heavy:
         raise ConfigurationError(
-            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give the body an "
-            f"<inertial>, or bring the mesh. {problem}"
+            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give"
+            f" the body an <inertial>, or bring the mesh. {problem}"
         )
     return ReadModel(spec, model, name, lost)
 
@@ -306,7 +352,8 @@ def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     return [
         body
         for body in spec.bodies[1:]
-        if any(_is_of_mesh(geom) for geom in body.geoms) and (from_geoms or not body.explicitinertial)
+        if any(_is_of_mesh(geom) for geom in body.geoms)
+        and (from_geoms or not body.explicitinertial)
     ]
 
 
@@ -325,7 +372,9 @@ def _take_meshes(spec: mujoco.MjSpec) -> None:
 
 
 def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
-    """What MuJoCo makes, in a thread of its own so that Ctrl-C reaches this one; its errors in words that teach."""
+    """What MuJoCo makes, in a thread of its own so that Ctrl-C reaches this one; its errors in
+    words that teach.
+    """
     results: list[Result] = []
     errors: list[Exception] = []
 
@@ -336,7 +385,8 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
             errors.append(error)
 
     thread = threading.Thread(target=work, daemon=True)
-    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    before = mujoco.MjLogConfig.get()
+    silent = mujoco.MjLogConfig.get()
     silent.logto_file = False  # no MUJOCO_LOG.TXT in the folder of a user
     silent.set()
     try:
@@ -350,22 +400,30 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
 
 
 def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
-    """Visual or collision shapes of a link, whichever MuJoCo reads all of; else the meshes that it does not read."""
+    """Visual or collision shapes of a link, whichever MuJoCo reads all of; else the meshes that
+    it does not read.
+    """
     missing: list[str] = []
     for tag in _SHAPES:
         shapes = link.findall(tag)
-        named = [(mesh, mesh.get("filename", "")) for shape in shapes for mesh in shape.iter("mesh")]
+        named = [
+            (mesh, mesh.get("filename", "")) for shape in shapes for mesh in shape.iter("mesh")
+        ]
         found = [(mesh, _mesh_file(name, folder)) for mesh, name in named]
         if shapes and all(path is not None for _, path in found):
             for mesh, path in found:
                 mesh.set("filename", str(path))
             return shapes, []
-        missing = missing or [name for (_, name), (_, path) in zip(named, found, strict=True) if path is None]
+        missing = missing or [
+            name for (_, name), (_, path) in zip(named, found, strict=True) if path is None
+        ]
     return [], missing
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that MuJoCo reads, in the folder of the URDF, or of a package in a folder above; None without one."""
+    """A mesh that MuJoCo reads, in the folder of the URDF, or of a package in a folder above;
+    None without one.
+    """
     if Path(name).suffix.lower() not in _READABLE:
         return None
     relative = name.removeprefix(_PACKAGE).removeprefix("file://")
@@ -382,7 +440,10 @@ def _is_mesh(path: Path) -> bool:
 
 def _with_cure(error: Exception) -> str:
     """MuJoCo's error in one line, and what to do about it where that is known."""
-    text = ", ".join(line.strip() for line in str(error).splitlines() if line.strip()) or type(error).__name__
+    text = (
+        ", ".join(line.strip() for line in str(error).splitlines() if line.strip())
+        or type(error).__name__
+    )
     cures = [cure for part, cure in _CURES.items() if part in text]
     if len(text) > _LONGEST_ERROR:
         text = f"{text[:_LONGEST_ERROR]}..."

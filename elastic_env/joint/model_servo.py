@@ -28,8 +28,9 @@ class ModelServo:
 def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
     """The model's position actuator of a joint, by its gear on the joint; None where there is none.
 
-    A damper or a velocity actuator beside it, whose command is zero, is part of the velocity gain. So is the `damping`
-    of the joint, if it is more than these: it is what damps the servo in models without a `kv`, and no friction.
+    A damper or a velocity actuator beside it, whose command is zero, is part of the velocity gain.
+    So is the `damping` of the joint, if it is more than these: it is what damps the servo in models
+    without a `kv`, and no friction.
 
     Raises:
         ConfigurationError: There are several, or it has a law that a `Servo` has not.
@@ -37,16 +38,31 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
     position = [i for i in _actuators(model, joint) if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
         return None  # a motor or a velocity servo: a position servo takes its place
-    i, gear = position[0], float(model.actuator_gear[position[0], 0])
-    gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
+    i = position[0]
+    gear = float(model.actuator_gear[position[0], 0])
+    gain = model.actuator_gainprm[i]
+    bias = model.actuator_biasprm[i]
     is_pid = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID
-    kp, kv, ki = -float(bias[1]), -float(bias[2]), float(gain[0]) if is_pid else 0.0
+    kp = -float(bias[1])
+    kv = -float(bias[2])
+    ki = float(gain[0]) if is_pid else 0.0
     is_filtered = not is_pid and model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
-    is_plain = is_pid or (model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and np.isclose(gain[0], kp))
-    if len(position) > 1 or is_filtered or not is_plain or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
+    is_plain = is_pid or (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and np.isclose(gain[0], kp)
+    )
+    if (
+        len(position) > 1
+        or is_filtered
+        or not is_plain
+        or bias[0] != 0.0
+        or kp <= 0.0
+        or kv < 0.0
+        or gear == 0.0
+    ):
         raise ConfigurationError(
-            f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q) - kv q_dot; say its "
-            "position_gain, velocity_gain and integral_gain under `servo` of this joint in `joints`"
+            f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q)"
+            " - kv q_dot; say its position_gain, velocity_gain and integral_gain under `servo` of"
+            " this joint in `joints`"
         )
     braking = gear**2 * kv + _braking(model, joint)
     damping = float(model.dof_damping[model.joint(joint).dofadr[0]])
@@ -61,7 +77,10 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
 
 def rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
     """Armature of a joint and of the actuators on it, 0 where there is none [kg·m²]."""
-    of_actuators = [model.actuator_gear[i, 0] ** 2 * model.actuator_armature[i] for i in _actuators(model, joint)]
+    of_actuators = [
+        model.actuator_gear[i, 0] ** 2 * model.actuator_armature[i]
+        for i in _actuators(model, joint)
+    ]
     return float(model.dof_armature[model.joint(joint).dofadr[0]] + sum(of_actuators))
 
 
@@ -75,10 +94,19 @@ def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
     found = [_bound(joint, 1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
     for i in _actuators(model, joint):
         gear = abs(float(model.actuator_gear[i, 0]))
-        found.append(_bound(joint, gear, model.actuator_forcelimited[i], model.actuator_forcerange[i]))
-        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE and model.actuator_dyntype[i] == 0:
+        found.append(
+            _bound(joint, gear, model.actuator_forcelimited[i], model.actuator_forcerange[i])
+        )
+        if (
+            model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+            and model.actuator_dyntype[i] == 0
+        ):
             gain = abs(float(model.actuator_gainprm[i, 0]))
-            found.append(_bound(joint, gear * gain, model.actuator_ctrllimited[i], model.actuator_ctrlrange[i]))
+            found.append(
+                _bound(
+                    joint, gear * gain, model.actuator_ctrllimited[i], model.actuator_ctrlrange[i]
+                )
+            )
     return min((value for value in found if value is not None), default=None)
 
 
@@ -86,16 +114,23 @@ def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
     """Actuators that act on a joint."""
     number = model.joint(joint).id
     return [
-        i for i in range(model.nu) if model.actuator_trntype[i] in _ON_JOINT and model.actuator_trnid[i, 0] == number
+        i
+        for i in range(model.nu)
+        if model.actuator_trntype[i] in _ON_JOINT and model.actuator_trnid[i, 0] == number
     ]
 
 
 def _braking(model: mujoco.MjModel, joint: str) -> float:
-    """Damping by the actuators of a joint but the gain of its position servo, at zero command [N·m·s/rad]."""
+    """Damping by the actuators of a joint but the gain of its position servo, at zero command
+    [N·m·s/rad].
+    """
     braking = 0.0
     for i in _actuators(model, joint):
         own = float(model.actuator_damping[i])
-        if model.actuator_biasprm[i, 1] == 0.0 and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE:
+        if (
+            model.actuator_biasprm[i, 1] == 0.0
+            and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+        ):
             own += max(-float(model.actuator_biasprm[i, 2]), 0.0)
         braking += float(model.actuator_gear[i, 0]) ** 2 * own
     return braking
@@ -112,7 +147,8 @@ def _bound(joint: str, scale: float, is_limited: bool, interval: Array) -> float
     lowest, highest = map(float, interval)
     if not lowest < 0.0 < highest:
         raise ConfigurationError(
-            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a servo has to push both ways; say "
-            "its torque_limit [N·m] under `servo` of this joint in `joints`, or mend the range"
+            f"a force range of joint {joint!r} is {lowest:g} to {highest:g}, and a servo has to"
+            " push both ways; say its torque_limit [N·m] under `servo` of this joint in `joints`,"
+            " or mend the range"
         )
     return scale * min(-lowest, highest)

@@ -1,7 +1,8 @@
-"""The XML of a model, read within bounds before MuJoCo sees it: a file of MJCF or URDF, or the text of one.
+"""The XML of a model, read within bounds before MuJoCo sees it: a file of MJCF or URDF, or the text
+of one.
 
-Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded first (xacro,
-entities) is refused.
+Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded
+first (xacro, entities) is refused.
 """
 
 import codecs
@@ -35,15 +36,37 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_NOT_OF_FILES = {"idna", "punycode", "unicode_escape", "raw_unicode_escape", "undefined", "mbcs", "oem"}
+_NOT_OF_FILES = {
+    "idna",
+    "punycode",
+    "unicode_escape",
+    "raw_unicode_escape",
+    "undefined",
+    "mbcs",
+    "oem",
+}
 _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
 """Children of a robot that old files of xacro have without prefix."""
 _URDF_PARTS = {
-    "robot", "link", "joint", "origin", "mass", "inertia", "axis", "limit", "dynamics", "parent", "child", "mimic",
-    "box", "cylinder", "sphere", "mesh",
-}  # fmt: skip
+    "robot",
+    "link",
+    "joint",
+    "origin",
+    "mass",
+    "inertia",
+    "axis",
+    "limit",
+    "dynamics",
+    "parent",
+    "child",
+    "mimic",
+    "box",
+    "cylinder",
+    "sphere",
+    "mesh",
+}
 _PLACEHOLDER = re.compile(r"\$[{(]")
 
 
@@ -77,12 +100,16 @@ def read_model_text(model: str | Path) -> ModelText:
     """A file of MJCF or URDF, or the text of one.
 
     Raises:
-        ConfigurationError: There is no such file, it is too large, no XML or no model, or it has to be expanded first.
+        ConfigurationError: There is no such file, it is too large, no XML or no model, or it has to
+            be expanded first.
     """
     if is_text(model):
-        name, text = "the text of the model", str(model).lstrip(_BLANK)
+        name = "the text of the model"
+        text = str(model).lstrip(_BLANK)
         if len(text) > LARGEST_BYTES:
-            raise ConfigurationError(f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}")
+            raise ConfigurationError(
+                f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}"
+            )
         found = ModelText(parse_xml(text, name), name, Path.cwd(), None, text, is_utf8=True)
     else:
         found = _of_file(Path(model))
@@ -96,7 +123,9 @@ def is_text(model: object) -> bool:
 
 
 def without_declaration(text: str) -> str:
-    """The text of a model for a file in UTF-8: without mark, and without the encoding that it had once."""
+    """The text of a model for a file in UTF-8: without mark, and without the encoding that it
+    had once.
+    """
     return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
 
 
@@ -127,11 +156,15 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
     if not stat.S_ISREG(facts.st_mode):
         raise ConfigurationError(f"no {what} at {name_of(path)}: it is no regular file; {_FILE}")
     if facts.st_size > LARGEST_BYTES:
-        raise ConfigurationError(f"{name_of(path)} must have at most {LARGEST_BYTES} bytes, it has {facts.st_size}")
+        raise ConfigurationError(
+            f"{name_of(path)} must have at most {LARGEST_BYTES} bytes, it has {facts.st_size}"
+        )
     try:
         return path.read_bytes()
     except OSError as error:
-        raise ConfigurationError(f"{name_of(path)} cannot be read: {error.strerror}; {_FILE}") from None
+        raise ConfigurationError(
+            f"{name_of(path)} cannot be read: {error.strerror}; {_FILE}"
+        ) from None
 
 
 def parse_xml(text: str, name: str) -> ET.Element:
@@ -140,14 +173,16 @@ def parse_xml(text: str, name: str) -> ET.Element:
     Raises:
         ConfigurationError: It is no XML, is nested too deeply, or declares entities.
     """
-    tree, depth = ET.TreeBuilder(), 0
+    tree = ET.TreeBuilder()
+    depth = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
             raise ConfigurationError(
-                f"{name} must be nested at most {DEEPEST} elements deep; line {parser.CurrentLineNumber} is deeper"
+                f"{name} must be nested at most {DEEPEST} elements deep; line"
+                f" {parser.CurrentLineNumber} is deeper"
             )
         tree.start(tag, attributes)
 
@@ -158,11 +193,13 @@ def parse_xml(text: str, name: str) -> ET.Element:
 
     def refuse_entity(entity: str, *_: Any) -> None:
         raise ConfigurationError(
-            f"{name} declares the entity {shown(entity)}, which is not read; write its text out where it is used"
+            f"{name} declares the entity {shown(entity)}, which is not read; write its text out"
+            " where it is used"
         )
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
     parser.EntityDeclHandler = refuse_entity
     try:
         parser.Parse(text, True)
@@ -181,7 +218,9 @@ def _of_file(path: Path) -> ModelText:
 
 
 def decoded(content: bytes, name: str) -> tuple[str, bool]:
-    """The text of a file by its mark, or by the encoding that it declares; and whether that is UTF-8."""
+    """The text of a file by its mark, or by the encoding that it declares; and whether that is
+    UTF-8.
+    """
     encoding = next((own for mark, own in _MARKS if content.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(content)
@@ -206,23 +245,36 @@ def decoded(content: bytes, name: str) -> tuple[str, bool]:
 
 def _require_model(found: ModelText) -> None:
     """Refuse what is neither MJCF nor URDF, and what xacro would expand."""
-    root, name = found.root, found.name
+    root = found.root
+    name = found.name
     aliases = {_XACRO} | {
-        key.removeprefix("xmlns:") for key, value in root.attrib.items() if key.startswith("xmlns:") and _XACRO in value
+        key.removeprefix("xmlns:")
+        for key, value in root.attrib.items()
+        if key.startswith("xmlns:") and _XACRO in value
     }
     for element in root.iter():
         prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
-        of_xacro = next((key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None)
+        of_xacro = next(
+            (key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None
+        )
         if prefix in aliases or of_xacro is not None:
             what = f"<{element.tag}>" if prefix in aliases else f"the attribute {of_xacro}"
-            raise ConfigurationError(f"{name} is a file of xacro, it has {shown(what)[1:-1]}; {_EXPAND}")
+            raise ConfigurationError(
+                f"{name} is a file of xacro, it has {shown(what)[1:-1]}; {_EXPAND}"
+            )
     if root.tag not in _KINDS:
-        raise ConfigurationError(f"the root of {name} must be <mujoco> or <robot>, got {shown(root.tag)}; {_FILE}")
+        raise ConfigurationError(
+            f"the root of {name} must be <mujoco> or <robot>, got {shown(root.tag)}; {_FILE}"
+        )
     if found.is_urdf:
         for element in _parts(root):
-            unread = next((value for value in element.attrib.values() if _PLACEHOLDER.search(value)), None)
+            unread = next(
+                (value for value in element.attrib.values() if _PLACEHOLDER.search(value)), None
+            )
             if unread is not None:
-                raise ConfigurationError(f"{name} has {shown(unread)} in <{element.tag}>, of xacro; {_EXPAND}")
+                raise ConfigurationError(
+                    f"{name} has {shown(unread)} in <{element.tag}>, of xacro; {_EXPAND}"
+                )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:
             raise ConfigurationError(f"{name} is a file of xacro, it has <{old}>; {_EXPAND}")

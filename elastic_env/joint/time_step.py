@@ -1,10 +1,11 @@
-r"""Whether MuJoCo's integrator follows the springs, dampers and servos of a model, or lets them explode.
+r"""Whether MuJoCo's integrator follows the springs, dampers and servos of a model, or lets them
+explode.
 
-Near rest a step of the physics is linear, :math:`x_{k+1} = A x_k`, and stable if no eigenvalue of A lies outside the
-unit circle. Of a semi-implicit step (Euler, implicitfast) that means ωh < 2 for a spring without damper whose
-frequency is ω, of RK4 ωh < 2.83. A comes from differences of MuJoCo's own step, so that every integrator, every
-inertia and every servo is seen as it is. Left out are contacts, limits, dry friction and dead bands, which only hold
-a joint back.
+Near rest a step of the physics is linear, :math:`x_{k+1} = A x_k`, and stable if no eigenvalue of A
+lies outside the unit circle. Of a semi-implicit step (Euler, implicitfast) that means ωh < 2 for a
+spring without damper whose frequency is ω, of RK4 ωh < 2.83. A comes from differences of MuJoCo's
+own step, so that every integrator, every inertia and every servo is seen as it is. Left out are
+contacts, limits, dry friction and dead bands, which only hold a joint back.
 """
 
 import copy
@@ -18,19 +19,27 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
 _ROOM = 1.1
-"""By how much a physics step must be below the limit in the reference posture: inertias change with the posture."""
+"""By how much a physics step must be below the limit in the reference posture: inertias change
+with the posture.
+"""
 _LARGEST_RADIUS = 1.0 + 1e-3
-"""Largest eigenvalue that counts as stable; those of a free body are 1, up to the error of the differences."""
+"""Largest eigenvalue that counts as stable; those of a free body are 1, up to the error of the
+differences.
+"""
 _DIFFERENCE = 1e-6
 _HALVINGS = 24
 _LEFT_OUT = [
-    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}")) for what in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}"))
+    for what in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
 ]
-"""What holds a joint back, and the reset that would put numbers in the place of a step that gives none."""
+"""What holds a joint back, and the reset that would put numbers in the place of a step that
+gives none.
+"""
 
 
 def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> float:
-    """Largest magnitude of the eigenvalues of a physics step about the model's reference posture [1].
+    """Largest magnitude of the eigenvalues of a physics step about the model's reference posture
+    [1].
 
     Args:
         model: It is not changed.
@@ -44,16 +53,22 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> f
         linear.opt.timestep = timestep_s
     with _without_messages():
         A = _transition(linear)
-    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0)) if np.isfinite(A).all() else float("inf")
+    return (
+        float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+        if np.isfinite(A).all()
+        else float("inf")
+    )
 
 
 def largest_stable_timestep(model: mujoco.MjModel) -> float:
-    """The largest physics step, from a little above the model's own downwards, that is stable, to a thousandth [s].
+    """The largest physics step, from a little above the model's own downwards, that is stable, to a
+    thousandth [s].
 
     Raises:
         ConfigurationError: None is, down to a millionth of it.
     """
-    high, low = _ROOM * model.opt.timestep, 0.0
+    high = _ROOM * model.opt.timestep
+    low = 0.0
     if spectral_radius(model, high) <= _LARGEST_RADIUS:
         return high
     for _ in range(_HALVINGS):
@@ -65,8 +80,8 @@ def largest_stable_timestep(model: mujoco.MjModel) -> float:
         if low > 0.0 and high - low < 1e-3 * low:
             return low
     raise ConfigurationError(
-        f"no physics step from {model.opt.timestep:g} s down to {high:g} s follows the joints of this model: give them "
-        "more rotor inertia, their links more inertia, or less stiffness"
+        f"no physics step from {model.opt.timestep:g} s down to {high:g} s follows the joints of"
+        " this model: give them more rotor inertia, their links more inertia, or less stiffness"
     )
 
 
@@ -94,26 +109,33 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     stable = stable_timestep(model, control_period_s)
     if stable < model.opt.timestep:
         raise ConfigurationError(
-            f"the joints are too stiff, or their links or rotors too light, for timestep_s = {model.opt.timestep:g} s: "
-            f"the simulation would explode; the largest stable one is timestep_s = {stable:.12g} s"
+            "the joints are too stiff, or their links or rotors too light, for timestep_s ="
+            f" {model.opt.timestep:g} s: the simulation would explode; the largest stable one is"
+            f" timestep_s = {stable:.12g} s"
         )
 
 
 def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
-    """The model's physics step; where the joints explode with it, the largest stable one that divides a period [s].
+    """The model's physics step; where the joints explode with it, the largest stable one that
+    divides a period [s].
 
     Raises:
         ConfigurationError: None is stable, down to a millionth of it.
     """
     if is_stable(model):
         return float(model.opt.timestep)
-    return control_period_s / int(np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9))
+    return control_period_s / int(
+        np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9)
+    )
 
 
 @contextmanager
 def _without_messages() -> Iterator[None]:
-    """No warnings of MuJoCo on the terminal or in MUJOCO_LOG.TXT: here a step that explodes is an answer."""
-    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    """No warnings of MuJoCo on the terminal or in MUJOCO_LOG.TXT: here a step that explodes is
+    an answer.
+    """
+    before = mujoco.MjLogConfig.get()
+    silent = mujoco.MjLogConfig.get()
     silent.logto_console = silent.logto_file = False
     silent.set()
     try:
@@ -135,7 +157,8 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
 def _transition(model: mujoco.MjModel) -> Array:
     """A by central differences: MuJoCo's own do not take RK4."""
     size = 2 * model.nv + model.na
-    data, A = mujoco.MjData(model), np.empty((size, size))
+    data = mujoco.MjData(model)
+    A = np.empty((size, size))
     rest = data.qpos.copy()
 
     def stepped(change: Array) -> Array:

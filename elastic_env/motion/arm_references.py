@@ -1,7 +1,8 @@
-"""References of robots of several joints: static poses, moves from pose to pose, a line and a circle, a user's file.
+"""References of robots of several joints: static poses, moves from pose to pose, a line and a
+circle, a user's file.
 
-Those of `elastic_env.motion.references` move every joint alike. These know the robot: its joint ranges, its home, and
-where its end effector is. All begin with a second of standing.
+Those of `elastic_env.motion.references` move every joint alike. These know the robot: its joint
+ranges, its home, and where its end effector is. All begin with a second of standing.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,15 @@ from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.motion.inverse_kinematics import joint_path
-from elastic_env.motion.references import REFERENCES, AboutHome, Hold, Multisine, Sine, Steps, make_reference
+from elastic_env.motion.references import (
+    REFERENCES,
+    AboutHome,
+    Hold,
+    Multisine,
+    Sine,
+    Steps,
+    make_reference,
+)
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
 from elastic_env.rigid.tree.end_effector import EndEffector
 
@@ -58,7 +67,9 @@ class Workspace:
         Raises:
             ConfigurationError: The servos are too weak for almost all poses.
         """
-        width = np.where(np.isfinite(self.highest - self.lowest), _MARGIN * (self.highest - self.lowest), 0.0)
+        width = np.where(
+            np.isfinite(self.highest - self.lowest), _MARGIN * (self.highest - self.lowest), 0.0
+        )
         low = np.maximum(self.lowest + width, self.home - _HALF_TURN)
         high = np.minimum(self.highest - width, self.home + _HALF_TURN)
         found = np.empty((0, len(self.home)))
@@ -67,7 +78,9 @@ class Workspace:
             found = np.concatenate([found, drawn[self.holds(drawn)]])[:count]
             if len(found) == count:
                 return found
-        raise ConfigurationError("the servos hold hardly any pose of the workspace; give them a larger torque_limit")
+        raise ConfigurationError(
+            "the servos hold hardly any pose of the workspace; give them a larger torque_limit"
+        )
 
     def require_tool(self, kind: str) -> EndEffector:
         """The end effector that a reference moves.
@@ -76,18 +89,21 @@ class Workspace:
             ConfigurationError: There is none.
         """
         if self.end_effector is None:
-            raise ConfigurationError(f"the reference {kind!r} moves an end effector; name one, end_effector=SITE")
+            raise ConfigurationError(
+                f"the reference {kind!r} moves an end effector; name one, end_effector=SITE"
+            )
         return self.end_effector
 
 
 class _Drawn(Model):
     """What references with drawn poses share."""
 
-    positions: int = quantity("1", 8, ge=1, le=1000, description="number of poses")
-    move_s: float = quantity("s", 2.0, gt=0, le=600, description="duration of a move")
-    seed: int | None = quantity(
-        "1", 0, ge=0, le=LARGEST_SEED, description="seed of the poses; None draws new ones per episode"
-    )
+    positions: int = quantity("1", 8, ge=1, le=1000)
+    """Number of poses [1]."""
+    move_s: float = quantity("s", 2.0, gt=0, le=600)
+    """Duration of a move [s]."""
+    seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
+    """Seed of the poses; None draws new ones per episode [1]."""
 
     @property
     def is_random(self) -> bool:
@@ -101,18 +117,26 @@ class _Drawn(Model):
 
 
 class Poses(_Drawn):
-    """Static poses, drawn over the workspace within limits. The robot moves there from home, and is scored at rest.
+    """Static poses, drawn over the workspace within limits.
 
-    Moves are quintic. After each the robot rests: a time to settle, and a time in which it is scored.
+    The robot moves there from home, and is scored at rest.
+
+    Moves are quintic. After each the robot rests: a time to settle, and a time in which it is
+    scored.
     """
 
     kind: Literal["poses"] = "poses"
-    settle_s: float = quantity("s", 1.5, ge=0, le=600, description="time at rest before the measurement")
-    measure_s: float = quantity("s", 0.25, gt=0, le=600, description="time of the measurement")
+    settle_s: float = quantity("s", 1.5, ge=0, le=600)
+    """Time at rest before the measurement [s]."""
+    measure_s: float = quantity("s", 0.25, gt=0, le=600)
+    """Time of the measurement [s]."""
 
-    def joint_plan(self, workspace: Workspace, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def joint_plan(
+        self, workspace: Workspace, generator: np.random.Generator, control_period_s: float
+    ) -> Plan:
         """A plan of all joints, (T, n)."""
-        visits, period = self._visits(workspace, generator), self.move_s + self.settle_s + self.measure_s
+        visits = self._visits(workspace, generator)
+        period = self.move_s + self.settle_s + self.measure_s
         t = control_times(STAND_S + self.positions * period, control_period_s)
         since = t[:, None] - STAND_S - period * np.arange(self.positions)
         settled = self.move_s + self.settle_s
@@ -125,11 +149,12 @@ class Moves(_Drawn):
     """Smooth moves from pose to pose, drawn over the workspace within limits, scored throughout."""
 
     kind: Literal["moves"] = "moves"
-    seed: int | None = quantity(
-        "1", None, ge=0, le=LARGEST_SEED, description="seed of the poses; None draws new ones per episode"
-    )
+    seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
+    """Seed of the poses; None draws new ones per episode [1]."""
 
-    def joint_plan(self, workspace: Workspace, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def joint_plan(
+        self, workspace: Workspace, generator: np.random.Generator, control_period_s: float
+    ) -> Plan:
         """A plan of all joints, (T, n)."""
         visits = self._visits(workspace, generator)
         t = control_times(STAND_S + self.positions * self.move_s, control_period_s)
@@ -141,21 +166,33 @@ class _Path(Model):
     """What paths of the end effector share: there is one plan for all episodes."""
 
     is_random: ClassVar[bool] = False
-    duration_s: float = quantity("s", 4.0, gt=0, le=600, description="time of one way, or of one turn")
-    repeats: int = quantity("1", 1, ge=1, le=100, description="number of ways there and back, or of turns")
+    duration_s: float = quantity("s", 4.0, gt=0, le=600)
+    """Time of one way, or of one turn [s]."""
+    repeats: int = quantity("1", 1, ge=1, le=100)
+    """Number of ways there and back, or of turns [1]."""
 
-    def _along(self, workspace: Workspace, place: Any, phase: tuple[Array, ...], control_period_s: float) -> Plan:
-        """The plan of joints whose tool is at `place(s)`, an offset from where it starts, for a phase over time."""
+    def _along(
+        self, workspace: Workspace, place: Any, phase: tuple[Array, ...], control_period_s: float
+    ) -> Plan:
+        """The plan of joints whose tool is at `place(s)`, an offset from where it starts, for a
+        phase over time.
+        """
         s, s_dot, s_ddot = phase
         tool = workspace.require_tool(str(getattr(self, "kind", "")))
         path = joint_path(tool, workspace.home, place, float(s.max()))
-        q, slope, curve = path(s), path(s, 1), path(s, 2)
+        q = path(s)
+        slope = path(s, 1)
+        curve = path(s, 2)
         t = np.arange(len(s)) * control_period_s
-        return _scored(t, q, slope * s_dot[:, None], slope * s_ddot[:, None] + curve * s_dot[:, None] ** 2)
+        return _scored(
+            t, q, slope * s_dot[:, None], slope * s_ddot[:, None] + curve * s_dot[:, None] ** 2
+        )
 
 
 class Line(_Path):
-    """A straight line of the end effector from home, there and back, by inverse kinematics. Scored throughout.
+    """A straight line of the end effector from home, there and back, by inverse kinematics.
+
+    Scored throughout.
 
     A robot of six joints or more keeps the orientation of the tool.
     """
@@ -164,14 +201,21 @@ class Line(_Path):
     by: tuple[float, float, float] = (0.0, 0.0, -0.1)
     """Where it leads, from home, in the axes of the base [m]."""
 
-    def joint_plan(self, workspace: Workspace, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
+    def joint_plan(
+        self,
+        workspace: Workspace,
+        generator: np.random.Generator,  # noqa: ARG002
+        control_period_s: float,
+    ) -> Plan:
         """A plan of all joints, (T, n)."""
         t = control_times(STAND_S + 2 * self.repeats * self.duration_s, control_period_s)
         since = (t[:, None] - STAND_S) / self.duration_s - np.arange(2 * self.repeats)
         ways = np.stack(quintic(since)) * np.where(np.arange(2 * self.repeats) % 2, -1.0, 1.0)
         s, s_dot, s_ddot = ways.sum(axis=-1)
         phase = (np.clip(s, 0.0, 1.0), s_dot / self.duration_s, s_ddot / self.duration_s**2)
-        return self._along(workspace, lambda way: way[..., None] * np.array(self.by), phase, control_period_s)
+        return self._along(
+            workspace, lambda way: way[..., None] * np.array(self.by), phase, control_period_s
+        )
 
 
 class Circle(_Path):
@@ -181,11 +225,17 @@ class Circle(_Path):
     """
 
     kind: Literal["circle"] = "circle"
-    radius: float = quantity("m", 0.05, gt=0, le=10, description="radius of the circle")
+    radius: float = quantity("m", 0.05, gt=0, le=10)
+    """Radius of the circle [m]."""
     normal: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Axis of the circle in the axes of the base; its length does not matter."""
 
-    def joint_plan(self, workspace: Workspace, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
+    def joint_plan(
+        self,
+        workspace: Workspace,
+        generator: np.random.Generator,  # noqa: ARG002
+        control_period_s: float,
+    ) -> Plan:
         """A plan of all joints, (T, n)."""
         axis = np.array(self.normal)
         if not np.linalg.norm(axis) > 0.0:
@@ -196,44 +246,67 @@ class Circle(_Path):
         total = self.repeats * self.duration_s
         t = control_times(STAND_S + total, control_period_s)
         s, s_dot, s_ddot = quintic((t - STAND_S) / total)
-        down, across = self.radius * down / np.linalg.norm(down), self.radius * across / np.linalg.norm(across)
+        down = self.radius * down / np.linalg.norm(down)
+        across = self.radius * across / np.linalg.norm(across)
 
         def place(turns: Array) -> Array:
             angle: Array = 2.0 * np.pi * turns[..., None]
-            return np.asarray((np.cos(angle) - 1.0) * down + np.sin(angle) * across, dtype=np.float64)
+            return np.asarray(
+                (np.cos(angle) - 1.0) * down + np.sin(angle) * across, dtype=np.float64
+            )
 
         n = self.repeats
-        return self._along(workspace, place, (n * s, n * s_dot / total, n * s_ddot / total**2), control_period_s)
+        return self._along(
+            workspace, place, (n * s, n * s_dot / total, n * s_ddot / total**2), control_period_s
+        )
 
 
 class Csv(Model):
     """Angles over time from a user's file. Scored throughout.
 
-    The file has a column `time_s` and one for each joint that moves, by its name [rad]. The other joints stay at home.
-    Between its rows the motion is a cubic spline that starts and ends at rest.
+    The file has a column `time_s` and one for each joint that moves, by its name [rad]. The other
+    joints stay at home. Between its rows the motion is a cubic spline that starts and ends at rest.
     """
 
     kind: Literal["csv"] = "csv"
     is_random: ClassVar[bool] = False
-    file: Locator = Field(description="path of the file")
+    file: Locator
+    """Path of the file."""
 
-    def joint_plan(self, workspace: Workspace, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
+    def joint_plan(
+        self,
+        workspace: Workspace,
+        generator: np.random.Generator,  # noqa: ARG002
+        control_period_s: float,
+    ) -> Plan:
         """A plan of all joints, (T, n)."""
         names, rows = _table(Path(self.file), workspace.joints)
-        times, angles = rows[:, 0] - rows[0, 0], np.tile(workspace.home, (len(rows), 1))
+        times = rows[:, 0] - rows[0, 0]
+        angles = np.tile(workspace.home, (len(rows), 1))
         angles[:, [workspace.joints.index(name) for name in names]] = rows[:, 1:]
         path = CubicSpline(times, angles, bc_type="clamped")
         t = control_times(STAND_S + float(times[-1]), control_period_s)
         since = np.clip(t - STAND_S, 0.0, times[-1])
         moving = ((t > STAND_S) & (t < STAND_S + times[-1]))[:, None]
-        return _scored(t, path(since), np.where(moving, path(since, 1), 0.0), np.where(moving, path(since, 2), 0.0))
+        return _scored(
+            t,
+            path(since),
+            np.where(moving, path(since, 1), 0.0),
+            np.where(moving, path(since, 2), 0.0),
+        )
 
 
 OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
 ArmReference = Annotated[Hold | Sine | Multisine | Steps | OfArm, Field(discriminator="kind")]
 AnyArmReference: TypeAlias = Hold | Sine | Multisine | Steps | OfArm
 
-ARM_REFERENCES: dict[str, type[OfArm]] = {"poses": Poses, "moves": Moves, "line": Line, "circle": Circle, "csv": Csv}
+ARM_REFERENCES: dict[str, type[OfArm]] = {
+    "poses": Poses,
+    "moves": Moves,
+    "line": Line,
+    "circle": Circle,
+    "csv": Csv,
+}
 
 
 def make_arm_reference(reference: "str | dict[str, Any] | AnyArmReference") -> AnyArmReference:
@@ -270,7 +343,9 @@ class ArmMotion:
         return self.reference.is_random
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """Angles, rates and accelerations of all joints, (T, n); of a random one each joint has a plan of its own."""
+        """Angles, rates and accelerations of all joints, (T, n); of a random one each joint has
+        a plan of its own.
+        """
         if isinstance(self.reference, OfArm):
             return self.reference.joint_plan(self.workspace, generator, control_period_s)
         return AboutHome(self.reference, self.workspace.home).plan(generator, control_period_s)
@@ -282,24 +357,36 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     Raises:
         ConfigurationError: It cannot be read, or a column or value is not what it has to be.
     """
-    table = read_table(file, what="file of angles", row="row", most_rows=_MOST_ROWS, example="time_s, then joints")
-    names, rows = table.names, table.values
+    table = read_table(
+        file, what="file of angles", row="row", most_rows=_MOST_ROWS, example="time_s, then joints"
+    )
+    names = table.names
+    rows = table.values
     if names[0] != "time_s":
-        raise ConfigurationError(f"the first column of {file} must be time_s, got {shown(names[0])}")
+        raise ConfigurationError(
+            f"the first column of {file} must be time_s, got {shown(names[0])}"
+        )
     require_known(f"column of {file}", names[1:], joints)
     if len(rows) < 2 or len(names) < 2:
-        raise ConfigurationError(f"{file} must have two rows or more, and a column of angles or more beside time_s")
+        raise ConfigurationError(
+            f"{file} must have two rows or more, and a column of angles or more beside time_s"
+        )
     if (np.diff(rows[:, 0]) <= 0.0).any() or rows[-1, 0] - rows[0, 0] > _LONGEST_S:
-        raise ConfigurationError(f"time_s of {file} must increase from row to row, over at most {_LONGEST_S:g} s")
+        raise ConfigurationError(
+            f"time_s of {file} must increase from row to row, over at most {_LONGEST_S:g} s"
+        )
     if np.diff(rows[:, 0]).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
         raise ConfigurationError(
-            f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within ±{_LARGEST_RAD:g} rad"
+            f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within"
+            f" ±{_LARGEST_RAD:g} rad"
         )
     return list(names[1:]), rows
 
 
 def _moved(visits: Array, share: Array, move_s: float) -> tuple[Array, Array, Array]:
-    """Angle, rate and acceleration of moves between poses, each (T, n), from the shares of the moves, (T, moves)."""
+    """Angle, rate and acceleration of moves between poses, each (T, n), from the shares of the
+    moves, (T, moves).
+    """
     blend, blend_dot, blend_ddot = quintic(share)
     steps = np.diff(visits, axis=0)
     return visits[0] + blend @ steps, blend_dot @ steps / move_s, blend_ddot @ steps / move_s**2

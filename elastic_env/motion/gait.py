@@ -1,7 +1,8 @@
 """Timing of a walk in place: step periods, phases, and the ZMP reference that goes with them.
 
-A step is double, single, double support; its support foot is fixed and the other one swings. The first step swings the
-right foot, as Fig. 1 of the paper. Before and after the walk the robot stands.
+A step is double, single, double support; its support foot is fixed and the other one swings. The
+first step swings the right foot, as Fig. 1 of the paper. Before and after the walk the robot
+stands.
 """
 
 from dataclasses import dataclass
@@ -15,10 +16,16 @@ from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.trajectory import STAND_S, control_times, minimum_jerk
 
-LEFT, RIGHT = 0, 1
+LEFT = 0
+RIGHT = 1
 """Index of a foot or leg."""
 
-STEP_DURATIONS = {24.0: (7.0, 10.0, 7.0), 3.0: (1.1, 0.8, 1.1), 1.6: (0.5, 0.6, 0.5), 1.1: (0.3, 0.5, 0.3)}
+STEP_DURATIONS = {
+    24.0: (7.0, 10.0, 7.0),
+    3.0: (1.1, 0.8, 1.1),
+    1.6: (0.5, 0.6, 0.5),
+    1.1: (0.3, 0.5, 0.3),
+}
 """Durations of double, single, double support by step period [s]; 24 s and 3 s are the paper's."""
 
 TRANSITION_S = 0.2
@@ -35,15 +42,22 @@ _RAMP_INWARD_M = 0.02
 class Gait(Model):
     """A walk in place."""
 
-    double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="first double support of a step")
-    single_support_s: float = quantity("s", 0.8, gt=0, le=3600, description="single support of a step")
-    last_double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="last double support of a step")
-    num_steps: int = quantity("1", 4, ge=1, le=1000, description="number of steps")
-    lift_m: float = quantity("m", 0.025, gt=0, description="height to which the swing foot is lifted")
-    hip_height_m: float = quantity("m", 0.66, gt=0, description="height of the hip axes over the ground")
+    double_support_s: float = quantity("s", 1.1, gt=0, le=3600)
+    """First double support of a step [s]."""
+    single_support_s: float = quantity("s", 0.8, gt=0, le=3600)
+    """Single support of a step [s]."""
+    last_double_support_s: float = quantity("s", 1.1, gt=0, le=3600)
+    """Last double support of a step [s]."""
+    num_steps: int = quantity("1", 4, ge=1, le=1000)
+    """Number of steps [1]."""
+    lift_m: float = quantity("m", 0.025, gt=0)
+    """Height to which the swing foot is lifted [m]."""
+    hip_height_m: float = quantity("m", 0.66, gt=0)
+    """Height of the hip axes over the ground [m]."""
     transfer: Literal["smooth", "ramp"] = "smooth"
-    """How the ZMP goes from foot to foot: over the whole double support, or within 0.1 s before lift-off and after
-    touch-down, 0.02 m inward of the ankle, as in the published controller of this robot's group."""
+    """How the ZMP goes from foot to foot: over the whole double support, or within 0.1 s before
+    lift-off and after touch-down, 0.02 m inward of the ankle, as in the published controller of
+    this robot's group."""
 
     @property
     def step_period_s(self) -> float:
@@ -60,12 +74,15 @@ class Gait(Model):
         shortest = min(self.double_support_s, self.last_double_support_s)
         if self.transfer == "ramp" and shortest < _RAMP_SHIFT_S:
             raise ValueError(
-                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of {shortest} s is shorter"
+                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of"
+                f" {shortest} s is shorter"
             )
         return self
 
 
-def make_gait(step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: Any) -> Gait:
+def make_gait(
+    step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: Any
+) -> Gait:
     """A gait by its step period, or by the durations of double, single, double support [s].
 
     Args:
@@ -77,7 +94,8 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
     """
     if isinstance(step_period, Gait):
         return step_period.replace(**parameters) if parameters else step_period
-    period, durations = plain_numbers(step_period), ()
+    period = plain_numbers(step_period)
+    durations = ()
     if isinstance(period, tuple | list):
         durations = tuple(period)
     elif isinstance(period, int | float):
@@ -85,8 +103,8 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
     if len(durations) != 3:
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
-            f"step_period must be one of {known} [s], or the three durations of double, single and double support [s] "
-            f"such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
+            f"step_period must be one of {known} [s], or the three durations of double, single and"
+            f" double support [s] such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
         )
     return Gait(**dict(zip(_DURATIONS, durations, strict=True)), **parameters)
 
@@ -97,7 +115,8 @@ class Timing:
 
     Attributes:
         time: Time from the start of the episode [s].
-        support: Support foot of the step, `LEFT` or `RIGHT`; before and after the walk that of the next or last step.
+        support: Support foot of the step, `LEFT` or `RIGHT`; before and after the walk that of the
+            next or last step.
         single: Whether the other foot is off the ground.
         swing: Progress of the swing, 0 to 1; 0 and 1 before and after it.
         transition: Within `TRANSITION_S` of a lift-off or touch-down.
@@ -116,9 +135,12 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     """Phases of a gait.
 
     Raises:
-        ConfigurationError: A duration is no multiple of the control period, or the walk is too long.
+        ConfigurationError: A duration is no multiple of the control period, or the walk is too
+            long.
     """
-    first, single, last = (_whole_steps(name, getattr(gait, name), control_period_s) for name in _DURATIONS)
+    first, single, last = (
+        _whole_steps(name, getattr(gait, name), control_period_s) for name in _DURATIONS
+    )
     period = first + single + last
     _require_short(gait)
     time = control_times(gait.duration_s, control_period_s)
@@ -145,7 +167,10 @@ def _distance(steps: IntArray, events: IntArray) -> IntArray:
     """Control steps from each step to the nearest of some events in order, (T,)."""
     after = np.searchsorted(events, steps)
     last = len(events) - 1
-    return np.minimum(np.abs(steps - events[np.minimum(after, last)]), np.abs(steps - events[np.maximum(after - 1, 0)]))
+    return np.minimum(
+        np.abs(steps - events[np.minimum(after, last)]),
+        np.abs(steps - events[np.maximum(after - 1, 0)]),
+    )
 
 
 def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
@@ -157,9 +182,11 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
         feet: Middle of the left and the right sole, (2, 2) [m].
 
     Returns:
-        (T, 2) [m]; under the support foot in single support, halfway between the feet before and after the walk.
+        (T, 2) [m]; under the support foot in single support, halfway between the feet before and
+        after the walk.
     """
-    middle, supports = feet.mean(axis=0), support_points(gait, feet)
+    middle = feet.mean(axis=0)
+    supports = support_points(gait, feet)
     zmp = np.repeat(middle[None], len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, supports, middle):
         progress = (timing.time - begin) / duration
@@ -169,7 +196,9 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
 
 
 def support_points(gait: Gait, feet: Array) -> Array:
-    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2, 2) [m]."""
+    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2,
+    2) [m].
+    """
     inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
     towards = feet.mean(axis=0) - feet
     return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -177,7 +206,9 @@ def support_points(gait: Gait, feet: Array) -> Array:
 
 def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, float, Array, Array]]:
     """Moves of the ZMP: begin [s], duration [s], from and to [m]."""
-    shifts, last, begin = [], middle, STAND_S
+    shifts = []
+    last = middle
+    begin = STAND_S
     for step in range(gait.num_steps):
         lift_off = begin + gait.double_support_s
         touch_down = lift_off + gait.single_support_s
@@ -193,24 +224,29 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
             shifts.append((left, lift_off - left, last, support))
             if step == gait.num_steps - 1:
                 shifts.append((touch_down, end - touch_down, support, middle))
-        last, begin = support, end
+        last = support
+        begin = end
     return shifts
 
 
 def _require_short(gait: Gait) -> None:
     if gait.duration_s > LONGEST_WALK_S:
         raise ConfigurationError(
-            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps of "
-            f"{gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter ones"
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
+            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
+            " ones"
         )
 
 
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
     steps = duration_s / control_period_s
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        nearest = sorted({max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))})
+        nearest = sorted(
+            {max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))}
+        )
         raise ConfigurationError(
-            f"{name} must be a multiple of the control period of {control_period_s} s, got {duration_s} s; "
-            f"the nearest {'is' if len(nearest) == 1 else 'are'} {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
+            f"{name} must be a multiple of the control period of {control_period_s} s, got"
+            f" {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
+            f" {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
         )
     return round(steps)

@@ -1,4 +1,6 @@
-"""Joint angles whose end effector follows a path, by Newton's method from point to point when a motion is planned."""
+"""Joint angles whose end effector follows a path, by Newton's method from point to point when a
+motion is planned.
+"""
 
 from collections.abc import Callable
 
@@ -12,7 +14,8 @@ from elastic_env.rigid.tree.end_effector import EndEffector
 
 _POINTS = 100
 """Points of a path per unit of its parameter."""
-_ENOUGH, _MOST_STEPS = 1e-9, 50
+_ENOUGH = 1e-9
+_MOST_STEPS = 50
 _LARGEST_JUMP_RAD = 0.3
 """Between two points of a path; a larger one is a singular posture."""
 _DAMPING = 1e-12
@@ -20,7 +23,9 @@ _FOR_ORIENTATION = 6
 """Joints that a robot needs to keep the orientation of its tool."""
 
 
-def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float) -> CubicSpline:
+def joint_path(
+    tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float
+) -> CubicSpline:
     """Joint angles along a path of the end effector, from (...) to (..., n) [rad].
 
     Args:
@@ -39,16 +44,18 @@ def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], 
         found = _solved(tool, angles[-1], start + offset, R)
         if found is None or np.abs(found - angles[-1]).max() > _LARGEST_JUMP_RAD:
             raise ConfigurationError(
-                f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it, "
-                f"{offset.round(3).tolist()} m from its start: out of reach, or a singular posture; choose a smaller "
-                "path or another home"
+                f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it,"
+                f" {offset.round(3).tolist()} m from its start: out of reach, or a singular"
+                " posture; choose a smaller path or another home"
             )
         angles.append(found)
     return CubicSpline(s, np.array(angles))
 
 
 def _solved(tool: EndEffector, q: Array, wanted: Array, R_wanted: Array) -> Array | None:
-    """Angles near q with the end effector in a place, and of six joints or more in an orientation; None for none."""
+    """Angles near q with the end effector in a place, and of six joints or more in an
+    orientation; None for none.
+    """
     keeps = len(q) >= _FOR_ORIENTATION
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)

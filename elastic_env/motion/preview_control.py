@@ -1,11 +1,12 @@
 r"""Preview control of the center of mass on the cart-table model [Kajita2003].
 
-The cart of mass M at height z_c has the ZMP p = x − (z_c/g) ẍ. The jerk of the cart is chosen by an optimal servo with
-preview of the ZMP reference: integral of the ZMP error, state feedback, and the reference of the next seconds.
+The cart of mass M at height z_c has the ZMP p = x − (z_c/g) ẍ. The jerk of the cart is chosen by an
+optimal servo with preview of the ZMP reference: integral of the ZMP error, state feedback, and the
+reference of the next seconds.
 
-[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of Zero-Moment Point", ICRA.
-[Katayama1985] T. Katayama et al., "Design of an optimal controller for a discrete-time system subject to previewable
-demand", Int. J. Control 41(3).
+[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
+Zero-Moment Point", ICRA. [Katayama1985] T. Katayama et al., "Design of an optimal controller for a
+discrete-time system subject to previewable demand", Int. J. Control 41(3).
 """
 
 from dataclasses import dataclass
@@ -21,17 +22,25 @@ from elastic_env.core.signals import Array
 class PreviewConfig(Model):
     """Cart-table model and weights of the preview servo."""
 
-    com_height_m: float = quantity("m", gt=0, description="z_c, height of the center of mass over the ground")
-    period_s: float = quantity("s", 0.004, gt=0, description="control period")
-    preview_s: float = quantity("s", 1.6, gt=0, description="time over which the reference is known")
-    error_weight: float = quantity("1/m²", 1.0, gt=0, description="weight of the ZMP error")
-    jerk_weight: float = quantity("s⁶/m²", 1e-6, gt=0, description="weight of the jerk")
-    gravity: float = quantity("m/s²", 9.81, gt=0, description="acceleration of gravity")
+    com_height_m: float = quantity("m", gt=0)
+    """z_c, height of the center of mass over the ground [m]."""
+    period_s: float = quantity("s", 0.004, gt=0)
+    """Control period [s]."""
+    preview_s: float = quantity("s", 1.6, gt=0)
+    """Time over which the reference is known [s]."""
+    error_weight: float = quantity("1/m²", 1.0, gt=0)
+    """Weight of the ZMP error [1/m²]."""
+    jerk_weight: float = quantity("s⁶/m²", 1e-6, gt=0)
+    """Weight of the jerk [s⁶/m²]."""
+    gravity: float = quantity("m/s²", 9.81, gt=0)
+    """Acceleration of gravity [m/s²]."""
 
 
 @dataclass(frozen=True)
 class PreviewGains:
-    """Gains of the servo: on the integrated ZMP error, the state (x, ẋ, ẍ), and the previewed references."""
+    """Gains of the servo: on the integrated ZMP error, the state (x, ẋ, ẍ), and the previewed
+    references.
+    """
 
     integral: float
     state: Array
@@ -40,7 +49,9 @@ class PreviewGains:
 
 @dataclass(frozen=True)
 class ComMotion:
-    """Motion of the center of mass, time first, and the ZMP that it has on the cart-table [m], [m/s], [m/s²]."""
+    """Motion of the center of mass, time first, and the ZMP that it has on the cart-table [m],
+    [m/s], [m/s²].
+    """
 
     com: Array
     com_dot: Array
@@ -92,7 +103,9 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
         ElasticError: Shapes that do not fit.
     """
     if zmp_ref.ndim != 2 or start.shape != zmp_ref.shape[1:]:
-        raise ElasticError(f"zmp_ref must be (T, d) and start (d,), got {zmp_ref.shape} and {start.shape}")
+        raise ElasticError(
+            f"zmp_ref must be (T, d) and start (d,), got {zmp_ref.shape} and {start.shape}"
+        )
     A, b, c = cart_table(config)
     gains = preview_gains(config)
     steps, dimensions = zmp_ref.shape
@@ -101,12 +114,19 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
     coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)  # coming[k] = r_{k+1} − r_k
     state = np.zeros((3, dimensions))
     state[0] = start
-    last, jerk = state, np.zeros(dimensions)
+    last = state
+    jerk = np.zeros(dimensions)
     states = np.empty((steps, 3, dimensions))
     for k in range(steps):
         states[k] = state
         error = c @ state - zmp_ref[k]
         # in increments, as the servo is optimal: all of the preview is known from the first step on
-        jerk = jerk - gains.integral * error - gains.state @ (state - last) - gains.preview @ coming[k : k + reach]
-        last, state = state, A @ state + b[:, None] * jerk
+        jerk = (
+            jerk
+            - gains.integral * error
+            - gains.state @ (state - last)
+            - gains.preview @ coming[k : k + reach]
+        )
+        last = state
+        state = A @ state + b[:, None] * jerk
     return ComMotion(states[:, 0], states[:, 1], states[:, 2], np.einsum("i,kid->kd", c, states))

@@ -1,8 +1,8 @@
 """Reference trajectories of the testbed: static positions, sine, multisine, steps.
 
-A reference is a validated model; `plan` turns it into samples at the control rate, with rate and acceleration in closed
-form. Every plan begins with a second of standing, in which policies ramp in, and moves by quintic (minimum-jerk)
-polynomials, which start and end without acceleration.
+A reference is a validated model; `plan` turns it into samples at the control rate, with rate and
+acceleration in closed form. Every plan begins with a second of standing, in which policies ramp in,
+and moves by quintic (minimum-jerk) polynomials, which start and end without acceleration.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,8 @@ from elastic_env.motion.trajectory import (
     quintic_moves,
 )
 
-_LONGEST_S, _LONGEST_SUM_S = 7200.0, 36_000.0
+_LONGEST_S = 7200.0
+_LONGEST_SUM_S = 36_000.0
 
 
 def _require_short(duration_s: float) -> None:
@@ -36,7 +37,8 @@ def _require_short(duration_s: float) -> None:
     """
     if duration_s > _LONGEST_S:
         raise ValueError(
-            f"a motion must last at most {_LONGEST_S:g} s, got {duration_s:.0f} s or more; take fewer or quicker moves"
+            f"a motion must last at most {_LONGEST_S:g} s, got {duration_s:.0f} s or more; take"
+            " fewer or quicker moves"
         )
 
 
@@ -50,39 +52,52 @@ class _Motion(Model):
 
 
 class Hold(_Motion):
-    """The paper's static positions, evenly spaced in gravity torque, approached from below and then from above.
+    """The paper's static positions, evenly spaced in gravity torque, approached from below and then
+    from above.
 
-    Without compensation the link sags below its reference; the references lie so far beyond the positions that the
-    uncompensated link rests at evenly spaced torques.
+    Without compensation the link sags below its reference; the references lie so far beyond the
+    positions that the uncompensated link rests at evenly spaced torques.
 
-    The sweep starts below the first position and turns round beyond the last, so that every position is reached from
-    both sides. Moves are slow: a link that overshoots would lose the friction's hysteresis, which the experiment shows.
+    The sweep starts below the first position and turns round beyond the last, so that every
+    position is reached from both sides. Moves are slow: a link that overshoots would lose the
+    friction's hysteresis, which the experiment shows.
     """
 
     kind: Literal["hold"] = "hold"
-    positions: int = quantity("1", 20, ge=2, le=1000, description="number of static positions")
-    lower: float = quantity(
-        "1", -0.875, gt=-1, lt=1, description="first position, share of the torque at the horizontal"
-    )
-    upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
-    rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
-    sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
-    shortest_move_s: float = quantity("s", 4.0, gt=0, le=3600, description="shortest move; quick ones ring")
-    settle_s: float = quantity("s", 1.5, ge=0, le=3600, description="time at rest before the measurement")
-    measure_s: float = quantity("s", 0.5, gt=0, le=3600, description="time of the measurement")
-    overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
+    positions: int = quantity("1", 20, ge=2, le=1000)
+    """Number of static positions [1]."""
+    lower: float = quantity("1", -0.875, gt=-1, lt=1)
+    """First position, share of the torque at the horizontal [1]."""
+    upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1)
+    """Last position, likewise [1]."""
+    rate: float = quantity("rad/s", 0.06, gt=0)
+    """Peak rate of the moves [rad/s]."""
+    sag: float = quantity("rad", 60 / 1001, ge=0)
+    """Deflection at the horizontal without compensation [rad]."""
+    shortest_move_s: float = quantity("s", 4.0, gt=0, le=3600)
+    """Shortest move; quick ones ring [s]."""
+    settle_s: float = quantity("s", 1.5, ge=0, le=3600)
+    """Time at rest before the measurement [s]."""
+    measure_s: float = quantity("s", 0.5, gt=0, le=3600)
+    """Time of the measurement [s]."""
+    overrun: float = quantity("rad", 0.08, gt=0)
+    """How far the sweep starts and turns outside the positions [rad]."""
 
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
         if self.upper <= self.lower:
-            raise ValueError(f"upper must exceed lower, got lower {self.lower} and upper {self.upper}")
+            raise ValueError(
+                f"upper must exceed lower, got lower {self.lower} and upper {self.upper}"
+            )
         return self
 
     @model_validator(mode="after")
     def _ends_in_time(self) -> Self:
         angles = self.angles
         way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
-        moves = max(QUINTIC_PEAK_RATE * way / self.rate, (2 * self.positions + 1) * self.shortest_move_s)
+        moves = max(
+            QUINTIC_PEAK_RATE * way / self.rate, (2 * self.positions + 1) * self.shortest_move_s
+        )
         _require_short(STAND_S + moves + 2 * self.positions * (self.settle_s + self.measure_s))
         return self
 
@@ -94,7 +109,9 @@ class Hold(_Motion):
 
     @property
     def visits(self) -> tuple[Array, IntArray]:
-        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at rest."""
+        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at
+        rest.
+        """
         angles = self.angles
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
@@ -115,18 +132,22 @@ class Hold(_Motion):
         """Duration of a move over a distance [rad]."""
         return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
         """The plan, the same for every generator."""
         angles, directions = self.visits
-        start, turn = angles[0] - self.overrun, self.angles[-1] + self.overrun
-        moves, windows = [], []
-        now, position = STAND_S, start
+        start = angles[0] - self.overrun
+        turn = self.angles[-1] + self.overrun
+        moves = []
+        windows = []
+        now = STAND_S
+        position = start
 
         def move(target: float) -> None:
             nonlocal now, position
             duration = self._move_s(abs(target - position))
             moves.append((now, duration, target))
-            now, position = now + duration, target
+            now = now + duration
+            position = target
 
         for visit, (angle, direction) in enumerate(zip(angles, directions, strict=True)):
             if visit > 0 and direction != directions[visit - 1]:
@@ -145,14 +166,19 @@ class Hold(_Motion):
 class _Oscillation(_Motion):
     """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
 
-    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
-    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="angle about which it oscillates")
-    duration_s: float = quantity("s", 12.0, gt=0, le=3600, description="scored time")
-    onset_s: float = quantity("s", 2.0, gt=0, le=3600, description="time in which the amplitude grows; not scored")
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi)
+    """Largest angle from the middle [rad]."""
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi)
+    """Angle about which it oscillates [rad]."""
+    duration_s: float = quantity("s", 12.0, gt=0, le=3600)
+    """Scored time [s]."""
+    onset_s: float = quantity("s", 2.0, gt=0, le=3600)
+    """Time in which the amplitude grows; not scored [s]."""
 
     def _enveloped(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
         w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
-        w_dot, w_ddot = w_dot / self.onset_s, w_ddot / self.onset_s**2
+        w_dot = w_dot / self.onset_s
+        w_ddot = w_ddot / self.onset_s**2
         return Plan(
             q=self.middle + w * x,
             q_dot=w_dot * x + w * x_dot,
@@ -164,7 +190,8 @@ class _Oscillation(_Motion):
     def _extent(self, rate: float, acceleration: float) -> Extent:
         """Bounds with the envelope, whatever the phase of the oscillation when it grows."""
         w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
-        w_dot, w_ddot = w_dot / self.onset_s, np.abs(w_ddot) / self.onset_s**2
+        w_dot = w_dot / self.onset_s
+        w_ddot = np.abs(w_ddot) / self.onset_s**2
         return Extent(
             self.middle - self.amplitude,
             self.middle + self.amplitude,
@@ -180,14 +207,15 @@ class Sine(_Oscillation):
     """One sine, the same in every episode."""
 
     kind: Literal["sine"] = "sine"
-    frequency_hz: float = quantity("Hz", 0.25, gt=0, description="frequency")
+    frequency_hz: float = quantity("Hz", 0.25, gt=0)
+    """Frequency [Hz]."""
 
     def extent(self) -> Extent:
         """See `Extent`."""
         omega = 2.0 * np.pi * self.frequency_hz
         return self._extent(self.amplitude * omega, self.amplitude * omega**2)
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
         """The plan, the same for every generator."""
         t = self._time_base(control_period_s)
         omega = 2.0 * np.pi * self.frequency_hz
@@ -197,29 +225,36 @@ class Sine(_Oscillation):
 
 
 class Multisine(_Oscillation):
-    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode; their sum stays inside."""
+    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode;
+    their sum stays inside.
+    """
 
     kind: Literal["multisine"] = "multisine"
-    amplitude: float = quantity("rad", 0.4, gt=0, lt=np.pi, description="largest angle from the middle")
-    lowest_hz: float = quantity("Hz", 0.1, gt=0, description="lowest frequency")
-    highest_hz: float = quantity("Hz", 1.0, gt=0, description="highest frequency")
-    components: int = quantity("1", 5, ge=2, le=100, description="number of sines")
-    seed: int | None = quantity(
-        "1", None, ge=0, le=LARGEST_SEED, description="seed of the phases; None draws new ones per episode"
-    )
+    amplitude: float = quantity("rad", 0.4, gt=0, lt=np.pi)
+    """Largest angle from the middle [rad]."""
+    lowest_hz: float = quantity("Hz", 0.1, gt=0)
+    """Lowest frequency [Hz]."""
+    highest_hz: float = quantity("Hz", 1.0, gt=0)
+    """Highest frequency [Hz]."""
+    components: int = quantity("1", 5, ge=2, le=100)
+    """Number of sines [1]."""
+    seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
+    """Seed of the phases; None draws new ones per episode [1]."""
 
     @model_validator(mode="after")
     def _frequencies_are_ordered(self) -> Self:
         if self.highest_hz <= self.lowest_hz:
-            raise ValueError(f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz")
+            raise ValueError(
+                f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz"
+            )
         return self
 
     @model_validator(mode="after")
     def _is_summed_in_time(self) -> Self:
         if self.components * self.duration_s > _LONGEST_SUM_S:
             raise ValueError(
-                f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got {self.components} x "
-                f"{self.duration_s:g} s; take fewer sines or less time"
+                f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got"
+                f" {self.components} x {self.duration_s:g} s; take fewer sines or less time"
             )
         return self
 
@@ -236,7 +271,8 @@ class Multisine(_Oscillation):
         """A plan with phases of the generator, or of the reference's own seed."""
         phases = _own(generator, self.seed).uniform(0.0, 2.0 * np.pi, self.components)
         t = self._time_base(control_period_s)
-        omega, share = self._omega, self.amplitude / self.components
+        omega = self._omega
+        share = self.amplitude / self.components
         angle = omega * (t[:, None] - STAND_S) + phases
         x = share * np.sin(angle).sum(axis=1)
         x_dot = share * (omega * np.cos(angle)).sum(axis=1)
@@ -248,14 +284,18 @@ class Steps(_Motion):
     """Quick moves between random levels, each followed by a rest."""
 
     kind: Literal["steps"] = "steps"
-    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
-    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="middle of the levels")
-    move_s: float = quantity("s", 1.0, gt=0, le=3600, description="duration of a move")
-    rest_s: float = quantity("s", 1.0, ge=0, le=3600, description="rest after a move")
-    moves: int = quantity("1", 5, ge=1, le=1000, description="number of moves")
-    seed: int | None = quantity(
-        "1", None, ge=0, le=LARGEST_SEED, description="seed of the levels; None draws new ones per episode"
-    )
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi)
+    """Largest angle from the middle [rad]."""
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi)
+    """Middle of the levels [rad]."""
+    move_s: float = quantity("s", 1.0, gt=0, le=3600)
+    """Duration of a move [s]."""
+    rest_s: float = quantity("s", 1.0, ge=0, le=3600)
+    """Rest after a move [s]."""
+    moves: int = quantity("1", 5, ge=1, le=1000)
+    """Number of moves [1]."""
+    seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
+    """Seed of the levels; None draws new ones per episode [1]."""
 
     @model_validator(mode="after")
     def _ends_in_time(self) -> Self:
@@ -276,7 +316,10 @@ class Steps(_Motion):
         """A plan with levels of the generator, or of the reference's own seed."""
         offsets = _own(generator, self.seed).uniform(-self.amplitude, self.amplitude, self.moves)
         period = self.move_s + self.rest_s
-        moves = [(STAND_S + i * period, self.move_s, float(self.middle + x)) for i, x in enumerate(offsets)]
+        moves = [
+            (STAND_S + i * period, self.move_s, float(self.middle + x))
+            for i, x in enumerate(offsets)
+        ]
         t = control_times(STAND_S + self.moves * period, control_period_s)
         q, q_dot, q_ddot = quintic_moves(t, self.middle, moves)
         return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
@@ -295,7 +338,8 @@ REFERENCES: dict[str, type[AnyReference]] = {
 
 @dataclass(frozen=True)
 class AboutHome:
-    """A reference that every joint follows about its home; of a random one each joint has a plan of its own.
+    """A reference that every joint follows about its home; of a random one each joint has a plan of
+    its own.
 
     Attributes:
         reference: It.
@@ -316,7 +360,9 @@ class AboutHome:
         plans = [first] * len(self.home)
         if self.is_random:
             plans[1:] = [self.reference.plan(generator, control_period_s) for _ in plans[1:]]
-        q, q_dot, q_ddot = (np.stack([getattr(p, x) for p in plans], axis=-1) for x in ("q", "q_dot", "q_ddot"))
+        q, q_dot, q_ddot = (
+            np.stack([getattr(p, x) for p in plans], axis=-1) for x in ("q", "q_dot", "q_ddot")
+        )
         return Plan(q + self.home, q_dot, q_ddot, first.scored, first.rest)
 
 
@@ -333,7 +379,9 @@ def make_reference(
     if isinstance(reference, str):
         reference = {"kind": reference}
     if not isinstance(reference, dict):
-        raise ConfigurationError(f"a reference is a name, a mapping or a model, got {type(reference).__name__}")
+        raise ConfigurationError(
+            f"a reference is a name, a mapping or a model, got {type(reference).__name__}"
+        )
     kind = reference.get("kind")
     if not isinstance(kind, str) or kind not in REFERENCES:
         raise unknown_name("reference", kind, REFERENCES)

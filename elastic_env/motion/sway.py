@@ -1,10 +1,11 @@
-r"""How a robot sways on its springs: natural frequencies of standing on both feet with the motors held.
+r"""How a robot sways on its springs: natural frequencies of standing on both feet with the motors
+held.
 
-With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint angles q(x). About the
-equilibrium, with the motors at θ = q + K⁻¹τ,
+With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint
+angles q(x). About the equilibrium, with the motors at θ = q + K⁻¹τ,
 
 .. math:: M(x)\,\ddot x = -\partial V / \partial x, \quad V = \tfrac12 \sum K (\theta - q(x))^2 + m g z_{com}(x)
-"""
+"""  # noqa: E501
 
 import numpy as np
 from scipy import linalg
@@ -28,11 +29,17 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
         stiffness: K of the twelve joints, (12,) [N·m/rad].
 
     Returns:
-        The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes unstable.
+        The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes
+        unstable.
     """
     q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
-    legs, carried = biped.chains.posture(q.reshape(2, -1)), np.full(2, biped.chains.mass / 2.0)
-    torque = LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3))).torque().ravel()
+    legs = biped.chains.posture(q.reshape(2, -1))
+    carried = np.full(2, biped.chains.mass / 2.0)
+    torque = (
+        LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3)))
+        .torque()
+        .ravel()
+    )
     theta = q + torque / stiffness
 
     def potential(x: Array) -> Array:
@@ -59,7 +66,9 @@ def _rotations(x: Array) -> Array:
 
 
 def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
-    """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n, 12)."""
+    """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n,
+    12).
+    """
     R = _rotations(x)
     ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips

@@ -1,4 +1,6 @@
-"""Plans: sampled trajectories of a reference, their building blocks, and tables of them for many worlds."""
+"""Plans: sampled trajectories of a reference, their building blocks, and tables of them for many
+worlds.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,10 +19,12 @@ QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
+    """Samples of a reference at the control rate; row k is the target at the end of control period
+    k, row 0 the start.
 
     Attributes:
-        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,), or of all links, (T, n) [rad], [rad/s], [rad/s²].
+        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,), or of all links, (T, n)
+            [rad], [rad/s], [rad/s²].
         scored: Rows that count in metrics, (T,).
         rest: Number of the window at rest of `Hold`, −1 elsewhere, (T,).
     """
@@ -39,7 +43,9 @@ class Plan:
 
 @dataclass(frozen=True)
 class Extent:
-    """Bounds of a reference over all its plans: range of q [rad], largest |q̇| [rad/s], |q̈| [rad/s²]."""
+    """Bounds of a reference over all its plans: range of q [rad], largest |q̇| [rad/s], |q̈|
+    [rad/s²].
+    """
 
     lowest: float
     highest: float
@@ -60,7 +66,8 @@ def minimum_jerk(s: Array) -> Array:
 
 def quintic(s: Array) -> tuple[Array, Array, Array]:
     """`minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
-    blend, s = minimum_jerk(s), np.clip(s, 0.0, 1.0)
+    blend = minimum_jerk(s)
+    s = np.clip(s, 0.0, 1.0)
     return (
         blend,
         30.0 * s**2 * (1.0 - s) ** 2,
@@ -68,12 +75,19 @@ def quintic(s: Array) -> tuple[Array, Array, Array]:
     )
 
 
-def quintic_moves(t: Array, start: float, moves: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
-    """Angle, rate, acceleration at times t of moves (begin [s], duration [s], target [rad]) one after the other."""
-    q, q_dot, q_ddot = np.full_like(t, start), np.zeros_like(t), np.zeros_like(t)
+def quintic_moves(
+    t: Array, start: float, moves: list[tuple[float, float, float]]
+) -> tuple[Array, Array, Array]:
+    """Angle, rate, acceleration at times t of moves (begin [s], duration [s], target [rad]) one
+    after the other.
+    """
+    q = np.full_like(t, start)
+    q_dot = np.zeros_like(t)
+    q_ddot = np.zeros_like(t)
     position = start
     for begin, duration, target in moves:
-        # before a move nothing of it adds to the angle, after it all does: the rest would cost time alone
+        # before a move nothing of it adds to the angle, after it all does: the rest would cost time
+        # alone
         last = int(np.searchsorted(t, begin + duration)) + 1
         within = slice(int(np.searchsorted(t, begin)), last)
         blend, blend_dot, blend_ddot = quintic((t[within] - begin) / duration)
@@ -104,7 +118,8 @@ class Planned(Protocol):
 
 
 class PlanTable:
-    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
+    """The plans of all worlds as tables, one row per control step; a plan without randomness is
+    held once.
 
     Args:
         reference: Makes plans of all joints, (T, n).
@@ -112,22 +127,26 @@ class PlanTable:
         num_worlds: How many.
 
     Attributes:
-        motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3, n).
+        motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3,
+            n).
         plan_of_world: Which plan each world follows, (num_worlds,).
         scored, rest: As in a `Plan`, the same for all, (T,).
     """
 
     def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
-        self._reference, self._period = reference, control_period_s
+        self._reference = reference
+        self._period = control_period_s
         probe = self._reference.plan(np.random.default_rng(0), self._period)
         self.num_steps = probe.num_steps
         if not probe.scored.any():
             raise ConfigurationError(
-                f"the reference has no scored control step: its scored time is below the control period "
-                f"of {control_period_s} s; lengthen it"
+                "the reference has no scored control step: its scored time is below the control"
+                f" period of {control_period_s} s; lengthen it"
             )
         self._is_shared = not reference.is_random
-        self.plan_of_world = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
+        self.plan_of_world = (
+            np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
+        )
         self.motion = np.tile(_stacked(probe), (1 if self._is_shared else num_worlds, 1, 1, 1))
         self.scored = probe.scored
         self.rest = probe.rest

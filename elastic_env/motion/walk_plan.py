@@ -1,7 +1,8 @@
-"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles at every control step.
+"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles at every control
+step.
 
-The pelvis stays level at one height and moves so that the center of mass of the whole robot, not the pelvis, follows
-the preview control.
+The pelvis stays level at one height and moves so that the center of mass of the whole robot, not
+the pelvis, follows the preview control.
 """
 
 from dataclasses import dataclass, replace
@@ -25,9 +26,11 @@ _MAX_ITERATIONS = 50
 
 @dataclass(frozen=True, eq=False)
 class WalkPlan:
-    """A walk in place, one row per control step, row k at the end of control period k, row 0 the start.
+    """A walk in place, one row per control step, row k at the end of control period k, row 0 the
+    start.
 
-    Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway between the feet.
+    Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway
+    between the feet.
 
     Attributes:
         gait: What was planned.
@@ -41,7 +44,8 @@ class WalkPlan:
         pelvis: Position of the level pelvis, (T, 3) [m].
         ankles: Left and right ankle, (T, 2, 3) [m].
         share: Share μ of the weight on the right foot, (T,).
-        torque: Joint torques of the motion by inverse dynamics, the contact force shared by μ, (T, 12) [N·m].
+        torque: Joint torques of the motion by inverse dynamics, the contact force shared by μ, (T,
+            12) [N·m].
     """
 
     gait: Gait
@@ -88,7 +92,9 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     ankles = _ankle_paths(gait, timing, biped)
     zmp = zmp_reference(gait, timing, biped.footholds)
     standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
-    preview = PreviewConfig(com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity)
+    preview = PreviewConfig(
+        com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity
+    )
     motion = follow_zmp(preview, zmp, zmp[0])
     pelvis = _pelvis_under(motion.com, np.tile(standing, (len(zmp), 1)), biped, ankles, timing.time)
     q = _angles(biped, pelvis, ankles, timing.time)
@@ -97,13 +103,28 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     share = load_share(zmp, support_points(gait, biped.footholds))
     torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
-        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height, biped.gravity,
-        pelvis, ankles, share, torque,
-    )  # fmt: skip
+        gait,
+        timing,
+        q,
+        q_dot,
+        q_ddot,
+        zmp,
+        dynamics.zmp,
+        motion.com,
+        motion.com_dot,
+        com_height,
+        biped.gravity,
+        pelvis,
+        ankles,
+        share,
+        torque,
+    )
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
-    """The same motion with the torques, and the ZMP, that it has on another robot of the same size."""
+    """The same motion with the torques, and the ZMP, that it has on another robot of the same
+    size.
+    """
     dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
     torque = _joint_torque(biped, plan.ankles, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
@@ -113,26 +134,46 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
     """A plan that the robot cannot follow is an error now, not a fall later.
 
     Raises:
-        ConfigurationError: A joint leaves its range or needs more speed or torque than its servo has.
+        ConfigurationError: A joint leaves its range or needs more speed or torque than its servo
+            has.
     """
     joints = [biped.rigid.joint(name) for name in biped.joint_names]
     low, high = np.array([joint.range for joint in joints]).T
     _require(plan, biped, -plan.q, -low, "an angle of at least", "rad", sign=-1.0)
     _require(plan, biped, plan.q, high, "an angle of at most", "rad")
-    _require(plan, biped, np.abs(plan.q_dot), np.array([s.speed_limit for s in servos]), "a speed of at most", "rad/s")
-    _require(plan, biped, np.abs(plan.torque), np.array([s.torque_limit for s in servos]), "at most", "N·m")
+    _require(
+        plan,
+        biped,
+        np.abs(plan.q_dot),
+        np.array([s.speed_limit for s in servos]),
+        "a speed of at most",
+        "rad/s",
+    )
+    _require(
+        plan,
+        biped,
+        np.abs(plan.torque),
+        np.array([s.torque_limit for s in servos]),
+        "at most",
+        "N·m",
+    )
 
 
 def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
-    """First and second derivative of samples, time first, by central differences; zero at the ends, where it stands."""
-    first, second = np.zeros_like(samples), np.zeros_like(samples)
+    """First and second derivative of samples, time first, by central differences; zero at the
+    ends, where it stands.
+    """
+    first = np.zeros_like(samples)
+    second = np.zeros_like(samples)
     first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
     second[1:-1] = (samples[2:] - 2.0 * samples[1:-1] + samples[:-2]) / period_s**2
     return first, second
 
 
 def swing_height(progress: Array) -> Array:
-    """Height of the swing foot over its lift, 64 s³ (1 − s)³: no speed and no acceleration at both ends."""
+    """Height of the swing foot over its lift, 64 s³ (1 − s)³: no speed and no acceleration at
+    both ends.
+    """
     return 64.0 * (progress * (1.0 - progress)) ** 3
 
 
@@ -149,13 +190,18 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Arra
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
-    com = pelvis + biped.chains.center_of_mass(_angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1))
+    com = pelvis + biped.chains.center_of_mass(
+        _angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1)
+    )
     return pelvis[0], float(com[0, 2])
 
 
 def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: Array) -> Array:
-    """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag behind a little."""
-    pelvis, error = np.array(start), np.full(1, np.inf)
+    """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag
+    behind a little.
+    """
+    pelvis = np.array(start)
+    error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
         q = _angles(biped, pelvis, ankles, time)
         error = pelvis[:, :2] + biped.chains.center_of_mass(q.reshape(len(q), 2, -1))[:, :2] - com
@@ -163,8 +209,8 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: A
         if np.abs(error).max() < _COM_TOLERANCE_M:
             return pelvis
     raise ElasticError(
-        f"no pelvis position brings the center of mass within {_COM_TOLERANCE_M} m of its reference; "
-        f"{np.abs(error).max():.3g} m are left after {_MAX_ITERATIONS} iterations"
+        f"no pelvis position brings the center of mass within {_COM_TOLERANCE_M} m of its"
+        f" reference; {np.abs(error).max():.3g} m are left after {_MAX_ITERATIONS} iterations"
     )
 
 
@@ -172,25 +218,32 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
     try:
         return biped.joint_angles(pelvis, ankles)
     except ElasticError:
-        from_hip, reach = ankles - pelvis[:, None] - biped.hips, biped.leg.reach
+        from_hip = ankles - pelvis[:, None] - biped.hips
+        reach = biped.leg.reach
         distance = np.linalg.norm(from_hip, axis=-1)
         row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
         x, y, z = from_hip[row, leg]
         vertical = "lift_m" if z > 0.0 else "hip_height_m"
         # what would bring the foot into reach if its part of the distance were gone
-        helps = [n for n, left in ((vertical, np.hypot(x, y)), ("hip_half_spacing", np.hypot(x, z))) if left < reach]
+        helps = [
+            n
+            for n, left in ((vertical, np.hypot(x, y)), ("hip_half_spacing", np.hypot(x, z)))
+            if left < reach
+        ]
         excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
         decimals = max(4, -int(np.floor(np.log10(excess))))
         raise ConfigurationError(
-            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s: "
-            f"{distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m; lower "
-            f"{' or '.join(helps or [vertical])}"
+            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s:"
+            f" {distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m;"
+            f" lower {' or '.join(helps or [vertical])}"
         ) from None
 
 
 @dataclass(frozen=True)
 class _Dynamics:
-    """What a motion needs of the ground, (T, ...): force, its ZMP, its moment about the vertical; and of the joints."""
+    """What a motion needs of the ground, (T, ...): force, its ZMP, its moment about the
+    vertical; and of the joints.
+    """
 
     force: Array
     zmp: Array
@@ -204,7 +257,8 @@ def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynami
     pelvis_dot, pelvis_ddot = derivatives(pelvis, period_s)
     q_dot, q_ddot = derivatives(q, period_s)
     wrench, torque = body.inverse_dynamics(q, pelvis_dot, q_dot, pelvis_ddot, q_ddot)
-    force, moment = wrench[:, :3], wrench[:, 3:]
+    force = wrench[:, :3]
+    moment = wrench[:, 3:]
     # the moment of the ground's force about the pelvis has no horizontal part about the ZMP
     height = -pelvis[:, 2]
     x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
@@ -213,7 +267,9 @@ def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynami
     return _Dynamics(force, np.stack([x, y], axis=-1) + pelvis[:, :2], about_zmp, torque)
 
 
-def _joint_torque(biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, share: Array) -> Array:
+def _joint_torque(
+    biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, share: Array
+) -> Array:
     """Joint torques, the ground's force shared between the feet, (T, 12) [N·m]."""
     weights = shares(share)
     points = np.zeros((len(q), 2, 3))
@@ -229,13 +285,20 @@ def _joint_torque(biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, sh
 
 
 def _require(
-    plan: WalkPlan, biped: Biped, values: Array, bound: Array, what: str, unit: str, sign: float = 1.0
+    plan: WalkPlan,
+    biped: Biped,
+    values: Array,
+    bound: Array,
+    what: str,
+    unit: str,
+    sign: float = 1.0,
 ) -> None:
     excess = values - bound
     row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
     if excess[row, joint] > 0.0:
         raise ConfigurationError(
-            f"the walk asks too much of joint {biped.joint_names[joint]!r} at {plan.timing.time[row]:.3f} s: it allows "
-            f"{what} {sign * bound[joint]:.3f} {unit}, the plan needs {sign * values[row, joint]:.3f} {unit}; "
-            "use longer durations, a lower lift or another hip height"
+            f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
+            f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * bound[joint]:.3f} {unit},"
+            f" the plan needs {sign * values[row, joint]:.3f} {unit}; use longer durations, a lower"
+            " lift or another hip height"
         )

@@ -1,1 +1,3 @@
-"""Pictures in which one sees deviations of milliradians: they are drawn larger, by a factor that the picture shows."""
+"""Pictures in which one sees deviations of milliradians: they are drawn larger, by a factor that
+the picture shows.
+"""

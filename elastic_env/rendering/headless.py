@@ -14,7 +14,9 @@ CURE = (
 
 
 def prefer_egl() -> None:
-    """Let MuJoCo draw through EGL where there is no display and EGL is installed; to be called before its import."""
+    """Let MuJoCo draw through EGL where there is no display and EGL is installed; to be called
+    before its import.
+    """
     has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
     if sys.platform == "linux" and not has_display and _VARIABLE not in os.environ and _has_egl():
         os.environ[_VARIABLE] = "egl"

@@ -1,4 +1,6 @@
-"""What all pictures share: a MuJoCo model that is only drawn, as an image with a caption or in a window."""
+"""What all pictures share: a MuJoCo model that is only drawn, as an image with a caption or in a
+window.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -79,7 +81,8 @@ class ModelPicture(ABC):
         caption = self._update(signals, 0)
         if self._viewer is None:
             self._viewer = _window(self._model, self._data)
-        corner, large = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtFontScale.mjFONTSCALE_150
+        corner = mujoco.mjtGridPos.mjGRID_TOPLEFT
+        large = mujoco.mjtFontScale.mjFONTSCALE_150
         self._viewer.set_texts([(large, corner, "\n".join(caption), "")])
         self._viewer.sync()
 
@@ -100,16 +103,25 @@ class ModelPicture(ABC):
 
 
 def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
-    """Size of the images [pixels], a light background, and soft light from the side of the camera."""
+    """Size of the images [pixels], a light background, and soft light from the side of the
+    camera.
+    """
     spec.compiler.degree = False
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.15] * 3
+    spec.visual.global_.offwidth = width
+    spec.visual.global_.offheight = height
+    spec.visual.headlight.ambient = [0.5] * 3
+    spec.visual.headlight.diffuse = [0.15] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.rgba.haze = [*_BACKGROUND, 1.0]
     spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=_BACKGROUND, rgb2=_BACKGROUND, width=64, height=64,
-    )  # fmt: skip
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=_BACKGROUND,
+        rgb2=_BACKGROUND,
+        width=64,
+        height=64,
+    )
 
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
@@ -119,7 +131,9 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     except (ImportError, RuntimeError) as error:
         raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
     if not glfw.init():  # the viewer itself would end the process
-        raise ElasticError(f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}")
+        raise ElasticError(
+            f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}"
+        )
     viewer = viewers.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     viewer.cam.fixedcamid = model.camera(CAMERA).id
@@ -152,6 +166,11 @@ def with_text(image: Image, lines: list[str], legend: Legend = ()) -> Image:
         draw.text((_MARGIN, 10 + row * 1.25 * size), line, fill=_TEXT_RGB, font=font)
     x = float(_MARGIN)
     for word, rgba in legend:
-        draw.text((x, picture.height - 1.6 * size), word, fill=tuple(round(255 * c) for c in rgba[:3]), font=font)
+        draw.text(
+            (x, picture.height - 1.6 * size),
+            word,
+            fill=tuple(round(255 * c) for c in rgba[:3]),
+            font=font,
+        )
         x += draw.textlength(word, font=font) + size
     return np.asarray(picture)

@@ -1,4 +1,6 @@
-"""A robot that sags, in views side by side: deviations from a translucent reference are enlarged."""
+"""A robot that sags, in views side by side: deviations from a translucent reference are
+enlarged.
+"""
 
 from collections.abc import Sequence
 
@@ -11,20 +13,24 @@ from elastic_env.rendering.simple_bodies import add_simple_bodies
 
 ENLARGED = 8.0
 """Factor by which deviations are drawn."""
-_REFERENCE, _REFERENCE_RGBA, _LINK_RGBA = "reference_", (0.3, 0.7, 0.45, 0.3), (1.0, 0.72, 0.42, 1.0)
+_REFERENCE = "reference_"
+_REFERENCE_RGBA = (0.3, 0.7, 0.45, 0.3)
+_LINK_RGBA = (1.0, 0.72, 0.42, 1.0)
 
 
 class SagViews:
     """A robot and its translucent reference.
 
     Args:
-        spec: The robot's bodies, which are drawn in one colour. Without any shape, rods between the joints are.
+        spec: The robot's bodies, which are drawn in one colour. Without any shape, rods between the
+            joints are.
         joints: Hinges, in the order of all arrays.
         pixels: Width and height of a view.
     """
 
     def __init__(self, spec: mujoco.MjSpec, joints: Sequence[str], pixels: int) -> None:
-        shown, reference = _painted(spec, _LINK_RGBA), _painted(spec, _REFERENCE_RGBA)
+        shown = _painted(spec, _LINK_RGBA)
+        reference = _painted(spec, _REFERENCE_RGBA)
         set_stage(shown, pixels, pixels)
         shown.visual.headlight.diffuse = [0.45] * 3
         shown.attach(reference, prefix=_REFERENCE, frame=shown.worldbody.add_frame())
@@ -41,12 +47,14 @@ class SagViews:
         Raises:
             ElasticError: The machine cannot draw.
         """
-        data, views = mujoco.MjData(self._model), []
+        data = mujoco.MjData(self._model)
+        views = []
         with renderer(self._model) as renders:
             for wanted, q in zip(q_ref, links, strict=True):
                 enlarged = wanted + ENLARGED * (q - wanted)
                 for name, angle, reference in zip(self._joints, enlarged, wanted, strict=True):
-                    data.joint(name).qpos, data.joint(_REFERENCE + name).qpos = angle, reference
+                    data.joint(name).qpos = angle
+                    data.joint(_REFERENCE + name).qpos = reference
                 mujoco.mj_forward(self._model, data)
                 renders.update_scene(data, camera=_camera(self._model, data))
                 views.append(renders.render().copy())
@@ -61,16 +69,19 @@ def _painted(spec: mujoco.MjSpec, rgba: Sequence[float]) -> mujoco.MjSpec:
     if not copy.geoms:
         add_simple_bodies(copy)
     for geom in copy.geoms:
-        geom.rgba, geom.material = rgba, ""
+        geom.rgba = rgba
+        geom.material = ""
     return copy
 
 
 def _camera(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjvCamera:
     """A view from the side that holds the whole robot."""
     radius = model.geom_rbound[:, None]
-    low, high = (data.geom_xpos - radius).min(axis=0), (data.geom_xpos + radius).max(axis=0)
+    low = (data.geom_xpos - radius).min(axis=0)
+    high = (data.geom_xpos + radius).max(axis=0)
     camera = mujoco.MjvCamera()
     camera.lookat[:] = (low + high) / 2.0
     camera.distance = 1.15 * float(np.linalg.norm(high - low))
-    camera.azimuth, camera.elevation = 125.0, -15.0
+    camera.azimuth = 125.0
+    camera.elevation = -15.0
     return camera

@@ -1,8 +1,9 @@
-"""A robot three times side by side, reference, motor side and link side, deviations from the reference enlarged.
+"""A robot three times side by side, reference, motor side and link side, deviations from the
+reference enlarged.
 
-What is drawn of a joint stands at q_ref + factor · (x − q_ref), where x is the angle of the motor or of the link. A
-floating base deviates from its planned pose by factor times its true deviation. That of the motor side is the planned
-one, as an encoder does not see where the robot is.
+What is drawn of a joint stands at q_ref + factor · (x − q_ref), where x is the angle of the motor
+or of the link. A floating base deviates from its planned pose by factor times its true deviation.
+That of the motor side is the planned one, as an encoder does not see where the robot is.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,8 @@ from elastic_env.rendering.picture import Rgba, set_stage
 REFERENCE, MOTOR, LINK = COPIES = ("reference_", "motor_", "link_")
 """Prefixes of the names of the three robots, from left to right."""
 
-_REFERENCE_RGBA, _MOTOR_RGBA = (0.40, 0.72, 0.50, 1.0), (0.30, 0.50, 0.85, 1.0)
+_REFERENCE_RGBA = (0.40, 0.72, 0.50, 1.0)
+_MOTOR_RGBA = (0.30, 0.50, 0.85, 1.0)
 _SIZE = 720
 _ELEVATION_DEG = -15.0
 
@@ -48,7 +50,8 @@ class Sides:
 
     Attributes:
         q_ref, theta, q: Reference, motor side and link side, (n,) [rad].
-        base_ref, base: Planned and true pose of a floating base, position [m] and quaternion, (7,); empty without one.
+        base_ref, base: Planned and true pose of a floating base, position [m] and quaternion, (7,);
+            empty without one.
     """
 
     q_ref: Array
@@ -78,7 +81,8 @@ def enlarged_pose(planned: Array, true: Array, factor: float) -> Array:
         true: The same, in truth.
         factor: 0 gives the planned pose, 1 the true one.
     """
-    turn, quaternion = np.empty(3), planned[3:].copy()
+    turn = np.empty(3)
+    quaternion = planned[3:].copy()
     mujoco.mju_subQuat(turn, true[3:], planned[3:])
     mujoco.mju_quatIntegrate(quaternion, turn, factor)
     return np.concatenate([planned[:3] + factor * (true[:3] - planned[:3]), quaternion])
@@ -97,17 +101,27 @@ class SideBySide:
     def __init__(self, robot: Alone) -> None:
         spec = mujoco.MjSpec()
         set_stage(spec, _SIZE, _SIZE)
-        for name in ("cone", "impratio", "integrator"):  # as attaching wants them; nothing is stepped
+        for name in (
+            "cone",
+            "impratio",
+            "integrator",
+        ):  # as attaching wants them; nothing is stepped
             setattr(spec.option, name, getattr(robot.spec.option, name))
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         robot.dress(spec)
-        forward = np.cross([0.0, 0.0, 1.0], robot.right)  # where a viewer looks who sees them from left to right
+        forward = np.cross(
+            [0.0, 0.0, 1.0], robot.right
+        )  # where a viewer looks who sees them from left to right
         spec.visual.global_.azimuth = float(np.degrees(np.arctan2(forward[1], forward[0])))
         spec.visual.global_.elevation = _ELEVATION_DEG
-        self._offsets = {copy: (number - 1) * np.array(robot.right) for number, copy in enumerate(COPIES)}
+        self._offsets = {
+            copy: (number - 1) * np.array(robot.right) for number, copy in enumerate(COPIES)
+        }
         for copy, rgba in zip(COPIES, (_REFERENCE_RGBA, _MOTOR_RGBA, None), strict=True):
             spec.attach(
-                _painted(robot.spec, rgba), prefix=copy, frame=spec.worldbody.add_frame(pos=self._offsets[copy])
+                _painted(robot.spec, rgba),
+                prefix=copy,
+                frame=spec.worldbody.add_frame(pos=self._offsets[copy]),
             )
         self.model = spec.compile()
         self._robot = robot
@@ -134,5 +148,6 @@ class SideBySide:
 def _painted(spec: mujoco.MjSpec, rgba: Rgba | None) -> mujoco.MjSpec:
     copy = spec.copy()
     for geom in copy.geoms if rgba is not None else []:
-        geom.rgba, geom.material = rgba, ""
+        geom.rgba = rgba
+        geom.material = ""
     return copy

@@ -8,11 +8,13 @@ from elastic_env.core.signals import Array
 _RADIUS = 0.02
 """Of a rod, over the size of the robot."""
 _RGBA = (0.75, 0.76, 0.78, 1.0)
-_CAPSULE, _SPHERE = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
+_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+_SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 def add_simple_bodies(spec: mujoco.MjSpec) -> None:
-    """Draw every link without a shape by rods to its next links, or by a ball about its center of mass.
+    """Draw every link without a shape by rods to its next links, or by a ball about its center of
+    mass.
 
     Rods and balls have no mass and touch nothing.
 
@@ -22,7 +24,11 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
     model = spec.copy().compile()
     radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
     for body in [body for body in spec.bodies if not body.geoms]:
-        ends = [model.body_pos[c] for c in np.flatnonzero(model.body_parentid == body.id) if c != body.id]
+        ends = [
+            model.body_pos[c]
+            for c in np.flatnonzero(model.body_parentid == body.id)
+            if c != body.id
+        ]
         rods = [end for end in ends if np.linalg.norm(end) > radius]
         for end in rods:
             _add(body, _CAPSULE, radius, fromto=np.concatenate([np.zeros(3), end]))
@@ -31,4 +37,6 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
 
 
 def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, radius: float, **place: Array) -> None:
-    body.add_geom(type=kind, size=[radius, 0.0, 0.0], rgba=_RGBA, mass=0.0, contype=0, conaffinity=0, **place)  # pyright: ignore[reportArgumentType]
+    body.add_geom(
+        type=kind, size=[radius, 0.0, 0.0], rgba=_RGBA, mass=0.0, contype=0, conaffinity=0, **place
+    )  # pyright: ignore[reportArgumentType]

@@ -21,7 +21,8 @@ class Biped:
         leg: Lengths of thigh and shank.
         hips: Where the hip axes meet, left and right, in the pelvis frame, (2, 3) [m].
         ankle_height: Height of the ankle axes over the sole [m].
-        sole_half_size: Half length and half width of the soles, whose middles lie under the ankles [m].
+        sole_half_size: Half length and half width of the soles, whose middles lie under the ankles
+            [m].
     """
 
     rigid: mujoco.MjModel

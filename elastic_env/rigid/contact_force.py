@@ -1,12 +1,13 @@
-r"""How the ground's force is shared between the feet: Eqs. 5 and 6 of the paper, with the contact at the ZMP.
+r"""How the ground's force is shared between the feet: Eqs. 5 and 6 of the paper, with the contact
+at the ZMP.
 
-Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own, so that both together act
-at the ZMP:
+Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own, so
+that both together act at the ZMP:
 
 .. math:: c_i = p_i + r, \quad r = p_{ZMP} - \mu p_r - (1 - \mu) p_l
 
-with the middles p_i of the soles. That balances any force, horizontal components included, and is continuous where μ
-reaches 0 or 1, so that nothing jumps at lift-off and touch-down.
+with the middles p_i of the soles. That balances any force, horizontal components included, and is
+continuous where μ reaches 0 or 1, so that nothing jumps at lift-off and touch-down.
 """
 
 import numpy as np
@@ -15,7 +16,8 @@ from elastic_env.core.signals import Array
 
 
 def load_share(point: Array, feet: Array) -> Array:
-    r"""Eq. 6: share μ of the weight on the right foot, \mathrm{clip}((p - p_l)·(p_r - p_l)/‖p_r - p_l‖², 0, 1).
+    r"""Eq. 6: share μ of the weight on the right foot, \mathrm{clip}((p - p_l)·(p_r - p_l)/‖p_r -
+    p_l‖², 0, 1).
 
     Args:
         point: COM or ZMP in the ground plane, (..., 2) [m]; at rest they are the same.
@@ -24,7 +26,8 @@ def load_share(point: Array, feet: Array) -> Array:
     Returns:
         (...) in [0, 1].
     """
-    left, between = feet[..., 0, :], feet[..., 1, :] - feet[..., 0, :]
+    left = feet[..., 0, :]
+    between = feet[..., 1, :] - feet[..., 0, :]
     along = ((point - left) * between).sum(axis=-1) / (between**2).sum(axis=-1)
     return np.clip(along, 0.0, 1.0)
 
@@ -35,7 +38,9 @@ def shares(share_right: Array) -> Array:
 
 
 def contact_points(zmp: Array, share_right: Array, feet: Array) -> Array:
-    """Where each foot's force acts, (..., 2, 2) [m]; arguments as `load_share`, zmp (..., 2) [m]."""
+    """Where each foot's force acts, (..., 2, 2) [m]; arguments as `load_share`, zmp (..., 2)
+    [m].
+    """
     weights = shares(share_right)
     rest = zmp - (weights[..., None] * feet).sum(axis=-2)
     return feet + rest[..., None, :]

@@ -1,8 +1,8 @@
 """Rigid-body dynamics of a robot on a free base by Pinocchio, one posture after the other.
 
-The only file that imports pinocchio. The tests compare with it what MuJoCo or we compute of a model. Kinematic tree and
-inertias are taken from a compiled MuJoCo model in full precision (its XML output has six digits); the algorithms are
-Pinocchio's.
+The only file that imports pinocchio. The tests compare with it what MuJoCo or we compute of a
+model. Kinematic tree and inertias are taken from a compiled MuJoCo model in full precision (its XML
+output has six digits); the algorithms are Pinocchio's.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ from elastic_env.rigid.rigid_body import require_hinge_tree
 
 
 class FloatingBody:
-    """A robot whose base is free and level: translation of the base and its hinges, on (..., n) arrays.
+    """A robot whose base is free and level: translation of the base and its hinges, on (..., n)
+    arrays.
 
     Args:
         model: Compiled rigid model with one free joint, at its base.
@@ -28,15 +29,22 @@ class FloatingBody:
     """
 
     def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
-        free = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        free = [
+            model.joint(j).name
+            for j in range(model.njnt)
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
+        ]
         if len(free) != 1:
-            raise ConfigurationError(f"a floating robot needs one free joint, this model has {len(free)}")
+            raise ConfigurationError(
+                f"a floating robot needs one free joint, this model has {len(free)}"
+            )
         require_hinge_tree(model, joints, but=free)
         self._model = pinocchio_model(model)
         self._data = self._model.createData()
         base = self._model.joints[self._model.getJointId(free[0])]
         names = [self._model.joints[self._model.getJointId(joint)] for joint in joints]
-        self._base_q, self._base_v = base.idx_q, base.idx_v
+        self._base_q = base.idx_q
+        self._base_v = base.idx_v
         self._q = np.array([joint.idx_q for joint in names])
         self._zero = np.array([model.qpos0[model.joint(joint).qposadr[0]] for joint in joints])
         self._v = np.array([joint.idx_v for joint in names])
@@ -54,30 +62,43 @@ class FloatingBody:
             q_ddot: Accelerations of the hinges [rad/s²].
 
         Returns:
-            Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N, n) [N·m].
+            Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N,
+            n) [N·m].
         """
-        base_q, base_v = self._base_q, self._base_v
-        position, velocity, acceleration = np.zeros(self._model.nq), np.zeros(self._model.nv), np.zeros(self._model.nv)
+        base_q = self._base_q
+        base_v = self._base_v
+        position = np.zeros(self._model.nq)
+        velocity = np.zeros(self._model.nv)
+        acceleration = np.zeros(self._model.nv)
         position[base_q + 6] = 1.0  # the unit quaternion of a level base
-        wrench, torque = np.empty((len(q), 6)), np.empty(q.shape)
+        wrench = np.empty((len(q), 6))
+        torque = np.empty(q.shape)
         for i in range(len(q)):
             position[self._q] = q[i] - self._zero
-            velocity[base_v : base_v + 3], velocity[self._v] = base_dot[i], q_dot[i]
-            acceleration[base_v : base_v + 3], acceleration[self._v] = base_ddot[i], q_ddot[i]
+            velocity[base_v : base_v + 3] = base_dot[i]
+            velocity[self._v] = q_dot[i]
+            acceleration[base_v : base_v + 3] = base_ddot[i]
+            acceleration[self._v] = q_ddot[i]
             effort = pinocchio.rnea(self._model, self._data, position, velocity, acceleration)
-            wrench[i], torque[i] = effort[base_v : base_v + 6], effort[self._v]
+            wrench[i] = effort[base_v : base_v + 6]
+            torque[i] = effort[self._v]
         return wrench, torque
 
     def mass_matrix(self, q: Array) -> Array:
-        """Inertia of base translation, base rotation and hinges, (n,) [rad] to (6 + n, 6 + n) [kg], [kg·m], [kg·m²]."""
+        """Inertia of base translation, base rotation and hinges, (n,) [rad] to (6 + n, 6 + n)
+        [kg], [kg·m], [kg·m²].
+        """
         position = np.zeros(self._model.nq)
-        position[self._base_q + 6], position[self._q] = 1.0, q - self._zero
+        position[self._base_q + 6] = 1.0
+        position[self._q] = q - self._zero
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
         full = pinocchio.crba(self._model, self._data, position)
         return np.triu(full)[np.ix_(rows, rows)] + np.triu(full, 1).T[np.ix_(rows, rows)]
 
     def center_of_mass(self, q: Array) -> Array:
-        """Center of mass of the whole robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
+        """Center of mass of the whole robot in the frame of the base, (N, n) [rad] to (N, 3)
+        [m].
+        """
         position = np.zeros(self._model.nq)
         position[self._base_q + 6] = 1.0
         com = np.empty((len(q), 3))
@@ -100,16 +121,21 @@ def pinocchio_model(model: mujoco.MjModel) -> pinocchio.Model:
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
                 freeflyer = pinocchio.JointModelFreeFlyer()
-                carrier = tree.addJoint(carrier, freeflyer, pinocchio.SE3.Identity(), model.joint(j).name)
+                carrier = tree.addJoint(
+                    carrier, freeflyer, pinocchio.SE3.Identity(), model.joint(j).name
+                )
                 T = pinocchio.SE3.Identity()
                 continue
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())
             carrier = tree.addJoint(carrier, revolute, T * T_body_anchor, model.joint(j).name)
             T = T_body_anchor.inverse()
-        joint_of[b], T_joint_body[b] = carrier, T
+        joint_of[b] = carrier
+        T_joint_body[b] = T
         T_body_com = _placement(model.body_ipos[b], model.body_iquat[b])
-        inertia = pinocchio.Inertia(float(model.body_mass[b]), np.zeros(3), np.diag(model.body_inertia[b]))
+        inertia = pinocchio.Inertia(
+            float(model.body_mass[b]), np.zeros(3), np.diag(model.body_inertia[b])
+        )
         tree.appendBodyToJoint(carrier, inertia, T * T_body_com)
     return tree
 

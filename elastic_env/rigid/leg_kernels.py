@@ -1,10 +1,12 @@
-r"""Statics of legs, compiled, row by row over a batch; `elastic_env.rigid.leg_chains` has the formulas.
+r"""Statics of legs, compiled, row by row over a batch; `elastic_env.rigid.leg_chains` has the
+formulas.
 
-Every joint turns about a coordinate axis, so that taking a vector from link to link mixes two of its components. A row
-is one robot. What is needed of its legs on the way is kept in `Leg`, one leg after the other.
+Every joint turns about a coordinate axis, so that taking a vector from link to link mixes two of
+its components. A row is one robot. What is needed of its legs on the way is kept in `Leg`, one leg
+after the other.
 
-Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
-file, and every size comes from a type.
+Numba keeps compiled code by the file of the function that was called. So everything that a kernel
+calls stands in this file, and every size comes from a type.
 """
 
 import math
@@ -36,8 +38,8 @@ def legs_type(legs: int, joints: int) -> np.dtype[Any]:
 def loads_type(legs: int) -> np.dtype[Any]:
     """Row that says what loads the legs of a robot, see `elastic_env.rigid.leg_chains.LegLoads`.
 
-    Gravity [m/s²] in the pelvis frame, masses [kg] at points of the feet [m], forces and moments on the feet [N],
-    [N·m].
+    Gravity [m/s²] in the pelvis frame, masses [kg] at points of the feet [m], forces and moments on
+    the feet [N], [N·m].
     """
     return np.dtype(
         (
@@ -74,18 +76,24 @@ class Leg(NamedTuple):
     x: Array
 
 
-LEVER, FORCE, MOMENT = 0, 1, 2
+LEVER = 0
+FORCE = 1
+MOMENT = 2
 """What a joint carries: first moment of the masses, and a wrench."""
 
 
 @compiled
-def local_frames(legs: Any, q: Array, attitude: Array, point: Array, com: Array, feet: Array) -> None:
-    """Center of mass of the whole robot, and a point that is fixed in each foot, from the pelvis in a level frame.
+def local_frames(
+    legs: Any, q: Array, attitude: Array, point: Array, com: Array, feet: Array
+) -> None:
+    """Center of mass of the whole robot, and a point that is fixed in each foot, from the pelvis in
+    a level frame.
 
     Args:
         legs: Row of `legs_type`, (1,).
         q: Joint angles, (rows, L, J) [rad].
-        attitude: Roll and pitch of the pelvis, (rows, 2) [rad]; (0, 2) for a frame that is the pelvis'.
+        attitude: Roll and pitch of the pelvis, (rows, 2) [rad]; (0, 2) for a frame that is the
+            pelvis'.
         point: From the ankle, in the frame of the foot, (3,) [m].
         com: To be filled, (rows, 3) [m].
         feet: To be filled, (rows, L, 3) [m].
@@ -94,10 +102,14 @@ def local_frames(legs: Any, q: Array, attitude: Array, point: Array, com: Array,
     for row in range(len(q)):
         moment = (chain.fixed_moment[0], chain.fixed_moment[1], chain.fixed_moment[2])
         for leg in range(q.shape[1]):
-            own, foot = vector(chain.last_moment[leg]), vector(point)
+            own = vector(chain.last_moment[leg])
+            foot = vector(point)
             for j in range(q.shape[2] - 1, -1, -1):
-                axis, s, c = chain.axis[j], math.sin(q[row, leg, j]), math.cos(q[row, leg, j])
-                own, foot = into_parent(axis, s, c, own), into_parent(axis, s, c, foot)
+                axis = chain.axis[j]
+                s = math.sin(q[row, leg, j])
+                c = math.cos(q[row, leg, j])
+                own = into_parent(axis, s, c, own)
+                foot = into_parent(axis, s, c, foot)
                 if j > 0:
                     own = total(own, vector(chain.moment[leg, j - 1]))
                 foot = total(foot, vector(chain.offset[leg, j]))
@@ -113,19 +125,27 @@ def local_frames(legs: Any, q: Array, attitude: Array, point: Array, com: Array,
 
 @compiled
 def torques(legs: Any, loads: Any, q: Array, torque: Array) -> None:
-    """Joint torques that hold the legs, into `torque`, (rows, L, J) [N·m]; other arguments as in `solutions`."""
-    chain, leg_of_row = legs[0], leg_to_be_filled(q.shape[2])
+    """Joint torques that hold the legs, into `torque`, (rows, L, J) [N·m]; other arguments as in
+    `solutions`.
+    """
+    chain = legs[0]
+    leg_of_row = leg_to_be_filled(q.shape[2])
     for row in range(len(q)):
         for leg in range(q.shape[1]):
             carry(chain, loads[row], q[row, leg], leg, leg_of_row)
             for j in range(q.shape[2]):
-                torque[row, leg, j] = held_by(chain.axis[j], leg_of_row.carried[j], leg_of_row.gravity[j])
+                torque[row, leg, j] = held_by(
+                    chain.axis[j], leg_of_row.carried[j], leg_of_row.gravity[j]
+                )
 
 
 @compiled
 def gradients(legs: Any, loads: Any, q: Array, gradient: Array) -> None:
-    """∂τ/∂q of the legs, into `gradient`, (rows, L, J, J) [N·m/rad]; other arguments as in `solutions`."""
-    chain, leg_of_row = legs[0], leg_to_be_filled(q.shape[2])
+    """∂τ/∂q of the legs, into `gradient`, (rows, L, J, J) [N·m/rad]; other arguments as in
+    `solutions`.
+    """
+    chain = legs[0]
+    leg_of_row = leg_to_be_filled(q.shape[2])
     for row in range(len(q)):
         for leg in range(q.shape[1]):
             carry(chain, loads[row], q[row, leg], leg, leg_of_row)
@@ -146,14 +166,18 @@ def solutions(legs: Any, loads: Any, q: Array, stiffness: Array, torque: Array, 
         x: To be filled, (rows, L, J) [rad].
 
     Returns:
-        Whether all are below half a turn; a deflection beyond is none, and the matrix may be singular.
+        Whether all are below half a turn; a deflection beyond is none, and the matrix may be
+        singular.
     """
-    chain, leg_of_row, is_small = legs[0], leg_to_be_filled(q.shape[2]), True
+    chain = legs[0]
+    leg_of_row = leg_to_be_filled(q.shape[2])
+    is_small = True
     for row in range(len(q)):
         for leg in range(q.shape[1]):
             carry(chain, loads[row], q[row, leg], leg, leg_of_row)
             differentiate(chain, leg, leg_of_row)
-            A, b = leg_of_row.gradient, leg_of_row.x
+            A = leg_of_row.gradient
+            b = leg_of_row.x
             for i in range(len(b)):  # every row by its own stiffness
                 for k in range(len(b)):
                     A[i, k] /= stiffness[leg, i]
@@ -171,8 +195,11 @@ def solutions(legs: Any, loads: Any, q: Array, stiffness: Array, torque: Array, 
 
 
 @compiled
-def sole_tilts(axis: IntArray, q: Array, attitude: Array, bending: Array, seen: Array, expected: Array) -> None:
-    """Tilt of soles, roll and pitch, as motors and IMU see it, and what the bending of the joints adds to it.
+def sole_tilts(
+    axis: IntArray, q: Array, attitude: Array, bending: Array, seen: Array, expected: Array
+) -> None:
+    """Tilt of soles, roll and pitch, as motors and IMU see it, and what the bending of the joints
+    adds to it.
 
     Args:
         axis: Coordinate axis that each joint turns about, (J,).
@@ -189,57 +216,80 @@ def sole_tilts(axis: IntArray, q: Array, attitude: Array, bending: Array, seen: 
             normal = 0.0, 0.0, 1.0
             turns[:] = 0.0
             for j in range(q.shape[2] - 1, -1, -1):
-                s, c = math.sin(q[row, leg, j]), math.cos(q[row, leg, j])
+                s = math.sin(q[row, leg, j])
+                c = math.cos(q[row, leg, j])
                 normal = into_parent(axis[j], s, c, normal)
                 put(turns, into_parent(axis[j], s, c, vector(turns)))
                 turns[axis[j]] += bending[row, leg, j]
-            up, turn = times(R, normal), times(R, vector(turns))
-            seen[row, leg, 0], seen[row, leg, 1] = -up[1], up[0]
-            expected[row, leg, 0], expected[row, leg, 1] = turn[0], turn[1]
+            up = times(R, normal)
+            turn = times(R, vector(turns))
+            seen[row, leg, 0] = -up[1]
+            seen[row, leg, 1] = up[0]
+            expected[row, leg, 0] = turn[0]
+            expected[row, leg, 1] = turn[1]
 
 
 @compiled
 def tilt_rotations(attitude: Array, R: Array) -> None:
-    """Rotations about x by a roll, then about y by a pitch, (rows, 2) [rad]: into `R`, (rows, 3, 3)."""
+    """Rotations about x by a roll, then about y by a pitch, (rows, 2) [rad]: into `R`, (rows, 3,
+    3).
+    """
     for row in range(len(attitude)):
         found = rotation_of(attitude[row, 0], attitude[row, 1])
         for i in range(3):
-            R[row, i, 0], R[row, i, 1], R[row, i, 2] = found[3 * i], found[3 * i + 1], found[3 * i + 2]
+            R[row, i, 0] = found[3 * i]
+            R[row, i, 1] = found[3 * i + 1]
+            R[row, i, 2] = found[3 * i + 2]
 
 
 @compiled
 def leg_to_be_filled(joints: int) -> Leg:
     """Room for a leg."""
     return Leg(
-        np.empty(joints), np.empty(joints), np.empty((joints, 3)), np.empty((joints, 3, 3)),
-        np.empty((joints, 3, 3)), np.empty((joints, joints)), np.empty(joints),
-    )  # fmt: skip
+        np.empty(joints),
+        np.empty(joints),
+        np.empty((joints, 3)),
+        np.empty((joints, 3, 3)),
+        np.empty((joints, 3, 3)),
+        np.empty((joints, joints)),
+        np.empty(joints),
+    )
 
 
 @compiled
 def carry(chain: Any, load: Any, q: Array, leg: int, own: Leg) -> None:
-    """Sines, gravity from the hip to the foot, and what the joints carry from the foot to the hip."""
+    """Sines, gravity from the hip to the foot, and what the joints carry from the foot to the
+    hip.
+    """
     g = vector(load.gravity)
     for j in range(len(q)):
-        own.sine[j], own.cosine[j] = math.sin(q[j]), math.cos(q[j])
+        own.sine[j] = math.sin(q[j])
+        own.cosine[j] = math.cos(q[j])
         g = into_link(chain.axis[j], own.sine[j], own.cosine[j], g)
         put(own.gravity[j], g)
-    mass, point = load.mass[leg], vector(load.point[leg])
+    mass = load.mass[leg]
+    point = vector(load.point[leg])
     lever = mass * point[0], mass * point[1], mass * point[2]
-    force, moment = vector(load.wrench[leg, 0]), vector(load.wrench[leg, 1])
+    force = vector(load.wrench[leg, 0])
+    moment = vector(load.wrench[leg, 1])
     for j in range(len(q) - 1, -1, -1):
         if load.legs_weigh:
             lever = total(lever, vector(chain.moment[leg, j]))
         put(own.carried[j, LEVER], lever)
         put(own.carried[j, FORCE], force)
         put(own.carried[j, MOMENT], moment)
-        axis, s, c, offset = chain.axis[j], own.sine[j], own.cosine[j], vector(chain.offset[leg, j])
-        lever, force, moment = (
-            into_parent(axis, s, c, lever),
-            into_parent(axis, s, c, force),
-            into_parent(axis, s, c, moment),
+        axis = chain.axis[j]
+        s = own.sine[j]
+        c = own.cosine[j]
+        offset = vector(chain.offset[leg, j])
+        lever = into_parent(axis, s, c, lever)
+        force = into_parent(axis, s, c, force)
+        moment = into_parent(axis, s, c, moment)
+        lever = (
+            lever[0] + mass * offset[0],
+            lever[1] + mass * offset[1],
+            lever[2] + mass * offset[2],
         )
-        lever = lever[0] + mass * offset[0], lever[1] + mass * offset[1], lever[2] + mass * offset[2]
         moment = total(moment, cross(offset, force))
 
 
@@ -253,29 +303,45 @@ def held_by(axis: int, carried: Array, gravity: Array) -> float:
 
 @compiled
 def differentiate(chain: Any, leg: int, own: Leg) -> None:
-    """Gradient of a leg that carries its load: weights keep their direction, wrenches turn with the foot."""
-    changes, gradient, n = own.changes, own.gradient, len(own.sine)
+    """Gradient of a leg that carries its load: weights keep their direction, wrenches turn with
+    the foot.
+    """
+    changes = own.changes
+    gradient = own.gradient
+    n = len(own.sine)
     for j in range(n - 1, -1, -1):
         axis = chain.axis[j]
         first, second = others(axis)
-        lever, force, moment, g = own.carried[j, LEVER], own.carried[j, FORCE], own.carried[j, MOMENT], own.gravity[j]
-        changes[j, LEVER, first], changes[j, LEVER, second] = lever[first] * g[axis], lever[second] * g[axis]
+        lever = own.carried[j, LEVER]
+        force = own.carried[j, FORCE]
+        moment = own.carried[j, MOMENT]
+        g = own.gravity[j]
+        changes[j, LEVER, first] = lever[first] * g[axis]
+        changes[j, LEVER, second] = lever[second] * g[axis]
         changes[j, LEVER, axis] = -(lever[first] * g[first] + lever[second] * g[second])
-        changes[j, FORCE, first], changes[j, FORCE, second], changes[j, FORCE, axis] = -force[second], force[first], 0.0
-        changes[j, MOMENT, first], changes[j, MOMENT, second] = -moment[second], moment[first]
+        changes[j, FORCE, first] = -force[second]
+        changes[j, FORCE, second] = force[first]
+        changes[j, FORCE, axis] = 0.0
+        changes[j, MOMENT, first] = -moment[second]
+        changes[j, MOMENT, second] = moment[first]
         changes[j, MOMENT, axis] = 0.0
         gradient[j, j] = -changes[j, LEVER, axis]
         for k in range(j + 1, n):
             gradient[k, j] = -changes[k, LEVER, axis]
             gradient[j, k] = gradient[k, j] - changes[k, MOMENT, axis]
         if j > 0:
-            s, c, offset = own.sine[j], own.cosine[j], vector(chain.offset[leg, j])
+            s = own.sine[j]
+            c = own.cosine[j]
+            offset = vector(chain.offset[leg, j])
             for k in range(j, n):
                 change = changes[k]
                 moved = into_parent(axis, s, c, vector(change[FORCE]))
                 put(change[LEVER], into_parent(axis, s, c, vector(change[LEVER])))
                 put(change[FORCE], moved)
-                put(change[MOMENT], total(into_parent(axis, s, c, vector(change[MOMENT])), cross(offset, moved)))
+                put(
+                    change[MOMENT],
+                    total(into_parent(axis, s, c, vector(change[MOMENT])), cross(offset, moved)),
+                )
 
 
 @compiled
@@ -303,26 +369,37 @@ def solve(A: Array, b: Array) -> None:
 
 
 @compiled
-def rotation_of(roll: float, pitch: float) -> tuple[float, float, float, float, float, float, float, float, float]:
+def rotation_of(
+    roll: float, pitch: float
+) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Rotation about x by a roll, then about y by a pitch, row after row."""
-    sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
+    sr = math.sin(roll)
+    cr = math.cos(roll)
+    sp = math.sin(pitch)
+    cp = math.cos(pitch)
     return cp, sp * sr, sp * cr, 0.0, cr, -sr, -sp, cp * sr, cp * cr
 
 
 @compiled
 def others(axis: int) -> tuple[int, int]:
-    """The axes into which the others turn: a rotation about the axis turns the first towards the second."""
+    """The axes into which the others turn: a rotation about the axis turns the first towards the
+    second.
+    """
     return (axis + 1) % 3, (axis + 2) % 3
 
 
 @compiled
-def into_link(axis: int, s: float, c: float, v: tuple[float, float, float]) -> tuple[float, float, float]:
+def into_link(
+    axis: int, s: float, c: float, v: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """A vector of the link before a joint in the frame of the link behind it."""
     return into_parent(axis, -s, c, v)
 
 
 @compiled
-def into_parent(axis: int, s: float, c: float, v: tuple[float, float, float]) -> tuple[float, float, float]:
+def into_parent(
+    axis: int, s: float, c: float, v: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """A vector of the link behind a joint in the frame of the link before it."""
     if axis == 0:
         return v[0], c * v[1] - s * v[2], s * v[1] + c * v[2]
@@ -342,13 +419,17 @@ def times(A: Any, v: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 @compiled
-def cross(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+def cross(
+    a: tuple[float, float, float], b: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """A × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
-def total(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+def total(
+    a: tuple[float, float, float], b: tuple[float, float, float]
+) -> tuple[float, float, float]:
     """A + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 

@@ -1,7 +1,8 @@
 r"""Closed-form kinematics of a leg with six hinges: hip yaw, roll, pitch, knee, ankle pitch, roll.
 
-The three hip axes meet in a point, the two ankle axes in another; all link frames are parallel to the pelvis at zero
-angles, axes +z (yaw), +x (roll), +y (pitch), so that the foot's orientation in the pelvis is
+The three hip axes meet in a point, the two ankle axes in another; all link frames are parallel to
+the pelvis at zero angles, axes +z (yaw), +x (roll), +y (pitch), so that the foot's orientation in
+the pelvis is
 
 .. math:: R = R_z(q_1) R_x(q_2) R_y(q_3) R_y(q_4) R_y(q_5) R_x(q_6)
 
@@ -34,7 +35,8 @@ class LegGeometry:
 
 
 def foot_pose(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
-    """Forward kinematics: ankle relative to the hip, and orientation of the foot, in the pelvis frame.
+    """Forward kinematics: ankle relative to the hip, and orientation of the foot, in the pelvis
+    frame.
 
     Args:
         leg: Lengths.
@@ -51,7 +53,8 @@ def foot_pose(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
 
 
 def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
-    """Inverse kinematics: joint angles that place the foot, with the knee bent backwards and the hip above the sole.
+    """Inverse kinematics: joint angles that place the foot, with the knee bent backwards and the
+    hip above the sole.
 
     Args:
         leg: Lengths.
@@ -67,11 +70,14 @@ def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
     hip = -np.einsum("...ji,...j->...i", R, position)  # hip from the ankle, in the foot frame
     distance = np.linalg.norm(hip, axis=-1)
     _require_reach(leg, distance)
-    A, B = leg.thigh, leg.shank
+    A = leg.thigh
+    B = leg.shank
     knee = np.arccos(np.clip((distance**2 - A**2 - B**2) / (2.0 * A * B), -1.0, 1.0))
     ankle_roll = np.arctan2(hip[..., 1], hip[..., 2])
     in_plane = np.hypot(hip[..., 1], hip[..., 2])
-    ankle_pitch = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee)) - np.arctan2(hip[..., 0], in_plane)
+    ankle_pitch = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee)) - np.arctan2(
+        hip[..., 0], in_plane
+    )
     M = R @ rotation_x(-ankle_roll) @ rotation_y(-ankle_pitch - knee)  # Rz Rx Ry of the hip
     yaw = np.arctan2(-M[..., 0, 1], M[..., 1, 1])
     roll = np.arctan2(M[..., 2, 1], np.hypot(M[..., 2, 0], M[..., 2, 2]))
@@ -120,6 +126,7 @@ def _require_reach(leg: LegGeometry, distance: Array) -> None:
     if outside.size:
         worst = int(outside[0])
         raise ElasticError(
-            f"foot target {worst} is {distance.ravel()[worst]:.4f} m from the hip, out of reach of a leg of "
-            f"{leg.thigh} m + {leg.shank} m ({nearest:.4f} to {leg.reach:.4f} m); lower the hip or shorten the step"
+            f"foot target {worst} is {distance.ravel()[worst]:.4f} m from the hip, out of reach of"
+            f" a leg of {leg.thigh} m + {leg.shank} m ({nearest:.4f} to {leg.reach:.4f} m); lower"
+            " the hip or shorten the step"
         )

@@ -40,29 +40,43 @@ class RigidBody:
         self._gravity = model.opt.gravity.copy()
         self._n = len(joints)
         self._lanes: Any = np.zeros(len(self._links), kernels.LANES)
-        compile_now(self._compile, np.zeros((1, len(joints))))  # the first command of a live robot cannot wait
+        compile_now(
+            self._compile, np.zeros((1, len(joints)))
+        )  # the first command of a live robot cannot wait
 
     def gravity_torque(self, q: Array) -> Array:
         """τ_g that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
-        rows, torque = self._rows(q), np.empty(q.shape)
-        kernels.gravity_torques(self._links, self._gravity, rows, self._lanes, torque.reshape(rows.shape))
+        rows = self._rows(q)
+        torque = np.empty(q.shape)
+        kernels.gravity_torques(
+            self._links, self._gravity, rows, self._lanes, torque.reshape(rows.shape)
+        )
         return torque
 
     def gravity_gradient(self, q: Array) -> Array:
         """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
-        rows, n = self._rows(q), self._n
+        rows = self._rows(q)
+        n = self._n
         gradient = np.zeros((*q.shape, n))
-        kernels.gravity_gradients(self._links, self._gravity, rows, self._lanes, gradient.reshape(len(rows), n, n))
+        kernels.gravity_gradients(
+            self._links, self._gravity, rows, self._lanes, gradient.reshape(len(rows), n, n)
+        )
         return gradient
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
-        """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (..., n) [N·m]."""
+        """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (...,
+        n) [N·m].
+        """
         if not q.shape == q_dot.shape == q_ddot.shape:
             raise ElasticError(
-                f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape} and {q_ddot.shape}"
+                f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape}"
+                f" and {q_ddot.shape}"
             )
-        motion, torque = (self._rows(q), self._rows(q_dot), self._rows(q_ddot)), np.empty(q.shape)
-        kernels.inverse_dynamics(self._links, self._gravity, motion, self._lanes, torque.reshape(motion[0].shape))
+        motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
+        torque = np.empty(q.shape)
+        kernels.inverse_dynamics(
+            self._links, self._gravity, motion, self._lanes, torque.reshape(motion[0].shape)
+        )
         return torque
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
@@ -79,7 +93,10 @@ class RigidBody:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
         if values.shape[-1:] != (self._n,):
             # compiled code reads where nothing is, without a word
-            raise ElasticError(f"one value per joint is needed, (..., {self._n}), got an array of shape {values.shape}")
+            raise ElasticError(
+                f"one value per joint is needed, (..., {self._n}), got an array of shape"
+                f" {values.shape}"
+            )
         return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, self._n)
 
     def _compile(self, zero: Array) -> None:
@@ -88,8 +105,11 @@ class RigidBody:
         self.inverse_dynamics(zero, zero, zero)
 
 
-def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()) -> None:
-    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints by name or number.
+def require_hinge_tree(
+    model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()
+) -> None:
+    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints by
+    name or number.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
@@ -99,9 +119,12 @@ def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequen
     names = list(kinds)
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; trees of hinges are needed")
+            raise ConfigurationError(
+                f"joint {name!r} of the rigid model is no hinge; trees of hinges are needed"
+            )
     require_known("joint of the rigid model", joints, names)
     if sorted(joints) != sorted(names):
         raise ConfigurationError(
-            f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}: {', '.join(joints)}"
+            f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}:"
+            f" {', '.join(joints)}"
         )

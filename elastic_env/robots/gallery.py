@@ -3,9 +3,10 @@
     spec = gallery_robot("panda")
     model = make_elastic(spec, gallery_joints("panda")).compile()
 
-The arms are those of the package `example-robot-data` (extra `robots`); the pusher comes with Gymnasium. Slides, such
-as fingers of grippers, are held where the model has them. Nobody publishes stiffness, damping and rotor inertia of
-these joints in a form that we could check. They are therefore assumed, by the rule of `assumed_joints`.
+The arms are those of the package `example-robot-data` (extra `robots`); the pusher comes with
+Gymnasium. Slides, such as fingers of grippers, are held where the model has them. Nobody publishes
+stiffness, damping and rotor inertia of these joints in a form that we could check. They are
+therefore assumed, by the rule of `assumed_joints`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,14 +29,29 @@ from elastic_env.rigid.tree.torque import TreeTorque
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
 SAG_RAD = 0.015
-"""Deflection of a joint under the largest torque of its robot's weight, which the assumed stiffness gives."""
-_PACKAGE, _SHARE = "example-robot-data", "cmeel.prefix/share/example-robot-data/robots"
-_WEAKEST, _SLOWEST = 0.05, 2.0 * np.pi * 5.0
-"""Least stiffness of a joint: over that which the largest torque asks for, and by its frequency [rad/s]."""
-_ROTOR, _LIGHTEST, _DAMPING_RATIO, _SERVO_RATE = 0.5, 0.01, 0.1, 20.0
-"""Rotor inertia over that of the joint's links, least one over the largest; damping ratio; servo's rate [rad/s]."""
-_POSES, _INNER, _FARTHEST = 50, 0.8, np.pi
-"""Number of random poses, the part of a joint's range that they use, and their largest angle [rad]."""
+"""Deflection of a joint under the largest torque of its robot's weight, which the assumed
+stiffness gives.
+"""
+_PACKAGE = "example-robot-data"
+_SHARE = "cmeel.prefix/share/example-robot-data/robots"
+_WEAKEST = 0.05
+_SLOWEST = 2.0 * np.pi * 5.0
+"""Least stiffness of a joint: over that which the largest torque asks for, and by its frequency
+[rad/s].
+"""
+_ROTOR = 0.5
+_LIGHTEST = 0.01
+_DAMPING_RATIO = 0.1
+_SERVO_RATE = 20.0
+"""Rotor inertia over that of the joint's links, least one over the largest; damping ratio;
+servo's rate [rad/s].
+"""
+_POSES = 50
+_INNER = 0.8
+_FARTHEST = np.pi
+"""Number of random poses, the part of a joint's range that they use, and their largest angle
+[rad].
+"""
 
 
 @dataclass(frozen=True)
@@ -62,45 +78,85 @@ class GalleryRobot:
 _UR_HOME = {"shoulder_lift_joint": -0.9, "elbow_joint": 1.1, "wrist_1_joint": -0.4}
 GALLERY: Mapping[str, GalleryRobot] = {
     "panda": GalleryRobot(
-        "Franka Panda", "panda_description/urdf/panda.urdf", "panda_hand_tcp",
-        {"panda_joint2": 0.3, "panda_joint4": -1.6, "panda_joint6": 1.9}, "Apache-2.0",
+        "Franka Panda",
+        "panda_description/urdf/panda.urdf",
+        "panda_hand_tcp",
+        {"panda_joint2": 0.3, "panda_joint4": -1.6, "panda_joint6": 1.9},
+        "Apache-2.0",
     ),
-    "ur3": GalleryRobot("Universal Robots UR3", "ur_description/urdf/ur3_robot.urdf", "tool0", _UR_HOME),
-    "ur5": GalleryRobot("Universal Robots UR5", "ur_description/urdf/ur5_robot.urdf", "tool0", _UR_HOME),
-    "ur10": GalleryRobot("Universal Robots UR10", "ur_description/urdf/ur10_robot.urdf", "tool0", _UR_HOME),
+    "ur3": GalleryRobot(
+        "Universal Robots UR3", "ur_description/urdf/ur3_robot.urdf", "tool0", _UR_HOME
+    ),
+    "ur5": GalleryRobot(
+        "Universal Robots UR5", "ur_description/urdf/ur5_robot.urdf", "tool0", _UR_HOME
+    ),
+    "ur10": GalleryRobot(
+        "Universal Robots UR10", "ur_description/urdf/ur10_robot.urdf", "tool0", _UR_HOME
+    ),
     "kinova": GalleryRobot(
-        "Kinova Jaco 2, 6 joints", "kinova_description/robots/kinova.urdf", "j2s6s200_end_effector",
-        {"j2s6s200_joint_1": 1.6, "j2s6s200_joint_2": 2.4, "j2s6s200_joint_3": 1.2, "j2s6s200_joint_5": 2.0},
+        "Kinova Jaco 2, 6 joints",
+        "kinova_description/robots/kinova.urdf",
+        "j2s6s200_end_effector",
+        {
+            "j2s6s200_joint_1": 1.6,
+            "j2s6s200_joint_2": 2.4,
+            "j2s6s200_joint_3": 1.2,
+            "j2s6s200_joint_5": 2.0,
+        },
     ),
     "xarm7": GalleryRobot(
-        "UFACTORY xArm 7", "xarm_description/urdf/xarm7.urdf", "link_eef",
-        {"joint2": 0.4, "joint4": 1.2, "joint6": 0.9}, "BSD-3-Clause",
+        "UFACTORY xArm 7",
+        "xarm_description/urdf/xarm7.urdf",
+        "link_eef",
+        {"joint2": 0.4, "joint4": 1.2, "joint6": 0.9},
+        "BSD-3-Clause",
     ),
     "so100": GalleryRobot(
-        "SO-100", "so_arm_description/urdf/so100.urdf", "gripper",
-        {"shoulder_lift": 1.9, "elbow_flex": -1.4, "wrist_flex": 0.3}, "Apache-2.0",
+        "SO-100",
+        "so_arm_description/urdf/so100.urdf",
+        "gripper",
+        {"shoulder_lift": 1.9, "elbow_flex": -1.4, "wrist_flex": 0.3},
+        "Apache-2.0",
     ),
     "so101": GalleryRobot(
-        "SO-101", "so_arm_description/urdf/so101.urdf", "gripper_frame_link",
-        {"shoulder_lift": 0.2, "elbow_flex": -0.4}, "Apache-2.0",
+        "SO-101",
+        "so_arm_description/urdf/so101.urdf",
+        "gripper_frame_link",
+        {"shoulder_lift": 0.2, "elbow_flex": -0.4},
+        "Apache-2.0",
     ),
     "talos_arm": GalleryRobot(
-        "PAL Talos, left arm", "talos_data/robots/talos_left_arm.urdf", "gripper_left_base_link",
-        {"arm_left_2_joint": 0.7, "arm_left_4_joint": -1.2, "gripper_left_joint": -0.3}, "Apache-2.0",
+        "PAL Talos, left arm",
+        "talos_data/robots/talos_left_arm.urdf",
+        "gripper_left_base_link",
+        {"arm_left_2_joint": 0.7, "arm_left_4_joint": -1.2, "gripper_left_joint": -0.3},
+        "Apache-2.0",
     ),
     "baxter": GalleryRobot(
-        "Rethink Baxter, both arms", "baxter_description/urdf/baxter.urdf", "right_gripper",
-        {f"{side}_{joint}": angle for side in ("left", "right") for joint, angle in (("s1", -0.9), ("e1", 1.6))},
+        "Rethink Baxter, both arms",
+        "baxter_description/urdf/baxter.urdf",
+        "right_gripper",
+        {
+            f"{side}_{joint}": angle
+            for side in ("left", "right")
+            for joint, angle in (("s1", -0.9), ("e1", 1.6))
+        },
     ),
     "double_pendulum": GalleryRobot(
-        "Double pendulum", "double_pendulum_description/urdf/double_pendulum.urdf", "link2",
-        {"joint1": 1.2, "joint2": 0.5}, tip=(0.0, 0.0, 0.22),
+        "Double pendulum",
+        "double_pendulum_description/urdf/double_pendulum.urdf",
+        "link2",
+        {"joint1": 1.2, "joint2": 0.5},
+        tip=(0.0, 0.0, 0.22),
     ),
     "pusher": GalleryRobot(
-        "Gymnasium's pusher, with gravity", "gymnasium/pusher_v5.xml", "tips_arm",
-        {"r_shoulder_lift_joint": 0.2, "r_elbow_flex_joint": -0.8, "r_wrist_flex_joint": -0.4}, "MIT",
+        "Gymnasium's pusher, with gravity",
+        "gymnasium/pusher_v5.xml",
+        "tips_arm",
+        {"r_shoulder_lift_joint": 0.2, "r_elbow_flex_joint": -0.8, "r_wrist_flex_joint": -0.4},
+        "MIT",
     ),
-}  # fmt: skip
+}
 """The robots by name."""
 
 
@@ -120,7 +176,9 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / file.name
     path = (folder or _package_folder(name)) / file
     if not path.is_file():
-        raise missing_extra(_PACKAGE, "robots", f"the robot {name!r}, which has no model at {path},")
+        raise missing_extra(
+            _PACKAGE, "robots", f"the robot {name!r}, which has no model at {path},"
+        )
     return path
 
 
@@ -137,7 +195,8 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     Args:
         name: As in `GALLERY`.
         folder: Folder of the robots in place of that of the package.
-        shapes: Whether to load the meshes that MuJoCo reads, for pictures. They have no mass and touch nothing.
+        shapes: Whether to load the meshes that MuJoCo reads, for pictures. They have no mass and
+            touch nothing.
 
     Raises:
         ConfigurationError: No such robot, or the package is missing.
@@ -147,11 +206,14 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     if path.suffix != ".urdf":
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
-    spec.option.timestep, spec.option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.timestep = TIMESTEP_S
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = [0.0, 0.0, -9.81]
     slides = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]
     held = {joint.name for joint in slides}
-    for tie in [tie for tie in spec.equalities if held & {tie.name1, tie.name2}]:  # a finger that copies the other
+    for tie in [
+        tie for tie in spec.equalities if held & {tie.name1, tie.name2}
+    ]:  # a finger that copies the other
         spec.delete(tie)
     for joint in slides:
         spec.delete(joint)
@@ -165,13 +227,20 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
     return np.array([GALLERY[name].home.get(joint, 0.0) for joint in joints])
 
 
-def random_poses(model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES) -> Array:
-    """Poses within the inner part of the joints' ranges, (number, n) [rad]; they may cross the robot itself."""
+def random_poses(
+    model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES
+) -> Array:
+    """Poses within the inner part of the joints' ranges, (number, n) [rad]; they may cross the
+    robot itself.
+    """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
-    ends = np.clip(np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST]), -_FARTHEST, _FARTHEST)
+    ends = np.clip(
+        np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST]), -_FARTHEST, _FARTHEST
+    )
     # of a range that lies beyond a half turn, such as Kinova's 47° to 313°, what is within it
-    middle, half = ends.mean(axis=1), _INNER * np.ptp(ends, axis=1) / 2.0
+    middle = ends.mean(axis=1)
+    half = _INNER * np.ptp(ends, axis=1) / 2.0
     return generator.uniform(middle - half, middle + half, (number, len(ids)))
 
 
@@ -188,43 +257,56 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
         K_j = \max\left(\frac{\tau_j}{0.015}, \frac{\max_i \tau_i}{20 \cdot 0.015}, (10 \pi)^2 M_j\right), \quad
         B_j = \frac{M_j}{2} + \frac{\max_i M_i}{100}, \quad D_j = 0.2 \sqrt{K_j m_j}
 
-    τ_j is the largest gravity torque over random poses, M_j the largest inertia about the joint. 0.015 rad is a sag
-    that users of arms report, 10π rad/s a frequency that keeps a vertical axis, which carries no weight, from swinging.
-    m_j is the inertia against which the spring swings: that of the rotor and the least one of its links while the other
-    joints are free. Two digits of K are kept.
+    τ_j is the largest gravity torque over random poses, M_j the largest inertia about the joint.
+    0.015 rad is a sag that users of arms report, 10π rad/s a frequency that keeps a vertical axis,
+    which carries no weight, from swinging. m_j is the inertia against which the spring swings: that
+    of the rotor and the least one of its links while the other joints are free. Two digits of K are
+    kept.
 
     Args:
         model: Compiled rigid model, all of whose joints are hinges.
 
     Returns:
         Joints by name, with a servo that holds its angle.
-    """
+    """  # noqa: E501
     names = hinges_of(model)
     poses = random_poses(model, np.random.default_rng(0))
     torque = np.abs(TreeTorque(model, names).gravity_torque(poses)).max(axis=0)
     inertia = np.array([_inertia(model, pose) for pose in poses])
     links = np.diagonal(inertia, axis1=1, axis2=2).max(axis=0)
     free = (1.0 / np.diagonal(np.linalg.inv(inertia), axis1=1, axis2=2)).min(axis=0)
-    stiffness = np.maximum(np.maximum(torque, _WEAKEST * torque.max()) / SAG_RAD, _SLOWEST**2 * links)
+    stiffness = np.maximum(
+        np.maximum(torque, _WEAKEST * torque.max()) / SAG_RAD, _SLOWEST**2 * links
+    )
     digit = 10.0 ** (np.floor(np.log10(stiffness)) - 1.0)
     stiffness = np.round(stiffness / digit) * digit
     rotor = _ROTOR * links + _LIGHTEST * links.max()
     damping = 2.0 * _DAMPING_RATIO * np.sqrt(stiffness / (1.0 / rotor + 1.0 / free))
     return {
         name: ElasticJoint(
-            stiffness=K, damping=D, rotor_inertia=B, servo=_servo(B + M, K, float(torque.max() + 25.0 * (B + M)))
+            stiffness=K,
+            damping=D,
+            rotor_inertia=B,
+            servo=_servo(B + M, K, float(torque.max() + 25.0 * (B + M))),
         )
-        for name, K, D, B, M in zip(names, *(a.tolist() for a in (stiffness, damping, rotor, links)), strict=True)
+        for name, K, D, B, M in zip(
+            names, *(a.tolist() for a in (stiffness, damping, rotor, links)), strict=True
+        )
     }
 
 
 def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:
-    """A servo that holds its angle: three equal poles for a rigid load, and no softer than the spring behind it."""
+    """A servo that holds its angle: three equal poles for a rigid load, and no softer than the
+    spring behind it.
+    """
     carried = max(inertia, stiffness / (3.0 * _SERVO_RATE**2))
     return Servo(
-        position_gain=3.0 * carried * _SERVO_RATE**2, velocity_gain=3.0 * carried * _SERVO_RATE,
-        integral_gain=carried * _SERVO_RATE**3, torque_limit=torque_limit, speed_limit=5.0,
-    )  # fmt: skip
+        position_gain=3.0 * carried * _SERVO_RATE**2,
+        velocity_gain=3.0 * carried * _SERVO_RATE,
+        integral_gain=carried * _SERVO_RATE**3,
+        torque_limit=torque_limit,
+        speed_limit=5.0,
+    )
 
 
 def _inertia(model: mujoco.MjModel, pose: Array) -> Array:

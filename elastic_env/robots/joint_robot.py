@@ -4,8 +4,9 @@
     ARM.register()
     env = gymnasium.make("elastic_env/Arm-v0", scenario="soft", reference="multisine")
 
-`rigid_arm` is a function without arguments that returns a `mujoco.MjSpec`, whose hinges are all named here. Every joint
-follows the reference about its home, under the scenarios of robots that do not walk.
+`rigid_arm` is a function without arguments that returns a `mujoco.MjSpec`, whose hinges are all
+named here. Every joint follows the reference about its home, under the scenarios of robots that do
+not walk.
 """
 
 import warnings
@@ -43,10 +44,12 @@ from elastic_env.world.robot_model import RobotModel, read_stiffness, with_stiff
 from elastic_env.world.scenario import Scenario, make_scenario
 from elastic_env.world.task import ACTION_BOUND_RAD
 
-_WIDTH, _HEIGHT = 640, 480
+_WIDTH = 640
+_HEIGHT = 480
 _ENLARGED = 8.0
 """Factor by which a picture enlarges deviations from the reference."""
-_REFERENCE, _REFERENCE_RGBA = "elastic_env_reference_", (0.35, 0.65, 0.45, 0.35)
+_REFERENCE = "elastic_env_reference_"
+_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 """Prefix and colour of the robot that is the reference."""
 _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
@@ -77,8 +80,8 @@ class JointRobot:
         load: Body that carries what the scenario `payload` adds; None for that of the last joint.
         imu: Site of the accelerometer; None for a robot without one.
         end_effector: Site or body whose place and tilt are scored; None to score the joints alone.
-        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; None to scale the mass of
-            `load`.
+        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; None to
+            scale the mass of `load`.
     """
 
     name: str
@@ -117,12 +120,15 @@ class JointRobot:
         """The configuration from the arguments of `gymnasium.make`.
 
         Args:
-            reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind`
-                and parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
+            reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a
+                mapping with `kind` and parameters, such as {"kind": "csv", "file": "angles.csv"},
+                or a reference model.
             scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
-            stiffness: K of the joints [N·m/rad], one number or one per joint; default that of the joints.
+            stiffness: K of the joints [N·m/rad], one number or one per joint; default that of the
+                joints.
             form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
-            sensors: What is observed beside the standard set, see `elastic_env.world.further_sensors`.
+            sensors: What is observed beside the standard set, see
+                `elastic_env.world.further_sensors`.
             reward: Weights of the reward terms, or a mapping of what differs from the default.
             timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
 
@@ -147,28 +153,47 @@ class JointRobot:
         """The robot as it is built, and as it is known.
 
         Raises:
-            ConfigurationError: The reference needs more torque than the servos have, or a sensor has no place.
+            ConfigurationError: The reference needs more torque than the servos have, or a sensor
+                has no place.
         """
-        true = RobotModel(self._true_joints(config), self._loaded(config).compile(), config.control_period_s)
+        true = RobotModel(
+            self._true_joints(config), self._loaded(config).compile(), config.control_period_s
+        )
         body = TreeTorque(true.rigid, true.joint_names)
-        home = np.zeros(len(true.joints)) if self.home is None else np.array(self.home, dtype=np.float64)
+        home = (
+            np.zeros(len(true.joints))
+            if self.home is None
+            else np.array(self.home, dtype=np.float64)
+        )
         if home.shape != (len(true.joints),):
-            raise ConfigurationError(f"home must have one angle per joint, {len(true.joints)}, got {len(home)}")
-        tool = None if self.end_effector is None else EndEffector(true.rigid, true.joint_names, self.end_effector)
+            raise ConfigurationError(
+                f"home must have one angle per joint, {len(true.joints)}, got {len(home)}"
+            )
+        tool = (
+            None
+            if self.end_effector is None
+            else EndEffector(true.rigid, true.joint_names, self.end_effector)
+        )
         motion = ArmMotion(config.reference, _workspace(true, body, home, tool))
         plan = motion.plan(np.random.default_rng(0), config.control_period_s)
         rows = slice(None, None, max(plan.num_steps // 500, 1))
-        q, q_dot, q_ddot = (np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot))
+        q, q_dot, q_ddot = (
+            np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot)
+        )
         _require_in_range(config, true, q)
         _require_torque(config, true, body, (q, q_dot, q_ddot))
         assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
         _warn_of_action_bound(config, assumed, body.gravity_torque(q))
         return JointPlant(
-            name=self.name, model=self.elastic(config).compile(), assumed=assumed, true=true,
-            static_torque=body.gravity_torque, motion=motion,
+            name=self.name,
+            model=self.elastic(config).compile(),
+            assumed=assumed,
+            true=true,
+            static_torque=body.gravity_torque,
+            motion=motion,
             rest_angle=partial(_rest_angle, form=config.form, true=true, body=body),
             end_effector=tool,
-        )  # fmt: skip
+        )
 
     def elastic(self, config: JointRobotConfig) -> mujoco.MjSpec:
         """What moves: the model with the scenario's load and elastic joints, and with the sensors.
@@ -177,12 +202,15 @@ class JointRobot:
             ConfigurationError: A sensor has no place.
         """
         spec = transformed(self._loaded(config), self._true_joints(config), config.form)
-        spec.option.timestep, spec.option.integrator = config.timestep_s, mujoco.mjtIntegrator.mjINT_RK4
+        spec.option.timestep = config.timestep_s
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode, not restart the world behind the task's back
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if ACCELEROMETER in config.sensors:
             if self.imu is None:
-                raise ConfigurationError(f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)")
+                raise ConfigurationError(
+                    f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)"
+                )
             add_accelerometer(spec, self.imu)
         return spec
 
@@ -191,7 +219,8 @@ class JointRobot:
 
     def _loaded(self, config: JointRobotConfig) -> mujoco.MjSpec:
         """The model with its load scaled, or with the share of a mass at its end effector."""
-        spec, scale = self.rigid(), config.scenario.pendulum_mass_scale
+        spec = self.rigid()
+        scale = config.scenario.pendulum_mass_scale
         if scale == 1.0:
             return spec
         if self.load_kg is not None:
@@ -209,7 +238,8 @@ class JointRobot:
 
 
 class JointPicture(ModelPicture):
-    """The robot, its deviations from the reference enlarged, and the reference as a translucent robot.
+    """The robot, its deviations from the reference enlarged, and the reference as a translucent
+    robot.
 
     Args:
         robot: What is drawn.
@@ -222,56 +252,76 @@ class JointPicture(ModelPicture):
         look = spec.copy().compile().stat
         x, y, z = look.center
         spec.worldbody.add_camera(
-            name=CAMERA, pos=[x, y - 2.4 * look.extent, z + 0.25 * look.extent], xyaxes=[1, 0, 0, 0, 0.1, 1]
+            name=CAMERA,
+            pos=[x, y - 2.4 * look.extent, z + 0.25 * look.extent],
+            xyaxes=[1, 0, 0, 0, 0.1, 1],
         )
         spec.worldbody.add_light(
-            pos=[x + look.extent, y - 3.0 * look.extent, z + 3.0 * look.extent], dir=[-0.2, 0.7, -0.7],
-            diffuse=[0.5] * 3, specular=[0.0] * 3, castshadow=False,
-        )  # fmt: skip
+            pos=[x + look.extent, y - 3.0 * look.extent, z + 3.0 * look.extent],
+            dir=[-0.2, 0.7, -0.7],
+            diffuse=[0.5] * 3,
+            specular=[0.0] * 3,
+            castshadow=False,
+        )
         reference = robot.rigid()
         for geom in reference.geoms:
             geom.rgba = _REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
         super().__init__(spec, (("translucent: reference", (0.27, 0.55, 0.37, 1.0)),))
-        self._robot, self._task, self._joints = robot, task, list(robot.joints)
+        self._robot = robot
+        self._task = task
+        self._joints = list(robot.joints)
 
     def alone(self) -> Alone:
         """See `HasSides`."""
         extent = self._robot.rigid().compile().stat.extent
         return Alone(self._robot.rigid(), self._joints, (1.5 * extent, 0.0, 0.0))
 
-    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002  the truth has every joint
+    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """See `HasSides`."""
         truth = self._task.truth()
         q_ref = self._task.sample().joints["truth"]["q_ref"]
         return Sides(q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
 
-    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
+    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         q = self._task.truth().q[world]
         q_ref = self._task.sample().joints["truth"]["q_ref"][world]
         drawn = q_ref + _ENLARGED * (q - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
-            self._data.joint(name).qpos, self._data.joint(_REFERENCE + name).qpos = angle, reference
+            self._data.joint(name).qpos = angle
+            self._data.joint(_REFERENCE + name).qpos = reference
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
         return [
             f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {_ENLARGED:g}",
-            f"deflection {1e3 * now['deflection']:6.2f} mrad     link error {1e3 * now['link_error']:6.2f} mrad",
+            (
+                f"deflection {1e3 * now['deflection']:6.2f} mrad     link error"
+                f" {1e3 * now['link_error']:6.2f} mrad"
+            ),
         ]
 
 
 def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
-    """Joints as a compensator knows them: where the scenario is without friction, it knows of none."""
+    """Joints as a compensator knows them: where the scenario is without friction, it knows of
+    none.
+    """
     if config.scenario.friction_scale > 0.0:
         return config.joints
-    return {name: one.replace(coulomb_friction=0.0, viscous_friction=0.0) for name, one in config.joints.items()}
+    return {
+        name: one.replace(coulomb_friction=0.0, viscous_friction=0.0)
+        for name, one in config.joints.items()
+    }
 
 
 def _scaled(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
     """A model with the mass of a body scaled, where it is."""
-    made, carrier = spec.copy().compile().body(body), spec.body(body)
-    carrier.mass, carrier.inertia = float(made.mass[0]) * scale, made.inertia * scale
-    carrier.ipos, carrier.iquat, carrier.explicitinertial = made.ipos, made.iquat, True
+    made = spec.copy().compile().body(body)
+    carrier = spec.body(body)
+    carrier.mass = float(made.mass[0]) * scale
+    carrier.inertia = made.inertia * scale
+    carrier.ipos = made.ipos
+    carrier.iquat = made.iquat
+    carrier.explicitinertial = True
     return spec
 
 
@@ -281,33 +331,60 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
     carrier = spec.body(end_effector) if site is None else site.parent
     if carrier is None or not mass > 0.0:
         raise ConfigurationError(
-            f"the load at the end effector {end_effector!r} must be > 0 kg, got {mass:g} kg; name an end effector, and "
-            "give load_kg and the scenario's pendulum_mass_scale - 1 the same sign"
+            f"the load at the end effector {end_effector!r} must be > 0 kg, got {mass:g} kg; name"
+            " an end effector, and give load_kg and the scenario's pendulum_mass_scale - 1 the"
+            " same sign"
         )
     place = np.zeros(3) if site is None else site.pos
-    carrier.add_body(pos=place, mass=mass, ipos=[0.0] * 3, inertia=[_POINT * mass] * 3, explicitinertial=True)
+    carrier.add_body(
+        pos=place, mass=mass, ipos=[0.0] * 3, inertia=[_POINT * mass] * 3, explicitinertial=True
+    )
     return spec
 
 
-def _workspace(robot: RobotModel, body: TreeTorque, home: Array, tool: EndEffector | None) -> Workspace:
+def _workspace(
+    robot: RobotModel, body: TreeTorque, home: Array, tool: EndEffector | None
+) -> Workspace:
     """What references have to know of a robot, by its true model."""
     at = [int(robot.rigid.joint(name).id) for name in robot.joint_names]
-    ranges = np.where(robot.rigid.jnt_limited[at].astype(bool)[:, None], robot.rigid.jnt_range[at], [-np.inf, np.inf])
-    return Workspace(tuple(robot.joint_names), ranges[:, 0], ranges[:, 1], home, partial(_holds, robot, body), tool)
+    ranges = np.where(
+        robot.rigid.jnt_limited[at].astype(bool)[:, None],
+        robot.rigid.jnt_range[at],
+        [-np.inf, np.inf],
+    )
+    return Workspace(
+        tuple(robot.joint_names),
+        ranges[:, 0],
+        ranges[:, 1],
+        home,
+        partial(_holds, robot, body),
+        tool,
+    )
 
 
 def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
-    """Whether servos hold poses with a fifth of their torque to spare, from (..., n) [rad] to (...)."""
+    """Whether servos hold poses with a fifth of their torque to spare, from (..., n) [rad] to
+    (...).
+    """
     limits = np.array([servo.torque_limit for servo in robot.servos])
-    return np.all(np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1)
+    return np.all(
+        np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1
+    )
 
 
 def _require_torque(
-    config: JointRobotConfig, robot: RobotModel, body: TreeTorque, motion: tuple[Array, Array, Array]
+    config: JointRobotConfig,
+    robot: RobotModel,
+    body: TreeTorque,
+    motion: tuple[Array, Array, Array],
 ) -> None:
-    """Refuse a reference that the servos cannot follow; `motion` has its angles, rates and accelerations."""
+    """Refuse a reference that the servos cannot follow; `motion` has its angles, rates and
+    accelerations.
+    """
     q, q_dot, q_ddot = motion
-    needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(axis=0)
+    needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(
+        axis=0
+    )
     needed += robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
     limits = np.array([servo.torque_limit for servo in robot.servos])
     if not isinstance(config.reference, OfArm):
@@ -315,8 +392,9 @@ def _require_torque(
     elif np.any(needed > limits):
         weakest = int(np.argmax(needed - limits))
         raise ConfigurationError(
-            f"the reference {config.reference.kind!r} can need {needed[weakest]:.1f} N·m of the servo of joint "
-            f"{robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.1f} N·m; make its moves slower"
+            f"the reference {config.reference.kind!r} can need {needed[weakest]:.1f} N·m of the"
+            f" servo of joint {robot.joint_names[weakest]!r}, which is limited to"
+            f" {limits[weakest]:.1f} N·m; make its moves slower"
         )
 
 
@@ -334,10 +412,11 @@ def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: A
     if needed[worst] > ACTION_BOUND_RAD:
         enough = np.abs(torque[:, worst]).max() / ACTION_BOUND_RAD
         warnings.warn(
-            f"the weight along the reference {config.reference.kind!r} bends joint {known.joint_names[worst]!r} by up "
-            f"to {needed[worst]:.3g} rad, and actions are cut at ±{ACTION_BOUND_RAD:g} rad: no policy can take all of "
-            f"it back. Spring and servo together need {enough:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them "
-            "more, or choose poses with less load",
+            f"the weight along the reference {config.reference.kind!r} bends joint"
+            f" {known.joint_names[worst]!r} by up to {needed[worst]:.3g} rad, and actions are cut"
+            f" at ±{ACTION_BOUND_RAD:g} rad: no policy can take all of it back. Spring and servo"
+            f" together need {enough:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them more,"
+            " or choose poses with less load",
             stacklevel=4,
         )
 
@@ -347,11 +426,13 @@ def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> 
     for column, name in enumerate(robot.joint_names):
         joint = robot.rigid.joint(name).id
         lowest, highest = robot.rigid.jnt_range[joint]
-        least, most = float(q[:, column].min()), float(q[:, column].max())
+        least = float(q[:, column].min())
+        most = float(q[:, column].max())
         if robot.rigid.jnt_limited[joint] and (least < lowest or most > highest):
             raise ConfigurationError(
-                f"the reference {config.reference.kind!r} moves joint {name!r} from {least:.3f} to {most:.3f} rad, and "
-                f"its range is {lowest:.3f} to {highest:.3f} rad; lower the amplitude, or choose another home"
+                f"the reference {config.reference.kind!r} moves joint {name!r} from {least:.3f} to"
+                f" {most:.3f} rad, and its range is {lowest:.3f} to {highest:.3f} rad; lower the"
+                " amplitude, or choose another home"
             )
 
 
@@ -364,10 +445,19 @@ def _rest_angle(
     true: RobotModel,
     body: TreeTorque,
 ) -> Array:
-    """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
+    """Link angles at rest without friction: a dead band is crossed to the side to which the load
+    pulls.
+    """
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return command
-    engaged = command - np.sign(body.gravity_torque(command)) * (true.backlash if backlash is None else backlash) / 2.0
+    engaged = (
+        command
+        - np.sign(body.gravity_torque(command))
+        * (true.backlash if backlash is None else backlash)
+        / 2.0
+    )
     finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
-    return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient, unique=False)
+    return static_link_angle(
+        engaged, finite, body.gravity_torque, body.gravity_gradient, unique=False
+    )

@@ -8,7 +8,10 @@ import numpy as np
 from elastic_env.core.signals import Array, BoolArray, IntArray
 
 _SHARE = 0.004
-"""Motion within a window that is worth a word, over the sag. An error of 2 % that fades by 1/s moves by as much."""
+"""Motion within a window that is worth a word, over the sag.
+
+An error of 2 % that fades by 1/s moves by as much.
+"""
 _SMALLEST_RAD = 1e-5
 """Motion that is worth no word, even where a robot does not sag."""
 
@@ -25,8 +28,12 @@ class RestWatch:
         joints: Names of the joints.
     """
 
-    def __init__(self, static_torque: Callable[[Array], Array], stiffness: Array, joints: Sequence[str]) -> None:
-        self._static_torque, self._stiffness, self._joints = static_torque, stiffness, list(joints)
+    def __init__(
+        self, static_torque: Callable[[Array], Array], stiffness: Array, joints: Sequence[str]
+    ) -> None:
+        self._static_torque = static_torque
+        self._stiffness = stiffness
+        self._joints = list(joints)
         self.is_said = False
         self._window: IntArray = np.empty(0, dtype=np.int64)
         self._least: Array = np.empty(0)
@@ -37,7 +44,9 @@ class RestWatch:
         if self._window.shape == worlds.shape:
             self._window[worlds] = -1
 
-    def see(self, rest: IntArray, is_last: BoolArray, q_ref: Array, q: Array, offset: Array) -> None:
+    def see(
+        self, rest: IntArray, is_last: BoolArray, q_ref: Array, q: Array, offset: Array
+    ) -> None:
         """Look at a control step.
 
         Args:
@@ -61,7 +70,9 @@ class RestWatch:
             self._judge(q_ref[ended], (self._most - self._least)[:, ended], rest[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
-        """Warn of windows that end; `moved` is by how much links and commands moved within them, (2, ended, n)."""
+        """Warn of windows that end; `moved` is by how much links and commands moved within them,
+        (2, ended, n).
+        """
         sag = np.abs(self._static_torque(q_ref) / self._stiffness).max(axis=-1)
         links, commands = moved.max(axis=-1)
         restless = (links > np.maximum(_SHARE * sag, _SMALLEST_RAD)) & (commands < links / 2.0)
@@ -71,9 +82,10 @@ class RestWatch:
         worst = int(np.argmax(np.where(restless, links, 0.0)))
         joint = self._joints[int(moved[0, worst].argmax())]
         warnings.warn(
-            f"joint {joint!r} does not rest where it is scored at rest: at position {window[worst] + 1} its link "
-            f"moves by {1e3 * links[worst]:.3g} mrad while it is measured, and the weight bends the joints by "
-            f"{1e3 * sag[worst]:.3g} mrad. The score holds this motion. Give the reference a longer settle_s, or "
-            "joints and servos more damping",
+            f"joint {joint!r} does not rest where it is scored at rest: at position"
+            f" {window[worst] + 1} its link moves by {1e3 * links[worst]:.3g} mrad while it is"
+            f" measured, and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad. The score"
+            " holds this motion. Give the reference a longer settle_s, or joints and servos more"
+            " damping",
             stacklevel=6,
         )

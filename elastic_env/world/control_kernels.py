@@ -1,12 +1,13 @@
 """A control step but for the physics, compiled: command, read, measure, score, observe.
 
-One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend on its own row alone.
-Records have their fields by name, see `elastic_env.world.rows`. All robots share the joints. What comes on top stands
-behind them: links on a fixed base, and a walker.
+One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend on
+its own row alone. Records have their fields by name, see `elastic_env.world.rows`. All robots share
+the joints. What comes on top stands behind them: links on a fixed base, and a walker.
 
-Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
-file, and every size comes from a type or from an array. A kernel that Python calls takes plain tuples and names their
-parts itself: Numba takes a microsecond more for a tuple with names.
+Numba keeps compiled code by the file of the function that was called. So everything that a kernel
+calls stands in this file, and every size comes from a type or from an array. A kernel that Python
+calls takes plain tuples and names their parts itself: Numba takes a microsecond more for a tuple
+with names.
 """
 
 import math
@@ -17,7 +18,8 @@ import numpy as np
 from elastic_env.core.compiled import compiled, within_compiled
 from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 
-FIRST_HALF, SECOND_HALF = 1, 2
+FIRST_HALF = 1
+SECOND_HALF = 2
 """Of a swing; 0 is none."""
 
 
@@ -42,7 +44,9 @@ class Joints(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,), which is counted here."""
+    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,),
+    which is counted here.
+    """
 
     samples: Any
     used: IntArray
@@ -54,7 +58,8 @@ class Commanded(NamedTuple):
     Attributes:
         offset: Within their bounds, (num_worlds, n) [rad].
         is_clipped: Worlds whose action was beyond its bounds.
-        diverged: Worlds that diverged, to which those too fast are added. They keep truth and measurements.
+        diverged: Worlds that diverged, to which those too fast are added. They keep truth and
+            measurements.
         periods: Control periods that have gone by, more than 1 where hardware has missed some.
     """
 
@@ -65,7 +70,9 @@ class Commanded(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The control step before and the present one, which is filled: joints (num_worlds, n), worlds (num_worlds,)."""
+    """The control step before and the present one, which is filled: joints (num_worlds, n),
+    worlds (num_worlds,).
+    """
 
     last_joints: Any
     joints: Any
@@ -79,7 +86,8 @@ class Results(NamedTuple):
     Attributes:
         observed: Observation, (num_worlds, columns).
         reward: (num_worlds,).
-        ends: Whether a world diverged, failed in other ways, is terminated, is truncated, (ways, num_worlds).
+        ends: Whether a world diverged, failed in other ways, is terminated, is truncated, (ways,
+            num_worlds).
     """
 
     observed: Array
@@ -89,9 +97,16 @@ class Results(NamedTuple):
 
 @compiled
 def command(
-    joints: Any, last_joints: Any, last_worlds: Any, action: Array, bound: Array, is_clipped: BoolArray, inputs: Array
+    joints: Any,
+    last_joints: Any,
+    last_worlds: Any,
+    action: Array,
+    bound: Array,
+    is_clipped: BoolArray,
+    inputs: Array,
 ) -> bool:
-    """Servo inputs of the coming control period, q_ref + offset, by encoders that are off by their homing error.
+    """Servo inputs of the coming control period, q_ref + offset, by encoders that are off by their
+    homing error.
 
     Args:
         joints: `Joints`.
@@ -120,17 +135,24 @@ def command(
             if offset != value:
                 is_clipped[world] = True
             action[world, i] = offset
-            inputs[world, joints.at[i].servo] = plan[coming, 0, i] + offset - last_joints[world, i].truth.homing
+            inputs[world, joints.at[i].servo] = (
+                plan[coming, 0, i] + offset - last_joints[world, i].truth.homing
+            )
     return True
 
 
 @compiled
 def begin_joints(qpos: Array, qvel: Array, joints: Joints, worlds: BoolArray, steps: Steps) -> None:
-    """Truth and measurements of joints at the start of an episode in some worlds, where they have been at rest."""
+    """Truth and measurements of joints at the start of an episode in some worlds, where they
+    have been at rest.
+    """
     for world in range(len(worlds)):
         if worlds[world]:
             course = steps.worlds[world].truth
-            course.step, course.command_rate, course.clipped, course.diverged = 0, 0.0, False, False
+            course.step = 0
+            course.command_rate = 0.0
+            course.clipped = False
+            course.diverged = False
             rules = joints.rules[joints.kind[world]]
             plan = joints.plans[joints.plan[world]]
             for i in range(len(joints.at)):
@@ -145,9 +167,14 @@ def begin_joints(qpos: Array, qvel: Array, joints: Joints, worlds: BoolArray, st
 
 
 @compiled
-def sense_joints(qpos: Array, qvel: Array, joints: Joints, commanded: Commanded, steps: Steps, observed: Array) -> None:
-    """The joints' part of a control step after the physics: keep the command, read, measure, observe."""
-    offset, diverged = commanded.offset, commanded.diverged
+def sense_joints(
+    qpos: Array, qvel: Array, joints: Joints, commanded: Commanded, steps: Steps, observed: Array
+) -> None:
+    """The joints' part of a control step after the physics: keep the command, read, measure,
+    observe.
+    """
+    offset = commanded.offset
+    diverged = commanded.diverged
     n = len(joints.at)
     for world in range(len(offset)):
         rules = joints.rules[joints.kind[world]]
@@ -166,7 +193,9 @@ def sense_joints(qpos: Array, qvel: Array, joints: Joints, commanded: Commanded,
             truth.command = truth.q_ref + truth.offset
             truth.command_rate = change / rules.control_period_s
             total += change * change
-            fastest = max(abs(qvel[world, joints.at[i].theta_dot]), abs(qvel[world, joints.at[i].q_dot]))
+            fastest = max(
+                abs(qvel[world, joints.at[i].theta_dot]), abs(qvel[world, joints.at[i].q_dot])
+            )
             diverged[world] = diverged[world] or fastest > rules.highest_rad_s
         course.command_rate = math.sqrt(total / n) / rules.control_period_s
         course.diverged = diverged[world]
@@ -178,26 +207,39 @@ def sense_joints(qpos: Array, qvel: Array, joints: Joints, commanded: Commanded,
                 show_encoder(joint.truth, rules.count_rad, joint.shown)
         visible = steps.last_joints[world] if rules.is_delayed else steps.joints[world]
         period_s = rules.control_period_s * commanded.periods
-        observe_joints(joints, plan, course.step, steps.joints[world], visible, period_s, observed[world])
+        observe_joints(
+            joints, plan, course.step, steps.joints[world], visible, period_s, observed[world]
+        )
 
 
 @compiled
 def show_joints(joints: Any, steps: Any, observed: Array) -> None:
     """The joints' columns of observations of the present state."""
-    joints, steps = Joints(*joints), Steps(*steps)
+    joints = Joints(*joints)
+    steps = Steps(*steps)
     for world in range(len(observed)):
         rules = joints.rules[joints.kind[world]]
         plan = joints.plans[joints.plan[world]]
         visible = steps.last_joints[world] if rules.is_delayed else steps.joints[world]
         step = steps.worlds[world].truth.step
-        observe_joints(joints, plan, step, steps.joints[world], visible, rules.control_period_s, observed[world])
+        observe_joints(
+            joints,
+            plan,
+            step,
+            steps.joints[world],
+            visible,
+            rules.control_period_s,
+            observed[world],
+        )
 
 
 @compiled
 def read_joint(qpos: Array, qvel: Array, at: Any, truth: Any) -> None:
     """State of a joint as the physics has it."""
-    truth.theta, truth.theta_dot = qpos[at.theta], qvel[at.theta_dot]
-    truth.q, truth.q_dot = qpos[at.q], qvel[at.q_dot]
+    truth.theta = qpos[at.theta]
+    truth.theta_dot = qvel[at.theta_dot]
+    truth.q = qpos[at.q]
+    truth.q_dot = qvel[at.q_dot]
 
 
 @compiled
@@ -209,7 +251,13 @@ def show_encoder(truth: Any, count_rad: float, shown: Any) -> None:
 
 @compiled
 def observe_joints(
-    joints: Joints, plan: Array, step: int, present: Any, visible: Any, period_s: float, observed: Array
+    joints: Joints,
+    plan: Array,
+    step: int,
+    present: Any,
+    visible: Any,
+    period_s: float,
+    observed: Array,
 ) -> None:
     """What a policy sees of the joints, and what they are to do in the coming control period."""
     columns = joints.columns[0]
@@ -235,8 +283,8 @@ class Links(NamedTuple):
         constants: Weights of the reward and quality of the IMU, (1,).
         imu_bias: Offset of the IMU on the only link, (num_worlds,) [rad].
         imu_column: Where it is observed, −1 for nowhere.
-        imu_angle: Angle of the link as an inertial IMU computes it, (num_worlds,) [rad]; None for one that shows the
-            true angle with its errors.
+        imu_angle: Angle of the link as an inertial IMU computes it, (num_worlds,) [rad]; None for
+            one that shows the true angle with its errors.
     """
 
     schedule: Any
@@ -247,14 +295,23 @@ class Links(NamedTuple):
 
 
 @compiled
-def begin_links(qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, worlds: BoolArray, steps: Any) -> None:
-    """Truth and measurements of links at the start of an episode in some worlds, which have been at rest."""
-    joints, links, noise, steps = Joints(*joints), Links(*links), Noise(*noise), Steps(*steps)
+def begin_links(
+    qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, worlds: BoolArray, steps: Any
+) -> None:
+    """Truth and measurements of links at the start of an episode in some worlds, which have been
+    at rest.
+    """
+    joints = Joints(*joints)
+    links = Links(*links)
+    noise = Noise(*noise)
+    steps = Steps(*steps)
     begin_joints(qpos, qvel, joints, worlds, steps)
     for world in range(len(worlds)):
         if worlds[world]:
-            truth, shown = steps.worlds[world].truth, steps.worlds[world].shown
-            truth.scored, truth.rest = links.schedule[0].scored, links.schedule[0].rest
+            truth = steps.worlds[world].truth
+            shown = steps.worlds[world].shown
+            truth.scored = links.schedule[0].scored
+            truth.rest = links.schedule[0].rest
             constants = links.constants[0]
             q = steps.joints[world, 0].truth.q
             show_link(noise, world, q, links.imu_angle, links.imu_bias[world], constants, shown)
@@ -263,7 +320,14 @@ def begin_links(qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, w
 
 @compiled
 def sense_links(
-    qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, commanded: Any, steps: Any, results: Any
+    qpos: Array,
+    qvel: Array,
+    joints: Any,
+    links: Any,
+    noise: Any,
+    commanded: Any,
+    steps: Any,
+    results: Any,
 ) -> bool:
     """Everything after the physics where the base is fixed: read, measure, end, score, observe.
 
@@ -280,18 +344,25 @@ def sense_links(
     Returns:
         Whether an episode ends.
     """
-    joints, links, noise = Joints(*joints), Links(*links), Noise(*noise)
-    commanded, steps, results = Commanded(*commanded), Steps(*steps), Results(*results)
+    joints = Joints(*joints)
+    links = Links(*links)
+    noise = Noise(*noise)
+    commanded = Commanded(*commanded)
+    steps = Steps(*steps)
+    results = Results(*results)
     sense_joints(qpos, qvel, joints, commanded, steps, results.observed)
     diverged = commanded.diverged
     is_over = False
     for world in range(len(diverged)):
         kind = joints.kind[world]
         constants = links.constants[0]
-        truth, shown, scores = steps.worlds[world].truth, steps.worlds[world].shown, steps.worlds[world].scores
+        truth = steps.worlds[world].truth
+        shown = steps.worlds[world].shown
+        scores = steps.worlds[world].scores
         last = len(links.schedule) - 1
         planned = links.schedule[min(truth.step, last)]
-        truth.scored, truth.rest = planned.scored, planned.rest
+        truth.scored = planned.scored
+        truth.rest = planned.rest
         if planned.imu_is_due and not diverged[world]:
             q = steps.joints[world, 0].truth.q
             show_link(noise, world, q, links.imu_angle, links.imu_bias[world], constants, shown)
@@ -316,7 +387,9 @@ def sense_links(
 
 
 @compiled
-def show_link(noise: Noise, world: int, q: float, imu_angle: Any, imu_bias: float, constants: Any, shown: Any) -> None:
+def show_link(
+    noise: Noise, world: int, q: float, imu_angle: Any, imu_bias: float, constants: Any, shown: Any
+) -> None:
     """The next sample of the IMU on the only link, see `Links`."""
     drawn = sample_of(noise, world)
     if imu_angle is None:
@@ -325,12 +398,16 @@ def show_link(noise: Noise, world: int, q: float, imu_angle: Any, imu_bias: floa
     else:
         angle = imu_angle[world]
         added = 0.0
-    shown.imu = shown_angle(angle, imu_bias, added, constants.imu_bias_rad, constants.imu_sine_error_rad)
+    shown.imu = shown_angle(
+        angle, imu_bias, added, constants.imu_bias_rad, constants.imu_sine_error_rad
+    )
 
 
 @compiled
 def tracking_penalty(link_error: float) -> float:
-    """−rms of q_ref − q over the joints [rad]: linear, so that a large error never stops to matter."""
+    """−rms of q_ref − q over the joints [rad]: linear, so that a large error never stops to
+    matter.
+    """
     return -link_error
 
 
@@ -361,8 +438,8 @@ class Walker(NamedTuple):
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
         plan: One record per control step.
         bias: Errors of mounting, and of an inertial IMU, (num_worlds,).
-        inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an IMU: its filter is then
-            not even compiled.
+        inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an
+            IMU: its filter is then not even compiled.
         columns: Where the observation has what they show, (1,).
     """
 
@@ -374,15 +451,24 @@ class Walker(NamedTuple):
 
 
 @compiled
-def begin_walk(physics: Any, joints: Any, walker: Any, noise: Any, worlds: BoolArray, steps: Any) -> None:
-    """Truth and measurements of walkers at the start of an episode in some worlds, which have been at rest."""
-    physics, joints, walker = Physics(*physics), Joints(*joints), Walker(*walker)
-    noise, steps = Noise(*noise), Steps(*steps)
+def begin_walk(
+    physics: Any, joints: Any, walker: Any, noise: Any, worlds: BoolArray, steps: Any
+) -> None:
+    """Truth and measurements of walkers at the start of an episode in some worlds, which have
+    been at rest.
+    """
+    physics = Physics(*physics)
+    joints = Joints(*joints)
+    walker = Walker(*walker)
+    noise = Noise(*noise)
+    steps = Steps(*steps)
     begin_joints(physics.qpos, physics.qvel, joints, worlds, steps)
     feet = feet_to_be_filled()
     for world in range(len(worlds)):
         if worlds[world]:
-            truth, shown, bias = steps.worlds[world].truth, steps.worlds[world].shown, walker.bias[world]
+            truth = steps.worlds[world].truth
+            shown = steps.worlds[world].shown
+            bias = walker.bias[world]
             kind = joints.kind[world]
             constants = walker.constants[kind]
             truth.contact_since = -1
@@ -390,11 +476,22 @@ def begin_walk(physics: Any, joints: Any, walker: Any, noise: Any, worlds: BoolA
             stand(physics, constants, world, truth, feet)
             drawn = sample_of(noise, world)
             settle_imu(walker.inertial, kind, truth, drawn, bias, constants.quality, shown)
-            measure(walker.inertial, kind, truth, drawn, bias, constants.quality, walker.plan[0].imu_is_due, shown)
+            measure(
+                walker.inertial,
+                kind,
+                truth,
+                drawn,
+                bias,
+                constants.quality,
+                walker.plan[0].imu_is_due,
+                shown,
+            )
 
 
 @compiled
-def sense_walk(physics: Any, joints: Any, walker: Any, noise: Any, commanded: Any, steps: Any, results: Any) -> bool:
+def sense_walk(
+    physics: Any, joints: Any, walker: Any, noise: Any, commanded: Any, steps: Any, results: Any
+) -> bool:
     """Everything after the physics in a walker: read, measure, end, score, observe.
 
     Args:
@@ -409,37 +506,65 @@ def sense_walk(physics: Any, joints: Any, walker: Any, noise: Any, commanded: An
     Returns:
         Whether an episode ends.
     """
-    physics, joints, walker = Physics(*physics), Joints(*joints), Walker(*walker)
-    noise, commanded, steps, results = Noise(*noise), Commanded(*commanded), Steps(*steps), Results(*results)
+    physics = Physics(*physics)
+    joints = Joints(*joints)
+    walker = Walker(*walker)
+    noise = Noise(*noise)
+    commanded = Commanded(*commanded)
+    steps = Steps(*steps)
+    results = Results(*results)
     sense_joints(physics.qpos, physics.qvel, joints, commanded, steps, results.observed)
     diverged = commanded.diverged
-    is_over, feet = False, feet_to_be_filled()
+    is_over = False
+    feet = feet_to_be_filled()
     for world in range(len(diverged)):
-        kind, bias, last = joints.kind[world], walker.bias[world], steps.last_worlds[world]
+        kind = joints.kind[world]
+        bias = walker.bias[world]
+        last = steps.last_worlds[world]
         constants = walker.constants[kind]
         rules = constants.rules
-        truth, shown, scores = steps.worlds[world].truth, steps.worlds[world].shown, steps.worlds[world].scores
+        truth = steps.worlds[world].truth
+        shown = steps.worlds[world].shown
+        scores = steps.worlds[world].scores
         planned = row_of(walker.plan, truth.step)
         if not diverged[world]:
             read_body(physics, constants, world, truth)
             stand(physics, constants, world, truth, feet)
             drawn = sample_of(noise, world)
-            quality, period_s = constants.quality, joints.rules[kind].control_period_s
-            advance_imu(walker.inertial, kind, last.truth, truth, drawn, bias, quality, period_s, shown)
-            measure(walker.inertial, kind, truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
+            quality = constants.quality
+            period_s = joints.rules[kind].control_period_s
+            advance_imu(
+                walker.inertial, kind, last.truth, truth, drawn, bias, quality, period_s, shown
+            )
+            measure(
+                walker.inertial,
+                kind,
+                truth,
+                drawn,
+                bias,
+                constants.quality,
+                planned.imu_is_due,
+                shown,
+            )
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
         is_over = end(truth, rules, diverged[world], is_last, results.ends[:, world]) or is_over
-        results.reward[world] = score(truth, planned, rules.weights, results.ends[-2, world], scores)
+        results.reward[world] = score(
+            truth, planned, rules.weights, results.ends[-2, world], scores
+        )
         visible = last.shown if joints.rules[kind].is_delayed else shown
-        observe_walk(visible, row_of(walker.plan, truth.step + 1), walker.columns[0], results.observed[world])
+        observe_walk(
+            visible, row_of(walker.plan, truth.step + 1), walker.columns[0], results.observed[world]
+        )
     return is_over
 
 
 @compiled
 def show_walk(joints: Any, walker: Any, steps: Any, observed: Array) -> None:
     """The walker's columns of observations of the present state."""
-    joints, walker, steps = Joints(*joints), Walker(*walker), Steps(*steps)
+    joints = Joints(*joints)
+    walker = Walker(*walker)
+    steps = Steps(*steps)
     for world in range(len(observed)):
         is_delayed = joints.rules[joints.kind[world]].is_delayed
         visible = steps.last_worlds[world].shown if is_delayed else steps.worlds[world].shown
@@ -463,11 +588,17 @@ def sample_of(noise: Noise, world: int) -> Any:
 
 @compiled
 def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
-    """State of pelvis and feet as the physics has it; MuJoCo's wrench acts on the foot, ours on the leg."""
-    qpos, qvel, at = physics.qpos[world], physics.qvel[world], constants.at
+    """State of pelvis and feet as the physics has it; MuJoCo's wrench acts on the foot, ours on
+    the leg.
+    """
+    qpos = physics.qpos[world]
+    qvel = physics.qvel[world]
+    at = constants.at
     row.servo_torque = rms(physics.actuator_force[world])
     for i in range(3):
-        row.pelvis[i], row.pelvis_velocity[i], row.pelvis_rate[i] = qpos[i], qvel[i], qvel[3 + i]
+        row.pelvis[i] = qpos[i]
+        row.pelvis_velocity[i] = qvel[i]
+        row.pelvis_rate[i] = qvel[3 + i]
     for i in range(4):
         row.quaternion[i] = qpos[3 + i]
     for foot in range(2):
@@ -481,7 +612,10 @@ def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
 @compiled
 def attitude_of(quaternion: Array) -> tuple[float, float, float]:
     """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad]."""
-    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    w = quaternion[0]
+    x = quaternion[1]
+    y = quaternion[2]
+    z = quaternion[3]
     # the vertical in the frame of the pelvis
     return attitude_by(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
 
@@ -495,12 +629,16 @@ def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, fl
 
 @compiled
 def feet_to_be_filled() -> tuple[Array, Array, Array]:
-    """Orientation of two feet, (2, 3, 3), force and moment of the ground on them, (2, 3) each, for `stand`."""
+    """Orientation of two feet, (2, 3, 3), force and moment of the ground on them, (2, 3) each,
+    for `stand`.
+    """
     return np.empty((2, 3, 3)), np.empty((2, 3)), np.empty((2, 3))
 
 
 @compiled
-def stand(physics: Physics, constants: Any, world: int, row: Any, feet: tuple[Array, Array, Array]) -> None:
+def stand(
+    physics: Physics, constants: Any, world: int, row: Any, feet: tuple[Array, Array, Array]
+) -> None:
     """Force of the ground on the feet, and the ZMP."""
     foot_R, force, moment = feet
     for foot in range(2):
@@ -509,7 +647,8 @@ def stand(physics: Physics, constants: Any, world: int, row: Any, feet: tuple[Ar
                 foot_R[foot, i, j] = physics.site_xmat[world, constants.at.ankles[foot], 3 * i + j]
     ground_wrench(row.wrench, foot_R, constants.foot_com, constants.foot_weight, force, moment)
     moment_point(force, moment, row.ankles, constants.rules.zmp_n, row.zmp)
-    row.force[0], row.force[1] = force[0, 2], force[1, 2]
+    row.force[0] = force[0, 2]
+    row.force[1] = force[1, 2]
 
 
 @compiled
@@ -517,20 +656,36 @@ def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
     """Since when the swing foot has been on the ground in the second half of its swing."""
     if planned.half_of_swing == FIRST_HALF:
         row.contact_since = -1
-    if planned.half_of_swing == SECOND_HALF and row.contact_since < 0 and row.force[planned.swing_foot] > loaded_n:
+    if (
+        planned.half_of_swing == SECOND_HALF
+        and row.contact_since < 0
+        and row.force[planned.swing_foot] > loaded_n
+    ):
         row.contact_since = row.step
 
 
 @compiled
 def measure(
-    inertial: Any, kind: int, row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, shown: Any
+    inertial: Any,
+    kind: int,
+    row: Any,
+    noise: Any,
+    bias: Any,
+    quality: Any,
+    imu_is_due: bool,
+    shown: Any,
 ) -> None:
     """What IMU and foot sensors show; an IMU that is not due shows its last sample."""
     for foot in range(2):
         for i in range(3):
-            force, moment = row.wrench[foot, 0, i], row.wrench[foot, 1, i]
-            shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
-            shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
+            force = row.wrench[foot, 0, i]
+            moment = row.wrench[foot, 1, i]
+            shown.wrench[foot, 0, i] = (
+                noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
+            )
+            shown.wrench[foot, 1, i] = (
+                noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
+            )
     if imu_is_due:
         if show_inertial(inertial, kind, bias, quality, shown):
             return
@@ -545,7 +700,9 @@ def measure(
 
 @compiled
 def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any) -> bool:
-    """What an inertial IMU shows of its own state, and whether one is fitted: errors of the mounting come on top."""
+    """What an inertial IMU shows of its own state, and whether one is fitted: errors of the
+    mounting come on top.
+    """
     if inertial is None:
         return False
     if not inertial[kind].is_fitted:
@@ -561,11 +718,16 @@ def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any)
 
 
 @compiled
-def settle_imu(inertial: Any, kind: int, row: Any, noise: Any, bias: Any, quality: Any, shown: Any) -> None:
-    """An inertial IMU that has been at rest for long: its filter has settled, a bias of the gyroscope included."""
+def settle_imu(
+    inertial: Any, kind: int, row: Any, noise: Any, bias: Any, quality: Any, shown: Any
+) -> None:
+    """An inertial IMU that has been at rest for long: its filter has settled, a bias of the
+    gyroscope included.
+    """
     if inertial is None:
         return
-    sensor, force = inertial[kind], np.empty(3)
+    sensor = inertial[kind]
+    force = np.empty(3)
     if not sensor.is_fitted:
         return
     specific_force(row, row, 1.0, sensor.gravity_m_s2, force)
@@ -587,14 +749,16 @@ def advance_imu(
     period_s: float,
     shown: Any,
 ) -> None:
-    """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical by its filter.
+    """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical
+    by its filter.
 
     Args:
         inertial: Records of `INERTIAL`, or None.
         kind: Which of them.
         before: Truth at the beginning of the period.
         row: And at its end.
-        noise: Sample of the sensors; that of the attitude is of the accelerometer, across the vertical.
+        noise: Sample of the sensors; that of the attitude is of the accelerometer, across the
+            vertical.
         bias: Of the world.
         quality: One record of `QUALITY`.
         period_s: Control period [s].
@@ -605,7 +769,8 @@ def advance_imu(
     sensor = inertial[kind]
     if not sensor.is_fitted:
         return
-    force, turned = np.empty(3), np.empty(3)
+    force = np.empty(3)
+    turned = np.empty(3)
     specific_force(before, row, period_s, sensor.gravity_m_s2, force)
     rotation_between(before.quaternion, row.quaternion, turned)
     # a force to the left is a positive roll, one forward a negative pitch
@@ -614,14 +779,24 @@ def advance_imu(
     for i in range(3):
         force[i] += bias.specific_force[i]
         rate = turned[i] / period_s + bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
-        shown.imu_gyro[i], turned[i] = rate, rate * period_s
-    complementary_filter(shown.imu_up, turned, force, 1.0 - math.exp(-period_s / sensor.time_constant_s))
+        shown.imu_gyro[i] = rate
+        turned[i] = rate * period_s
+    complementary_filter(
+        shown.imu_up, turned, force, 1.0 - math.exp(-period_s / sensor.time_constant_s)
+    )
 
 
 @compiled
-def specific_force(before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array) -> None:
-    """Mean specific force over a period, acceleration minus gravity, in the frame at its end: into `force` [m/s²]."""
-    w, x, y, z = row.quaternion[0], row.quaternion[1], row.quaternion[2], row.quaternion[3]
+def specific_force(
+    before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array
+) -> None:
+    """Mean specific force over a period, acceleration minus gravity, in the frame at its end:
+    into `force` [m/s²].
+    """
+    w = row.quaternion[0]
+    x = row.quaternion[1]
+    y = row.quaternion[2]
+    z = row.quaternion[3]
     a = (row.pelvis_velocity[0] - before.pelvis_velocity[0]) / period_s
     b = (row.pelvis_velocity[1] - before.pelvis_velocity[1]) / period_s
     c = (row.pelvis_velocity[2] - before.pelvis_velocity[2]) / period_s + gravity_m_s2
@@ -632,8 +807,11 @@ def specific_force(before: Any, row: Any, period_s: float, gravity_m_s2: float, 
 
 @compiled
 def rotation_between(before: Array, after: Array, turned: Array) -> None:
-    """Rotation vector from one unit quaternion to another, in the frame that turns: into `turned`, (3,) [rad]."""
-    a, b = before, after
+    """Rotation vector from one unit quaternion to another, in the frame that turns: into
+    `turned`, (3,) [rad].
+    """
+    a = before
+    b = after
     w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     turned[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
     turned[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
@@ -647,12 +825,14 @@ def rotation_between(before: Array, after: Array, turned: Array) -> None:
 
 @compiled
 def complementary_filter(up: Array, turned: Array, force: Array, gain: float) -> None:
-    r"""One step of a complementary filter of the vertical, the explicit one of [Mahony2008] without bias estimation.
+    r"""One step of a complementary filter of the vertical, the explicit one of [Mahony2008] without
+    bias estimation.
 
     .. math:: \dot u = u \times (\omega + \tfrac{1}{\tau} \, f / |f| \times u)
 
     Args:
-        up: Vertical in the frame of the sensor, a unit vector, which is brought up to date, (3,) [1].
+        up: Vertical in the frame of the sensor, a unit vector, which is brought up to date, (3,)
+            [1].
         turned: Rotation of the sensor by its gyroscope, as a vector in its frame, (3,) [rad].
         force: Specific force by its accelerometer in the frame after it, (3,) [m/s²].
         gain: 1 − exp(−period/τ) [1].
@@ -661,28 +841,46 @@ def complementary_filter(up: Array, turned: Array, force: Array, gain: float) ->
     # what stands still in the world turns backwards in the frame of the sensor
     sine = math.sin(angle) / angle if angle > 0.0 else 1.0
     cosine = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
-    x, y, z = up[0], up[1], up[2]
+    x = up[0]
+    y = up[1]
+    z = up[2]
     p, q, r = cross(x, y, z, turned)
     s, t, u = cross(p, q, r, turned)
-    x, y, z = x + sine * p + cosine * s, y + sine * q + cosine * t, z + sine * r + cosine * u
+    x = x + sine * p + cosine * s
+    y = y + sine * q + cosine * t
+    z = z + sine * r + cosine * u
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     if size > 0.0:
-        a, b, c = force[0] / size, force[1] / size, force[2] / size
+        a = force[0] / size
+        b = force[1] / size
+        c = force[2] / size
         along = a * x + b * y + c * z
-        x, y, z = x + gain * (a - along * x), y + gain * (b - along * y), z + gain * (c - along * z)
+        x = x + gain * (a - along * x)
+        y = y + gain * (b - along * y)
+        z = z + gain * (c - along * z)
     size = math.sqrt(x * x + y * y + z * z)
-    up[0], up[1], up[2] = x / size, y / size, z / size
+    up[0] = x / size
+    up[1] = y / size
+    up[2] = z / size
 
 
 @compiled
 def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: float) -> None:
-    """The vertical where the filter rests, for a constant force and a small bias of the gyroscope: into `up`, (3,)."""
+    """The vertical where the filter rests, for a constant force and a small bias of the
+    gyroscope: into `up`, (3,).
+    """
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-    x, y, z = force[0] / size, force[1] / size, force[2] / size
+    x = force[0] / size
+    y = force[1] / size
+    z = force[2] / size
     p, q, r = cross(x, y, z, gyro)
-    x, y, z = x + time_constant_s * p, y + time_constant_s * q, z + time_constant_s * r
+    x = x + time_constant_s * p
+    y = y + time_constant_s * q
+    z = z + time_constant_s * r
     size = math.sqrt(x * x + y * y + z * z)
-    up[0], up[1], up[2] = x / size, y / size, z / size
+    up[0] = x / size
+    up[1] = y / size
+    up[2] = z / size
 
 
 @compiled
@@ -698,7 +896,9 @@ def in_whole_counts(angle: Any, count_rad: Any) -> Any:
 
 
 @within_compiled
-def shown_angle(angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float) -> Any:
+def shown_angle(
+    angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float
+) -> Any:
     """An angle by the IMU, see `elastic_env.world.sensors.attitude` [rad]."""
     return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
 
@@ -709,7 +909,10 @@ def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray
     is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
     has_fallen = is_down and not has_diverged
     is_terminated = has_diverged or has_fallen
-    ends[0], ends[1], ends[2], ends[3] = has_diverged, has_fallen, is_terminated, is_last and not is_terminated
+    ends[0] = has_diverged
+    ends[1] = has_fallen
+    ends[2] = is_terminated
+    ends[3] = is_last and not is_terminated
     return is_terminated or is_last
 
 
@@ -757,7 +960,9 @@ def fall_penalty(is_terminated: bool) -> float:
 
 @compiled
 def observe_walk(shown: Any, coming: Any, columns: Any, observed: Array) -> None:
-    """What a policy sees of a walker beside its joints, see the table of `elastic_env.robots.thormang.task`."""
+    """What a policy sees of a walker beside its joints, see the table of
+    `elastic_env.robots.thormang.task`.
+    """
     observed[columns.load_share] = coming.share
     for i in range(2):
         observed[columns.imu_attitude + i] = shown.imu_attitude[i]
@@ -789,11 +994,17 @@ def rms_of_rows(values: Array) -> Array:
 
 
 @compiled
-def ground_wrench(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
-    """Wrench of the ground on the feet of one robot, see `FootSensors`: into `force` and `moment`, (L, 3)."""
+def ground_wrench(
+    sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
+) -> None:
+    """Wrench of the ground on the feet of one robot, see `FootSensors`: into `force` and
+    `moment`, (L, 3).
+    """
     c = np.empty(3)
     for foot in range(len(sensors)):
-        R, (f, n), w = foot_R[foot], sensors[foot], weight[foot]
+        R = foot_R[foot]
+        f, n = sensors[foot]
+        w = weight[foot]
         for i in range(3):
             c[i] = R[i, 0] * com[foot, 0] + R[i, 1] * com[foot, 1] + R[i, 2] * com[foot, 2]
             force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
@@ -808,16 +1019,21 @@ def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp:
     """ZMP of one robot, see `zero_moment_point`: into `zmp`, (2,)."""
     about_x = about_y = vertical = 0.0
     for foot in range(len(force)):
-        f, n, p = force[foot], moment[foot], ankle[foot]
+        f = force[foot]
+        n = moment[foot]
+        p = ankle[foot]
         about_x += p[1] * f[2] - p[2] * f[1] + n[0]
         about_y += p[2] * f[0] - p[0] * f[2] + n[1]
         vertical += f[2]
     scale = vertical if vertical >= least_n else np.nan
-    zmp[0], zmp[1] = -about_y / scale, about_x / scale
+    zmp[0] = -about_y / scale
+    zmp[1] = about_x / scale
 
 
 @compiled
-def ground_wrenches(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
+def ground_wrenches(
+    sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
+) -> None:
     """`ground_wrench` of several robots."""
     for row in range(len(sensors)):
         ground_wrench(sensors[row], foot_R[row], com, weight, force[row], moment[row])

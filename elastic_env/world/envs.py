@@ -58,7 +58,9 @@ class _Faces:
         return self.task.simulation
 
     def truth(self) -> Any:
-        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
+        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing
+        else.
+        """
         return self.task.truth()
 
     @property
@@ -112,15 +114,21 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         self.task = task
         task.attach(simulation, num_threads=1, is_scalar=True)
         self._make_picture = picture
-        self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
+        self._steps_per_frame = max(
+            round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1
+        )
         self._steps = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode, with options["robot_seed"] = s of the robot, and motion, that `reset(seed=s)` draws."""
+        """Begin an episode, with options["robot_seed"] = s of the robot, and motion, that
+        `reset(seed=s)` draws.
+        """
         super().reset(seed=seed, options=options)
-        self.task.restart(np.ones(1, dtype=np.bool_), _episodes([self.np_random], _robot_seeds(options, 1)))
+        self.task.restart(
+            np.ones(1, dtype=np.bool_), _episodes([self.np_random], _robot_seeds(options, 1))
+        )
         self._steps = 0
         self._render_human()
         return self.task.observe()[0], _first(self.task.signals())
@@ -139,7 +147,9 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         )
 
     def render(self) -> Any:
-        """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
+        """The present picture as an RGB array, (height, width, 3) uint8; None in the other
+        modes.
+        """
         return self._draw().rgb(self.task.signals()) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -156,8 +166,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
 ):
     """Many worlds of a task on a thread pool.
 
-    World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever the number of worlds
-    and threads.
+    World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever
+    the number of worlds and threads.
 
     Args:
         task: The rules, for num_envs worlds.
@@ -179,11 +189,14 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
-        self.render_mode, self._make_picture = render_mode, picture
+        self.render_mode = render_mode
+        self._make_picture = picture
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
-            raise unknown_name("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]) from None
+            raise unknown_name(
+                "autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]
+            ) from None
         self.num_envs = task.num_worlds
         self.single_observation_space = task.observation_table.space(np.float64)
         self.single_action_space = task.action_table.space(np.float32)
@@ -199,11 +212,13 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode in every world, or in those of options["reset_mask"].
 
-        With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)` draws for it, under
-        noise and pushes of its own: the same robot walks again. It may be a list, as `seed`, with None for a new one.
+        With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)`
+        draws for it, under noise and pushes of its own: the same robot walks again. It may be a
+        list, as `seed`, with None for a new one.
         """
         mask = reset_mask(options, self.num_envs)
-        seeds, robots = _seeds(seed, self.num_envs), _robot_seeds(options, self.num_envs)
+        seeds = _seeds(seed, self.num_envs)
+        robots = _robot_seeds(options, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
@@ -214,7 +229,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self, actions: Action
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
-        restarting, given = self._done, np.asarray(actions)
+        restarting = self._done
+        given = np.asarray(actions)
         some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
         if some_restart and given.shape == self.action_space.shape:
             given = np.where(restarting[:, None], 0.0, given)
@@ -222,7 +238,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         if some_restart:
             result = self._restarted_instead(result, restarting)
         self._done = done = result.done
-        observation, info = result.observation, result.info
+        observation = result.observation
+        info = result.info
         if done.any():
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 observation, info = self._restarted_after(result)
@@ -233,10 +250,16 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
     @property
     def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What Gymnasium's wrappers ask for."""
-        return {**ElasticEnv.metadata, "render_modes": ["rgb_array"], "autoreset_mode": self.autoreset_mode}
+        return {
+            **ElasticEnv.metadata,
+            "render_modes": ["rgb_array"],
+            "autoreset_mode": self.autoreset_mode,
+        }
 
     def render(self) -> tuple[Observation, ...] | None:
-        """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms each."""
+        """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms
+        each.
+        """
         if self.render_mode is None:
             return None
         signals = self.task.signals()
@@ -251,17 +274,24 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
-        """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
+        """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts
+        for nothing.
+        """
         self._begin(worlds)
         fresh = self.task.signals()
         info = _restarted_info(result.info, worlds, fresh)
-        terminated, truncated = result.terminated & ~worlds, result.truncated & ~worlds
+        terminated = result.terminated & ~worlds
+        truncated = result.truncated & ~worlds
         if not (terminated | truncated).any():  # what ended had ended before
             info = _without_metrics(info)
-        return Transition(self.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info)
+        return Transition(
+            self.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info
+        )
 
     def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
-        """SAME_STEP: the worlds that end begin anew at once; their last observation and info are kept beside."""
+        """SAME_STEP: the worlds that end begin anew at once; their last observation and info are
+        kept beside.
+        """
         final = final_of(result.observation, _with_mask(result.info, result.done), result.done)
         self._begin(result.done)
         info = _without_metrics(_restarted_info(result.info, result.done, self.task.signals()))
@@ -269,14 +299,23 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
 
 
 def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
-    """What Gymnasium's SAME_STEP keeps of the worlds that end: their last observation, and the info of the step."""
+    """What Gymnasium's SAME_STEP keeps of the worlds that end: their last observation, and the
+    info of the step.
+    """
     last = np.full(len(done), None, dtype=object)
     for world in np.flatnonzero(done):
         last[world] = observation[world].copy()
-    return {"final_obs": last, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
+    return {
+        "final_obs": last,
+        "_final_obs": done.copy(),
+        "final_info": info,
+        "_final_info": done.copy(),
+    }
 
 
-def _episodes(generators: Sequence[np.random.Generator], robots: Sequence[int | None]) -> list[EpisodeRandom]:
+def _episodes(
+    generators: Sequence[np.random.Generator], robots: Sequence[int | None]
+) -> list[EpisodeRandom]:
     """Generators of new episodes, of new robots or of those that some seeds draw."""
     return [
         EpisodeRandom(own) if seed is None else EpisodeRandom(seeding.np_random(seed)[0], own)
@@ -298,7 +337,9 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
             f"{name} must be a whole number, one per world ({num_envs}), or None; got {shown(seed)}"
         )
     if len(seed) != num_envs:
-        raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
+        raise ConfigurationError(
+            f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}"
+        )
     return [None if one is None else int(one) for one in seed]
 
 
@@ -312,7 +353,8 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
     given = np.asarray(mask)
     if given.dtype != np.bool_ or given.shape != (num_envs,):
         raise ConfigurationError(
-            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got {shown(mask)}"
+            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got"
+            f" {shown(mask)}"
         )
     return given
 
@@ -320,7 +362,9 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
 def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> dict[str, Any]:
     """The info of a step in which some worlds begin anew: theirs is that of the reset."""
     changed = info | {key: np.where(worlds, value, info[key]) for key, value in fresh.items()}
-    changed["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+    changed["reward_terms"] = {
+        key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()
+    }
     changed["termination"] = np.where(worlds, "", info["termination"])
     changed["clipped"] = np.where(worlds, 0.0, info["clipped"])
     return changed
@@ -328,7 +372,11 @@ def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> 
 
 def _without_metrics(info: dict[str, Any]) -> dict[str, Any]:
     """The info of a step in which no episode has ended."""
-    return {key: value for key, value in info.items() if key not in ("episode_metrics", "_episode_metrics")}
+    return {
+        key: value
+        for key, value in info.items()
+        if key not in ("episode_metrics", "_episode_metrics")
+    }
 
 
 def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
@@ -339,4 +387,7 @@ def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:
     """The info of the only world, with Python scalars."""
-    return {key: _first(value) if isinstance(value, dict) else value[0].item() for key, value in info.items()}
+    return {
+        key: _first(value) if isinstance(value, dict) else value[0].item()
+        for key, value in info.items()
+    }

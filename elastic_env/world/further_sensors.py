@@ -1,4 +1,5 @@
-"""Sensors beyond the standard set of a robot: each is declared once, and observed where `sensors=[...]` asks for it.
+"""Sensors beyond the standard set of a robot: each is declared once, and observed where
+`sensors=[...]` asks for it.
 
 | name | columns | unit | shows | error in `nominal`, none in `ideal` |
 |---|---|---|---|---|
@@ -8,10 +9,10 @@
 
 `link_imu` of a fixed robot of one joint is declared in `elastic_env.world.joint_task`.
 
-The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib), at half the
-control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5 % of 100 N·m. It is drawn anew every
-control step, the offset every episode.
-"""
+The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4,
+calib), at half the control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5
+% of 100 N·m. It is drawn anew every control step, the offset every episode.
+"""  # noqa: E501
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,8 +35,8 @@ class SensorInputs:
     Attributes:
         q: Link angles, (num_worlds, n) [rad].
         joint_torque: Of spring and damper on the links, (num_worlds, n) [N·m].
-        specific_force: Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²]; nan
-            where no sensor asks for it.
+        specific_force: Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²];
+            nan where no sensor asks for it.
     """
 
     q: Array
@@ -70,15 +71,24 @@ class Sensor:
 
 
 SENSORS: Mapping[str, Sensor] = {
-    "link_encoder": Sensor("rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True),
+    "link_encoder": Sensor(
+        "rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True
+    ),
     "joint_torque": Sensor(
-        "N·m", "torque sensor on the link side of the spring", lambda truth: truth.joint_torque, noise=0.2, offset=0.5
+        "N·m",
+        "torque sensor on the link side of the spring",
+        lambda truth: truth.joint_torque,
+        noise=0.2,
+        offset=0.5,
     ),
     "accelerometer": Sensor(
-        "m/s²", "specific force at the IMU, in its frame", lambda truth: truth.specific_force,
-        axes={"x": "same", "y": "opposite", "z": "same"}, noise=1.0e-3 * np.sqrt(125.0),
+        "m/s²",
+        "specific force at the IMU, in its frame",
+        lambda truth: truth.specific_force,
+        axes={"x": "same", "y": "opposite", "z": "same"},
+        noise=1.0e-3 * np.sqrt(125.0),
     ),
-}  # fmt: skip
+}
 """Sensors by the name that `sensors=[...]` gives them."""
 
 ACCELEROMETER = "accelerometer"
@@ -87,7 +97,10 @@ ACCELEROMETER = "accelerometer"
 def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
     """Give a model the sensor that `specific_force` reads, at a site."""
     spec.add_sensor(
-        name=ACCELEROMETER, type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+        name=ACCELEROMETER,
+        type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname=site,
     )
 
 
@@ -104,8 +117,10 @@ class FurtherSensors:
 
     Args:
         names: Of `SENSORS`.
-        joints: The robot's joints in order, and what their angles are in the mirror, None where it has none.
-        scenarios: Of every world: its `sensor_noise` scales noise and offset, and it has the encoders' errors.
+        joints: The robot's joints in order, and what their angles are in the mirror, None where it
+            has none.
+        scenarios: Of every world: its `sensor_noise` scales noise and offset, and it has the
+            encoders' errors.
         counts_per_turn: Of the encoders.
 
     Raises:
@@ -134,14 +149,20 @@ class FurtherSensors:
         self._offset = {group.name: np.zeros((num_worlds, *group.shape)) for group in groups}
         self._now = self._before = np.zeros((num_worlds, len(self.signals)))
 
-    def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs) -> None:
+    def restart(
+        self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs
+    ) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:
             return
         for world in np.flatnonzero(worlds).tolist():
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
-                width = self._homing_rad[world] if sensor.is_encoder else self._scale[world] * sensor.offset
+                width = (
+                    self._homing_rad[world]
+                    if sensor.is_encoder
+                    else self._scale[world] * sensor.offset
+                )
                 offset[world] = width * random[world].robot.uniform(-1.0, 1.0, offset.shape[1])
             self._noise.restart(world, random[world].noise())
         self.measure(worlds, truth)
@@ -156,10 +177,13 @@ class FurtherSensors:
             self._shown(sensor, sensor.truth(truth) + self._offset[name], drawn[name])
             for name, sensor in self._sensors.items()
         ]
-        self._before, self._now = self._now, np.where(worlds[:, None], np.hstack(shown), self._now)
+        self._before = self._now
+        self._now = np.where(worlds[:, None], np.hstack(shown), self._now)
 
     def columns(self, is_delayed: BoolArray) -> Array:
-        """What they show, (num_worlds, columns); in worlds whose measurements are old, a control step ago."""
+        """What they show, (num_worlds, columns); in worlds whose measurements are old, a control
+        step ago.
+        """
         return np.where(is_delayed[:, None], self._before, self._now)
 
     def _shown(self, sensor: Sensor, value: Array, drawn: Array) -> Array:

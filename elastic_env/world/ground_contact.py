@@ -1,8 +1,8 @@
 r"""Zero moment point from the wrenches at the ankles.
 
-A force-torque sensor at the ankle measures what the foot passes on to the leg: the ground's force less the weight of
-the foot itself, (f, n) about the ankle, in the frame of the foot. With the ground's forces on both feet,
-taken about the origin on the ground, the ZMP is
+A force-torque sensor at the ankle measures what the foot passes on to the leg: the ground's force
+less the weight of the foot itself, (f, n) about the ankle, in the frame of the foot. With the
+ground's forces on both feet, taken about the origin on the ground, the ZMP is
 
 .. math:: x = -M_y / F_z, \quad y = M_x / F_z
 """
@@ -41,14 +41,17 @@ class FootSensors:
         """Force and moment of the ground on each foot, about its ankle, in the world.
 
         Args:
-            sensors: Force and moment on the leg about the ankle, in the frame of the foot, (n, L, 2, 3) [N], [N·m].
+            sensors: Force and moment on the leg about the ankle, in the frame of the foot, (n, L,
+                2, 3) [N], [N·m].
             foot_R: Orientation of the feet, (n, L, 3, 3).
 
         Returns:
             (n, L, 3) each [N], [N·m].
         """
-        seen, R = _rows(sensors, (*foot_R.shape[:-2], 2, 3), 3), _rows(foot_R, foot_R.shape, 3)
-        force, moment = np.empty(R.shape[:-1]), np.empty(R.shape[:-1])
+        seen = _rows(sensors, (*foot_R.shape[:-2], 2, 3), 3)
+        R = _rows(foot_R, foot_R.shape, 3)
+        force = np.empty(R.shape[:-1])
+        moment = np.empty(R.shape[:-1])
         ground_wrenches(seen, R, self.com, self.weight, force, moment)
         shape = foot_R.shape[:-1]
         return force.reshape(shape), moment.reshape(shape)
@@ -57,7 +60,8 @@ class FootSensors:
         """ZMP as if the feet lay flat where they are planned, (n, 2) [m].
 
         Args:
-            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3) [N], [N·m].
+            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3)
+                [N], [N·m].
             ankles: Planned positions of the ankles, (2, 3) [m].
             least_n: Vertical force below which there is no ZMP, and the result is nan [N].
         """
@@ -89,5 +93,7 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
 def _rows(values: Array, shape: tuple[int, ...], axes: int) -> Array:
     """Values of a shape with one row per robot: all but the last axes in one."""
     if values.shape != shape:
-        values = np.broadcast_to(values, shape)  # which cannot be written to: to Numba that is another type
+        values = np.broadcast_to(
+            values, shape
+        )  # which cannot be written to: to Numba that is another type
     return np.require(values, requirements=["C", "W"]).reshape(-1, *shape[-axes:])

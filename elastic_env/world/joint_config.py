@@ -16,9 +16,12 @@ from elastic_env.world.scenario import WALKER_FIELDS, Scenario, make_scenario, s
 class RewardWeights(Model):
     """Weights of the reward terms; every term is a penalty that grows without saturating."""
 
-    link_error: float = quantity("1/rad", 100.0, ge=0, le=1e6, description="per rad of link error: 1 at 0.01 rad")
-    command_rate: float = quantity("s/rad", 0.1, ge=0, le=1e6, description="per rad/s of change of the offset")
-    divergence: float = quantity("1", 200.0, ge=0, le=1e6, description="once, where the simulation diverges")
+    link_error: float = quantity("1/rad", 100.0, ge=0, le=1e6)
+    """Per rad of link error: 1 at 0.01 rad [1/rad]."""
+    command_rate: float = quantity("s/rad", 0.1, ge=0, le=1e6)
+    """Per rad/s of change of the offset [s/rad]."""
+    divergence: float = quantity("1", 200.0, ge=0, le=1e6)
+    """Once, where the simulation diverges [1]."""
 
 
 class JointConfig(Model):
@@ -30,8 +33,10 @@ class JointConfig(Model):
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
     """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
-    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
-    timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
+    control_period_s: float = quantity("s", 0.004, gt=0)
+    """Time between commands [s]."""
+    timestep_s: float = quantity("s", 5e-4, gt=0)
+    """Physics step [s]."""
     reward: RewardWeights = RewardWeights()
 
     @model_validator(mode="after")
@@ -39,13 +44,15 @@ class JointConfig(Model):
         acting = [name for name in WALKER_FIELDS if getattr(self.scenario, name)]
         if acting:
             raise ValueError(
-                f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker knows; here "
-                f"choose from: {', '.join(scenario_names(walks=False))}"
+                f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"
+                f" knows; here choose from: {', '.join(scenario_names(walks=False))}"
             )
         return self
 
     def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A joint as the plant has it, which the scenario makes differ from the one that is known."""
+        """A joint as the plant has it, which the scenario makes differ from the one that is
+        known.
+        """
         scenario = self.scenario
         return joint.replace(
             stiffness=joint.stiffness * scenario.stiffness_scale,
@@ -67,9 +74,10 @@ def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
         ConfigurationError: A servo is too weak.
     """
     if np.any(needed > limits):
-        weakest, extent = int(np.argmax(needed - limits)), reference.extent()
+        weakest = int(np.argmax(needed - limits))
+        extent = reference.extent()
         raise ConfigurationError(
-            f"the reference {reference.kind!r} can need {needed[weakest]:.1f} N·m of a servo limited to "
-            f"{limits[weakest]:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to {extent.q_ddot:.2f} rad/s²); "
-            "lower its amplitude or its rate"
+            f"the reference {reference.kind!r} can need {needed[weakest]:.1f} N·m of a servo"
+            f" limited to {limits[weakest]:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to"
+            f" {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
         )

@@ -1,9 +1,11 @@
-"""A task of n elastic joints: make the links follow a reference although the joints bend under gravity.
+"""A task of n elastic joints: make the links follow a reference although the joints bend under
+gravity.
 
-The observation has the encoders, the reference of the coming control period, the last command, and the sensors that are
-asked for; the action is the command offset of every joint. With one joint its signals have plain names, with several
-`name.<joint>`, and `info` then has the figures of all joints together under the plain names: rms of the link errors, of
-the deflections, of the servo errors and of the offsets' rates, largest joint torque.
+The observation has the encoders, the reference of the coming control period, the last command, and
+the sensors that are asked for; the action is the command offset of every joint. With one joint its
+signals have plain names, with several `name.<joint>`, and `info` then has the figures of all joints
+together under the plain names: rms of the link errors, of the deflections, of the servo errors and
+of the offsets' rates, largest joint torque.
 """
 
 import copy
@@ -36,13 +38,20 @@ from elastic_env.world.task import Task, joint_groups, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
-"""Name by which `sensors=[...]` asks for it, on a robot of one joint; its errors are those of the scenario's IMU."""
+"""Name by which `sensors=[...]` asks for it, on a robot of one joint; its errors are those of
+the scenario's IMU.
+"""
 
 _SCORES = record_type(("link_error", REAL), ("command_rate", REAL), ("divergence", REAL))
 _TRUTH = record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))  # as in a `Plan`
-_SHOWN = record_type(("imu", REAL), ("visible_imu", REAL))  # link angle now, and as old as the scenario has it [rad]
+_SHOWN = record_type(
+    ("imu", REAL), ("visible_imu", REAL)
+)  # link angle now, and as old as the scenario has it [rad]
 _CONSTANTS = record_type(
-    ("weights", _SCORES), ("imu_noise_rad", REAL), ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL)
+    ("weights", _SCORES),
+    ("imu_noise_rad", REAL),
+    ("imu_bias_rad", REAL),
+    ("imu_sine_error_rad", REAL),
 )
 _SCHEDULE = record_type(("scored", np.bool_), ("rest", WHOLE), ("imu_is_due", np.bool_))
 
@@ -82,11 +91,12 @@ class JointPlant:
         model: Compiled, with elastic joints.
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad], and if they differ
-            from the true ones the springs' factors, (..., n) [1], and the dead bands, (..., n) [rad].
+        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad],
+            and if they differ from the true ones the springs' factors, (..., n) [1], and the dead
+            bands, (..., n) [rad].
         motion: The reference as all joints follow it.
-        imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
-            q = 0 [m]; None where there is no such IMU.
+        imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a
+            link that hangs at q = 0 [m]; None where there is no such IMU.
         end_effector: Whose place and tilt are scored; None where the joints alone are.
     """
 
@@ -108,7 +118,9 @@ class JointPlant:
 
 @dataclass(frozen=True)
 class JointTruth(SensorInputs):
-    """Noise-free state of the joints and their true parameters, one row per world. For scoring and the oracle.
+    """Noise-free state of the joints and their true parameters, one row per world.
+
+    For scoring and the oracle.
 
     Attributes:
         theta, theta_dot, q_dot: Motor and link side, (num_worlds, n) [rad], [rad/s].
@@ -132,7 +144,8 @@ class JointTask(Task):
         config: Reference, scenario, sensors, rewards, periods.
         plant: What moves.
         num_worlds: How many.
-        observe_imu: Whether the IMU of the only link is observed, if no sensor of the configuration asks for it.
+        observe_imu: Whether the IMU of the only link is observed, if no sensor of the configuration
+            asks for it.
 
     Raises:
         ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
@@ -142,17 +155,21 @@ class JointTask(Task):
     world_type = record_type(("truth", _TRUTH), ("shown", _SHOWN), ("scores", _SCORES))
     noise_type = record_type(("imu", REAL))
 
-    def __init__(self, config: JointConfig, plant: JointPlant, num_worlds: int, observe_imu: bool = False) -> None:
+    def __init__(
+        self, config: JointConfig, plant: JointPlant, num_worlds: int, observe_imu: bool = False
+    ) -> None:
         joints = plant.joint_names
         observe_imu = observe_imu or LINK_IMU_SENSOR in config.sensors
         if observe_imu and len(joints) > 1:
             raise ConfigurationError(
-                f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has {len(joints)}; "
-                "choose link_encoder to observe the links of several"
+                f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has"
+                f" {len(joints)}; choose link_encoder to observe the links of several"
             )
         scenario = config.scenario
         period_s = config.control_period_s
-        count_rad = angle_of_count(plant.true.encoder_counts_per_turn if scenario.encoder_counts else None)
+        count_rad = angle_of_count(
+            plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
+        )
         reference = PlanTable(plant.motion, period_s, num_worlds)
         require_stable(stiffest(plant.model, scenario), period_s)
         super().__init__(
@@ -188,19 +205,27 @@ class JointTask(Task):
         self._plant = plant
         self._joint_names = joints
         self._true_model = plant.true.observed_by(self.observation_table)
-        self._rest_watch = RestWatch(plant.static_torque, plant.true.rest_stiffness(config.form), joints)
+        self._rest_watch = RestWatch(
+            plant.static_torque, plant.true.rest_stiffness(config.form), joints
+        )
         self._imu = _inertial_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)
         self._imu_column = self.observation_table.group(LINK_IMU.name).start if observe_imu else -1
         self._schedule = _schedule(reference, scenario.imu.rate_hz, period_s)
         self._link_constants = one(
             _CONSTANTS,
-            weights=one(_SCORES, **{name: getattr(config.reward, name) for name in _SCORES.names or ()}),
+            weights=one(
+                _SCORES, **{name: getattr(config.reward, name) for name in _SCORES.names or ()}
+            ),
             imu_noise_rad=scenario.imu.noise_rad,
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
-        self._springs = [int(self.model.tendon(spring_name(joint)).id) for joint in joints if config.form == "tendon"]
+        self._springs = [
+            int(self.model.tendon(spring_name(joint)).id)
+            for joint in joints
+            if config.form == "tendon"
+        ]
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes, also for the watch over windows at rest."""
@@ -208,7 +233,9 @@ class JointTask(Task):
         self._rest_watch.restart(worlds)
 
     def score(self) -> None:
-        """Take further steps into the metrics, and look whether the joints rest in windows at rest."""
+        """Take further steps into the metrics, and look whether the joints rest in windows at
+        rest.
+        """
         if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
             for row in range(self._unscored, self._row + 1):
                 joints = self._joints[row]["truth"]
@@ -272,7 +299,8 @@ class JointTask(Task):
 
     def _place(self, worlds: BoolArray) -> None:
         """The servos hold q_ref, the springs are already deflected."""
-        simulation, at = self.simulation, self._at
+        simulation = self.simulation
+        at = self._at
         truth = self._joints[self._row]["truth"][worlds]
         self._vary(worlds, truth)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
@@ -280,7 +308,9 @@ class JointTask(Task):
         factor = np.array([robot.stiffness_factor for robot in self._drawn(worlds)])
         q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
-        simulation.qpos[np.ix_(worlds, at["theta"])] = command - self._true_model.servo_compliance * torque
+        simulation.qpos[np.ix_(worlds, at["theta"])] = (
+            command - self._true_model.servo_compliance * torque
+        )
         simulation.qpos[np.ix_(worlds, at["q"])] = q
         simulation.ctrl[np.ix_(worlds, at["servo"])] = command
         for column, servo in enumerate(self._true_model.servos):
@@ -293,7 +323,9 @@ class JointTask(Task):
 
     def _vary(self, worlds: BoolArray, truth: Records) -> None:
         """Give the physics the joints that were drawn, (worlds, n)."""
-        scenario, model, simulation = self.config.scenario, self.model, self.simulation
+        scenario = self.config.scenario
+        model = self.model
+        simulation = self.simulation
         if not scenario.ranges and scenario.stiffness_spread == 0.0:
             return
         springs = np.ix_(worlds, np.array(self._springs, dtype=np.int64))
@@ -317,20 +349,29 @@ class JointTask(Task):
         return [self._robot(world) for world in np.flatnonzero(worlds).tolist()]
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
-        simulation, joints = self.simulation, self._constants
+        simulation = self.simulation
+        joints = self._constants
         if self._imu is not None:
             self._imu.settle(worlds, simulation.qpos[:, self._at["q"][0]])
         noise = self._noise.ready()
-        kernels.begin_links(simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps())
+        kernels.begin_links(
+            simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps()
+        )
 
     def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        simulation, joints = self.simulation, self._constants
-        qpos, qvel = simulation.qpos, simulation.qvel
+        simulation = self.simulation
+        joints = self._constants
+        qpos = simulation.qpos
+        qvel = simulation.qvel
         if self._imu is not None:
             too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
-            self._imu.advance(~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]])
+            self._imu.advance(
+                ~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]]
+            )
         noise = self._noise.ready()
-        return kernels.sense_links(qpos, qvel, joints, self._links, noise, commanded, self._steps(), results)
+        return kernels.sense_links(
+            qpos, qvel, joints, self._links, noise, commanded, self._steps(), results
+        )
 
     def _show_worlds(self, observed: Array) -> None:
         if self._imu_column >= 0:
@@ -343,7 +384,8 @@ class JointTask(Task):
         return self._schedule, self._link_constants, self._imu_bias, self._imu_column, angle
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        q_ref, q = joints["q_ref"], joints["q"]
+        q_ref = joints["q_ref"]
+        q = joints["q"]
         of_joints = {
             "reference_angle": q_ref,
             "link_angle": q,
@@ -363,7 +405,11 @@ class JointTask(Task):
             distance, tilt = self._plant.end_effector.errors(q_ref, q)
             shown |= {"end_effector_error": distance, "end_effector_tilt": tilt}
         truth = worlds["truth"]
-        return {"time_s": truth["step"] * self.config.control_period_s, **shown, "rest": truth["rest"].copy()}
+        return {
+            "time_s": truth["step"] * self.config.control_period_s,
+            **shown,
+            "rest": truth["rest"].copy(),
+        }
 
     def _signals_of_several(self, of_joints: dict[str, Array]) -> Signals:
         """Signals of every joint, and what they come to together."""
@@ -387,7 +433,9 @@ class JointTask(Task):
 def _observed(joints: Sequence[str], observe_imu: bool) -> list[Signal]:
     """The standard columns."""
     groups = joint_groups(dict.fromkeys(joints))
-    return [signal for group in groups for signal in group.signals] + ([LINK_IMU] if observe_imu else [])
+    return [signal for group in groups for signal in group.signals] + (
+        [LINK_IMU] if observe_imu else []
+    )
 
 
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
@@ -401,7 +449,9 @@ def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Reco
 
 
 def stiffest(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
-    """A model with the stiffest springs and strongest dampers that a scenario draws; tendons count as springs."""
+    """A model with the stiffest springs and strongest dampers that a scenario draws; tendons
+    count as springs.
+    """
     stiffness = [1.0 + scenario.stiffness_spread] + [
         own.stiffness[1] * own.joint_stiffness[1] for own in scenario.ranges
     ]
@@ -425,8 +475,8 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
         return None
     if plant.imu_arm_m is None:
         raise ConfigurationError(
-            f"scenario {config.scenario.name!r} is about the IMU on a link, which {plant.name} does not have; "
-            "choose another one, or the testbed or the walker"
+            f"scenario {config.scenario.name!r} is about the IMU on a link, which {plant.name} does"
+            " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
     return PendulumImu(sensor, plant.imu_arm_m, gravity, config.control_period_s, num_worlds)

@@ -1,6 +1,8 @@
-"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one, the same results bit for bit.
+"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one, the same results
+bit for bit.
 
-Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one call.
+Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one
+call.
 """
 
 import copy
@@ -18,7 +20,10 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 
 
 class Simulation(Protocol):
-    """What a task needs of the physics. The state arrays are live views; writing `ctrl` commands the next advance."""
+    """What a task needs of the physics.
+
+    The state arrays are live views; writing `ctrl` commands the next advance.
+    """
 
     model: mujoco.MjModel
     num_worlds: int
@@ -30,8 +35,9 @@ class Simulation(Protocol):
     def bind(self, field: str) -> Array:
         """A live (num_worlds, ...) view of a field of `MjData`.
 
-        Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics step behind the state,
-        as after `mj_step`; they are filled by the calls after they were first bound, so bind them before `refresh`.
+        Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics
+        step behind the state, as after `mj_step`; they are filled by the calls after they were
+        first bound, so bind them before `refresh`.
         """
         ...
 
@@ -40,11 +46,14 @@ class Simulation(Protocol):
         ...
 
     def vary(self, field: str) -> Array:
-        """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now on."""
+        """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now
+        on.
+        """
         ...
 
     def take(self, world: int, model: mujoco.MjModel) -> None:
-        """Give a world a model of its own, with as many bodies, joints and sensors, instead of varied fields.
+        """Give a world a model of its own, with as many bodies, joints and sensors, instead of
+        varied fields.
 
         The state of the world stays.
         """
@@ -55,15 +64,21 @@ class Simulation(Protocol):
         ...
 
     def refresh(self, worlds: BoolArray) -> None:
-        """Compute derived fields and sensors of the present state in some worlds, a (num_worlds,) mask."""
+        """Compute derived fields and sensors of the present state in some worlds, a
+        (num_worlds,) mask.
+        """
         ...
 
     def restart(self, worlds: BoolArray) -> None:
-        """Set some worlds, a (num_worlds,) mask, to the model's defaults; write their state afterwards."""
+        """Set some worlds, a (num_worlds,) mask, to the model's defaults; write their state
+        afterwards.
+        """
         ...
 
     def diverged(self) -> BoolArray:
-        """Worlds whose state, acceleration or control has been a bad number since their restart, (num_worlds,)."""
+        """Worlds whose state, acceleration or control has been a bad number since their restart,
+        (num_worlds,).
+        """
         ...
 
     def close(self) -> None:
@@ -72,18 +87,31 @@ class Simulation(Protocol):
 
 
 DIVERGED_RAD_S = 1e3
-"""Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the servos."""
+"""Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the
+servos.
+"""
 
-_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
+_BAD = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}"))
+    for what in ("QPOS", "QVEL", "QACC", "CTRL")
+]
 _OTHERS = {
-    int(mujoco.mjtWarning.mjWARN_INERTIA): "a nearly singular inertia matrix: look at the inertias of its bodies",
-    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): 'too many contacts for its memory: enlarge <size memory="..."/>',
-    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): 'too many constraints for its memory: enlarge <size memory="..."/>',
+    int(
+        mujoco.mjtWarning.mjWARN_INERTIA
+    ): "a nearly singular inertia matrix: look at the inertias of its bodies",
+    int(
+        mujoco.mjtWarning.mjWARN_CONTACTFULL
+    ): 'too many contacts for its memory: enlarge <size memory="..."/>',
+    int(
+        mujoco.mjtWarning.mjWARN_CNSTRFULL
+    ): 'too many constraints for its memory: enlarge <size memory="..."/>',
 }
 
 
 class _Warnings:
-    """What MuJoCo warns of: bad numbers, which end an episode, and anything else, which is said once."""
+    """What MuJoCo warns of: bad numbers, which end an episode, and anything else, which is said
+    once.
+    """
 
     def __init__(self) -> None:
         self._said: set[int] = set()
@@ -93,10 +121,14 @@ class _Warnings:
         if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
         is_bad = np.asarray(counts[:, _BAD].any(axis=1))
-        for kind in np.flatnonzero(counts[~is_bad].any(axis=0)).tolist():  # what explodes has every fault
+        for kind in np.flatnonzero(
+            counts[~is_bad].any(axis=0)
+        ).tolist():  # what explodes has every fault
             if kind in _OTHERS and kind not in self._said:
                 self._said.add(kind)
-                warnings.warn(f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2)
+                warnings.warn(
+                    f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2
+                )
         return is_bad
 
 
@@ -106,19 +138,30 @@ class SingleWorld:
     num_worlds = 1
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.__setstate__({"model": model, "varied": set(), "data": mujoco.MjData(model), "warnings": _Warnings()})
+        self.__setstate__(
+            {"model": model, "varied": set(), "data": mujoco.MjData(model), "warnings": _Warnings()}
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views, for `copy.deepcopy` and pickle."""
-        return {"model": self.model, "varied": self._varied, "data": self._data, "warnings": self._warnings}
+        return {
+            "model": self.model,
+            "varied": self._varied,
+            "data": self._data,
+            "warnings": self._warnings,
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.model: mujoco.MjModel = state["model"]
         self._varied: set[str] = state["varied"]
-        self._data, self._warnings = state["data"], state["warnings"]
-        self._counts, self._views = self._data.warning.number[None], dict[tuple[str, ...], tuple[Array, ...]]()
-        self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
-        self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
+        self._data = state["data"]
+        self._warnings = state["warnings"]
+        self._counts = self._data.warning.number[None]
+        self._views = dict[tuple[str, ...], tuple[Array, ...]]()
+        self.qpos = self._data.qpos[None]
+        self.qvel = self._data.qvel[None]
+        self.act = self._data.act[None]
+        self.ctrl = self._data.ctrl[None]
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
@@ -183,19 +226,33 @@ class ManyWorlds:
         own: list[mujoco.MjModel] | None = None,
     ) -> None:
         """Begin with worlds in the model's default state, and threads of this process."""
-        self.model, self.num_worlds, self._warnings, self._process = model, num_worlds, said, os.getpid()
-        self._own_models, self._are_given = own, own is None
+        self.model = model
+        self.num_worlds = num_worlds
+        self._warnings = said
+        self._process = os.getpid()
+        self._own_models = own
+        self._are_given = own is None
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
-        self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
+        self.qpos = self._batch.bind("qpos")
+        self.qvel = self._batch.bind("qvel")
+        self.act = self._batch.bind("act")
+        self.ctrl = self._batch.bind("ctrl")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a process that was forked."""
+        """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a
+        process that was forked.
+        """
         return {
-            "made": (self.model, self.num_worlds, self._batch.nthread, self._warnings, self._own_models),
+            "made": (
+                self.model,
+                self.num_worlds,
+                self._batch.nthread,
+                self._warnings,
+                self._own_models,
+            ),
             "bound": self._bound,
             "varied": {field: self.vary(field).copy() for field in self._varied},
             "state": self._batch.state.copy(),
@@ -212,7 +269,9 @@ class ManyWorlds:
         self._batch.warning[:] = state["warning"]
 
     def _ready(self) -> batch.Batch:
-        """The batch with the models of its worlds, and threads of this process: a fork leaves those of the parent."""
+        """The batch with the models of its worlds, and threads of this process: a fork leaves
+        those of the parent.
+        """
         if self._process != os.getpid():
             inherited = self._batch
             # its end would wait for threads that are not there: it is never freed
@@ -243,7 +302,8 @@ class ManyWorlds:
         """See `Simulation`."""
         if self._own_models is None:
             self._own_models = [self.model] * self.num_worlds
-        self._own_models[world], self._are_given = model, False
+        self._own_models[world] = model
+        self._are_given = False
 
     def model_of(self, world: int) -> mujoco.MjModel:
         """The model of a world with all that is its own, for reading."""
@@ -289,16 +349,18 @@ def substeps(control_period_s: float, timestep_s: float) -> int:
     """Physics steps in a control period.
 
     Raises:
-        ConfigurationError: The control period is no multiple of the physics step, or holds too many of them.
+        ConfigurationError: The control period is no multiple of the physics step, or holds too many
+            of them.
     """
     ratio = control_period_s / timestep_s
     if ratio > _MOST_SUBSTEPS:
         raise ConfigurationError(
-            f"timestep_s must be at least {control_period_s / _MOST_SUBSTEPS:g} s, a {_MOST_SUBSTEPS}th of the control "
-            f"period, got {timestep_s:g} s"
+            f"timestep_s must be at least {control_period_s / _MOST_SUBSTEPS:g} s, a"
+            f" {_MOST_SUBSTEPS}th of the control period, got {timestep_s:g} s"
         )
     if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
         raise ConfigurationError(
-            f"timestep_s must divide the control period of {control_period_s:g} s, got {timestep_s:g} s"
+            f"timestep_s must divide the control period of {control_period_s:g} s, got"
+            f" {timestep_s:g} s"
         )
     return round(ratio)

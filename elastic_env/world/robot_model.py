@@ -1,4 +1,6 @@
-"""What a compensator may know of a robot: its rigid model and the parameters of its elastic joints."""
+"""What a compensator may know of a robot: its rigid model and the parameters of its elastic
+joints.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,7 +27,8 @@ STIFFNESS_KEY = "stiffness_nm_per_rad"
 class RobotModel:
     """A compiled rigid model and an `ElasticJoint` for each of its elastic hinges, in order.
 
-    The same type describes what the compensators assume and, in `truth()`, what the plant really is.
+    The same type describes what the compensators assume and, in `truth()`, what the plant really
+    is.
     """
 
     joints: Mapping[str, ElasticJoint]
@@ -83,14 +86,20 @@ class RobotModel:
         """
         without = [name for name, joint in self.joints.items() if joint.servo is None]
         if without:
-            raise ConfigurationError(f"a servo is needed on every joint, but there is none on: {', '.join(without)}")
+            raise ConfigurationError(
+                f"a servo is needed on every joint, but there is none on: {', '.join(without)}"
+            )
         return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
-        """How far a servo itself gives way under a torque, (n,) [rad/(N·m)]: 1/k_p, 0 where an integrator holds it."""
+        """How far a servo itself gives way under a torque, (n,) [rad/(N·m)]: 1/k_p, 0 where an
+        integrator holds it.
+        """
         servos = [joint.servo for joint in self.joints.values()]
-        return np.array([0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos])
+        return np.array(
+            [0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos]
+        )
 
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
         """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
@@ -106,13 +115,17 @@ class RobotModel:
         springs = np.zeros_like(stiffness) if form == "rigid" else 1.0 / stiffness
         with np.errstate(divide="ignore"):
             in_series = 1.0 / (springs + self.servo_compliance)
-        return np.where(self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else stiffness)
+        return np.where(
+            self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else stiffness
+        )
 
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
-        """The same robot with another stiffness, one number for all joints or one per joint [N·m/rad].
+        """The same robot with another stiffness, one number for all joints or one per joint
+        [N·m/rad].
 
         Raises:
-            ConfigurationError: The number of values does not fit, or one is not positive and finite.
+            ConfigurationError: The number of values does not fit, or one is not positive and
+                finite.
         """
         return replace(self, joints=with_stiffness(self.joints, stiffness))
 
@@ -121,10 +134,14 @@ class RobotModel:
         return replace(self, observation_table=table)
 
     def _values(self, parameter: str) -> Array:
-        return np.array([getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64)
+        return np.array(
+            [getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64
+        )
 
 
-def with_stiffness(joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike) -> dict[str, ElasticJoint]:
+def with_stiffness(
+    joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike
+) -> dict[str, ElasticJoint]:
     """Joints with another stiffness, one number for all or one per joint [N·m/rad].
 
     Raises:
@@ -137,7 +154,10 @@ def with_stiffness(joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike)
             f"({', '.join(joints)}), got an array of shape {values.shape}"
         )
     each = np.broadcast_to(values, (len(joints),))
-    return {name: j.replace(stiffness=float(k)) for (name, j), k in zip(joints.items(), each, strict=True)}
+    return {
+        name: j.replace(stiffness=float(k))
+        for (name, j), k in zip(joints.items(), each, strict=True)
+    }
 
 
 @dataclass(frozen=True)
@@ -149,21 +169,27 @@ class WalkerModel(RobotModel):
 
 
 def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "float | Array":
-    """A stiffness given as a number, as one per joint, or as the file that `elastic identify` writes [N·m/rad].
+    """A stiffness given as a number, as one per joint, or as the file that `elastic identify`
+    writes [N·m/rad].
 
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
-    given, value = value, plain_numbers(value)
+    given = value
+    value = plain_numbers(value)
     if isinstance(value, list | tuple):
         try:
             if any(isinstance(item, str | bool) for item in value):  # NumPy would convert them
                 raise TypeError
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {shown(given)}") from None
+            raise ConfigurationError(
+                f"stiffness must be numbers [N·m/rad], got {shown(given)}"
+            ) from None
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
-        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {shown(value)}")
+        raise ConfigurationError(
+            f"stiffness must be a number [N·m/rad] or an identification file, got {shown(value)}"
+        )
     try:
         return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
     except (TypeError, ValueError):
@@ -172,11 +198,13 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
         content = read_bounded(path, LARGEST_JSON)
     except (OSError, ValueError):
         raise ConfigurationError(
-            f"stiffness must be a number [N·m/rad] or an identification file, found no file {shortened(path)}"
+            "stiffness must be a number [N·m/rad] or an identification file, found no file"
+            f" {shortened(path)}"
         ) from None
     try:
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(
-            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see `elastic identify`"
+            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see"
+            " `elastic identify`"
         ) from None

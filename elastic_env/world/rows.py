@@ -1,8 +1,9 @@
 """Records of a control step: one per joint and one per world, with their fields by name.
 
-NumPy's structured types, which Numba compiles as they stand: `joints[world, i].truth.theta` in a kernel,
-`joints["truth"]["theta"]` in NumPy. A joint is a record, so the code that is compiled serves any number of joints.
-Truth is what the physics did. Measurements are what sensors show of it. Nothing is in both.
+NumPy's structured types, which Numba compiles as they stand: `joints[world, i].truth.theta` in a
+kernel, `joints["truth"]["theta"]` in NumPy. A joint is a record, so the code that is compiled
+serves any number of joints. Truth is what the physics did. Measurements are what sensors show of
+it. Nothing is in both.
 """
 
 from collections.abc import Sequence
@@ -28,18 +29,28 @@ def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
 
 
 JOINT = record_type(
-    ("truth", record_type(
-        ("q_ref", REAL),  # [rad]
-        ("theta", REAL), ("theta_dot", REAL),  # motor side [rad], [rad/s]
-        ("q", REAL), ("q_dot", REAL),  # link side [rad], [rad/s]
-        ("offset", REAL), ("command", REAL),  # a, and θ_cmd = q_ref + a [rad]
-        ("command_rate", REAL),  # change of a [rad/s]
-        ("stiffness", REAL), ("damping", REAL),  # true K [N·m/rad] and D [N·m·s/rad]
-        ("backlash", REAL),  # dead band [rad]
-        ("homing", REAL),  # what the encoder shows beyond θ [rad]
-    )),
-    ("shown", record_type(("encoder", REAL), ("encoder_before", REAL))),  # now and one control step ago [rad]
-)  # fmt: skip
+    (
+        "truth",
+        record_type(
+            ("q_ref", REAL),  # [rad]
+            ("theta", REAL),
+            ("theta_dot", REAL),  # motor side [rad], [rad/s]
+            ("q", REAL),
+            ("q_dot", REAL),  # link side [rad], [rad/s]
+            ("offset", REAL),
+            ("command", REAL),  # a, and θ_cmd = q_ref + a [rad]
+            ("command_rate", REAL),  # change of a [rad/s]
+            ("stiffness", REAL),
+            ("damping", REAL),  # true K [N·m/rad] and D [N·m·s/rad]
+            ("backlash", REAL),  # dead band [rad]
+            ("homing", REAL),  # what the encoder shows beyond θ [rad]
+        ),
+    ),
+    (
+        "shown",
+        record_type(("encoder", REAL), ("encoder_before", REAL)),
+    ),  # now and one control step ago [rad]
+)
 """A joint in a control step. What is true of its spring and its encoder is drawn per episode."""
 
 COURSE: Any = (
@@ -59,10 +70,12 @@ RULES = record_type(
 """Rules of the joints of a world."""
 
 ADDRESS = record_type(
-    ("theta", WHOLE), ("q", WHOLE),  # in qpos
-    ("theta_dot", WHOLE), ("q_dot", WHOLE),  # in qvel
+    ("theta", WHOLE),
+    ("q", WHOLE),  # in qpos
+    ("theta_dot", WHOLE),
+    ("q_dot", WHOLE),  # in qvel
     ("servo", WHOLE),  # in ctrl
-)  # fmt: skip
+)
 """Where a joint stands in the physics."""
 
 JOINT_COLUMNS = (

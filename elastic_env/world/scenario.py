@@ -1,8 +1,8 @@
 """Named conditions: what the true plant has that the assumed model does not know of.
 
-Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` (the paper's robot: friction, sensor
-noise, encoder counts), and changes on top of either. A change alone is meant on top of `nominal`; `ideal+soft` puts it
-on `ideal`, and changes can be joined: `soft+payload`.
+Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` (the paper's robot:
+friction, sensor noise, encoder counts), and changes on top of either. A change alone is meant on
+top of `nominal`; `ideal+soft` puts it on `ideal`, and changes can be joined: `soft+payload`.
 """
 
 import math
@@ -25,52 +25,71 @@ class Scenario(Model):
     """Difference between the true plant and the assumed model, and the quality of the sensors."""
 
     name: Title = "custom"
-    stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
-    friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
-    backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
-    stiffness_spread: float = quantity(
-        "1", 0.0, ge=0, lt=1, description="half-width of a further factor on every joint's stiffness, drawn per robot"
-    )
-    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of pendulum")
-    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, not in the model")
-    push_n: float = quantity("N", 0.0, ge=0, description="walker: force of a push on the torso, anywhere in the walk")
-    push_s: float = quantity("s", 0.1, gt=0, le=600, description="walker: duration of the push")
-    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, direction drawn")
+    stiffness_scale: float = quantity("1", 1.0, gt=0)
+    """True over assumed stiffness of every joint [1]."""
+    friction_scale: float = quantity("1", 1.0, ge=0)
+    """Share of the joints' friction that acts, 0 for none [1]."""
+    backlash_rad: float = quantity("rad", 0.0, ge=0)
+    """Dead band of every joint, unknown to the compensator [rad]."""
+    stiffness_spread: float = quantity("1", 0.0, ge=0, lt=1)
+    """Half-width of a further factor on every joint's stiffness, drawn per robot [1]."""
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0)
+    """Testbed: true over assumed mass of pendulum [1]."""
+    torso_load_kg: float = quantity("kg", 0.0, ge=0)
+    """Walker: mass on the torso, not in the model [kg]."""
+    push_n: float = quantity("N", 0.0, ge=0)
+    """Walker: force of a push on the torso, anywhere in the walk [N]."""
+    push_s: float = quantity("s", 0.1, gt=0, le=600)
+    """Walker: duration of the push [s]."""
+    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5)
+    """Walker: slope of the floor, direction drawn [rad]."""
     encoder_counts: bool = True
     """Whether the encoders have whole counts."""
-    encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")
+    encoder_bias_rad: float = quantity("rad", 0.0, ge=0)
+    """Half-width of the encoders' homing error [rad]."""
     imu: AttitudeSensor = AttitudeSensor()
     """IMU on the link of the testbed."""
     pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
     """IMU in the pelvis of the walker, the same for roll and pitch."""
     inertial: InertialSensor | None = None
-    """IMU in the walker's pelvis or on the testbed's link that computes its attitude; None for one that shows the true
-    one with the noise of `pelvis_imu` or `imu`. Other errors of these are then those of the mounting."""
-    gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
-    force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
-    moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
-    sensor_noise: float = quantity("1", 0.0, ge=0, description="factor on the errors of further sensors")
-    delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
+    """IMU in the walker's pelvis or on the testbed's link that computes its attitude; None for one
+    that shows the true one with the noise of `pelvis_imu` or `imu`. Other errors of these are then
+    those of the mounting."""
+    gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0)
+    """Walker: standard deviation of the gyroscope [rad/s]."""
+    force_noise_n: float = quantity("N", 0.0, ge=0)
+    """Walker: standard deviation of the foot forces [N]."""
+    moment_noise_nm: float = quantity("N·m", 0.0, ge=0)
+    """Walker: standard deviation of the foot moments [N·m]."""
+    sensor_noise: float = quantity("1", 0.0, ge=0)
+    """Factor on the errors of further sensors [1]."""
+    delay_steps: int = quantity("control steps", 0, ge=0, le=1)
+    """Age of the measurements [control steps]."""
     ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
-    """Ranges that every episode's robot is drawn from, in equal shares where there are several; none for the robot that
-    the other fields describe. What is drawn comes on top of what they say."""
+    """Ranges that every episode's robot is drawn from, in equal shares where there are several;
+    none for the robot that the other fields describe. What is drawn comes on top of what they
+    say."""
 
     @model_validator(mode="after")
     def _ranges_say_all_that_is_drawn(self) -> Self:
         fixed = [name for name in _LEFT_TO_RANGES if getattr(self, name)]
-        if self.ranges and (fixed or self.imu.bias_spread_rad > 0.0 or self.pelvis_imu.bias_spread_rad > 0.0):
+        if self.ranges and (
+            fixed or self.imu.bias_spread_rad > 0.0 or self.pelvis_imu.bias_spread_rad > 0.0
+        ):
             raise ValueError(
-                "ranges say what is drawn; leave out "
-                f"{', '.join(fixed or ['bias_spread_rad of pelvis_imu'])}, or give the ranges an interval for it"
+                "ranges say what is drawn; leave out"
+                f" {', '.join(fixed or ['bias_spread_rad of pelvis_imu'])}, or give the ranges an"
+                " interval for it"
             )
         return self
 
     def with_ranges(self, changes: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Self:
-        """The scenario with other intervals; one that draws from none, or from several ranges, is as it was.
+        """The scenario with other intervals; one that draws from none, or from several ranges, is
+        as it was.
 
         Args:
-            changes: Fields of `RobotRanges` that differ from the scenario's; of several such mappings each makes ranges
-                of its own, which have equal shares of the robots.
+            changes: Fields of `RobotRanges` that differ from the scenario's; of several such
+                mappings each makes ranges of its own, which have equal shares of the robots.
         """
         if not changes or len(self.ranges) != 1:
             return self
@@ -79,11 +98,17 @@ class Scenario(Model):
 
     @property
     def draws_robots(self) -> bool:
-        """Whether episodes of the same motion differ in more than noise: joints, offsets of sensors, push or slope."""
+        """Whether episodes of the same motion differ in more than noise: joints, offsets of
+        sensors, push or slope.
+        """
         drawn = (
-            self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.imu.bias_spread_rad,
+            self.stiffness_spread,
+            self.push_n,
+            self.slope_rad,
+            self.encoder_bias_rad,
+            self.imu.bias_spread_rad,
             self.pelvis_imu.bias_spread_rad,
-        )  # fmt: skip
+        )
         return bool(self.ranges) or self.inertial is not None or any(value > 0.0 for value in drawn)
 
     @property
@@ -94,13 +119,23 @@ class Scenario(Model):
 
     @property
     def homing_width_rad(self) -> float:
-        """Half-width of the homing error of encoders beside those of the motors; of ranges their largest error."""
-        return max([self.encoder_bias_rad, *(abs(end) for own in self.ranges for end in own.homing_rad)])
+        """Half-width of the homing error of encoders beside those of the motors; of ranges their
+        largest error.
+        """
+        return max(
+            [self.encoder_bias_rad, *(abs(end) for own in self.ranges for end in own.homing_rad)]
+        )
 
     @property
     def pelvis_noise_rad(self) -> float:
-        """Walker: standard deviation of the noise of roll and pitch, in an inertial IMU before its filter."""
-        return self.pelvis_imu.noise_rad if self.inertial is None else self.inertial.accelerometer_noise_rad
+        """Walker: standard deviation of the noise of roll and pitch, in an inertial IMU before
+        its filter.
+        """
+        return (
+            self.pelvis_imu.noise_rad
+            if self.inertial is None
+            else self.inertial.accelerometer_noise_rad
+        )
 
     @property
     def pelvis_gyro_noise_rad_s(self) -> float:
@@ -108,16 +143,25 @@ class Scenario(Model):
         return self.gyro_noise_rad_s if self.inertial is None else self.inertial.gyro_noise_rad_s
 
 
-_LEFT_TO_RANGES = "stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad", "inertial", "delay_steps"
+_LEFT_TO_RANGES = (
+    "stiffness_spread",
+    "push_n",
+    "slope_rad",
+    "encoder_bias_rad",
+    "inertial",
+    "delay_steps",
+)
 """Parameters that `RobotRanges` has, too, for each robot its own."""
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
-# the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs at 500 Hz
+# the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs
+# at 500 Hz
 _PELVIS_IMU = AttitudeSensor(noise_rad=0.2e-3, rate_hz=500.0)
 # 3DM-GX4-25: 8.73e-5 rad/s/√Hz (KumarRobotics/imu_3dm_gx4) at half the control rate of 250 Hz
 _GYRO_NOISE_RAD_S = 1.0e-3
 # an assumption for the six-axis sensors of the feet, whose data were not found
-_FORCE_NOISE_N, _MOMENT_NOISE_NM = 1.0, 0.05
+_FORCE_NOISE_N = 1.0
+_MOMENT_NOISE_NM = 0.05
 # an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
 _HOMING_ERROR_RAD = 2e-3
 
@@ -174,8 +218,8 @@ TRAINING_RANGES = RobotRanges(
     push_share=0.5,
     delay_share=0.5,
 )
-"""Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named changes but
-`stiff`'s on all joints at once."""
+"""Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named
+changes but `stiff`'s on all joints at once."""
 _BEYOND: tuple[dict[str, Any], ...] = (
     {"stiffness": (0.6, 0.7)},
     {"stiffness": (1.3, 1.5)},
@@ -193,18 +237,22 @@ DISTRIBUTIONS: dict[str, ScenarioChange] = {
     "drawn": lambda _: {"ranges": [TRAINING_RANGES]},
     "drawn_beyond": lambda _: {"ranges": [TRAINING_RANGES.replace(**beyond) for beyond in _BEYOND]},
 }
-"""Changes that draw every episode's robot from ranges: those to learn from, and for tests robots that have one
-quantity beyond these."""
+"""Changes that draw every episode's robot from ranges: those to learn from, and for tests robots
+that have one quantity beyond these."""
 
 
 WALKER_FIELDS = ("push_n", "slope_rad")
 """Parameters that only a robot that walks knows."""
-WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
+WALKER_ONLY = tuple(
+    name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS}
+)
 """Changes that set one of them."""
 
 
 def scenario_names(walks: bool = True) -> list[str]:
-    """Named conditions, joined names and distributions aside; only those of robots that do not walk if asked."""
+    """Named conditions, joined names and distributions aside; only those of robots that do not
+    walk if asked.
+    """
     return [*GROUNDS, *(name for name in CHANGES if walks or name not in WALKER_ONLY)]
 
 
@@ -216,23 +264,29 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
         walks: Whether an unknown name is answered with those of robots that walk, too.
 
     Raises:
-        ConfigurationError: A part of the name does not exist, a ground stands behind another part, or two changes set
-            the same parameter.
+        ConfigurationError: A part of the name does not exist, a ground stands behind another part,
+            or two changes set the same parameter.
     """
     if isinstance(name, Scenario):
         return name
     first, *rest = str(name)[:_LONGEST_JOINED].split("+")
-    ground, changes = (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
+    ground, changes = (
+        (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
+    )
     parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
-            raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
+            raise ConfigurationError(
+                f"scenario {name!r}: {change!r} is a ground and can only stand first"
+            )
         known = CHANGES | DISTRIBUTIONS
         if change not in known:
             raise unknown_name("scenario", change, [*scenario_names(walks), *DISTRIBUTIONS])
         added = known[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
-            raise ConfigurationError(f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time")
+            raise ConfigurationError(
+                f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time"
+            )
         parameters |= added
     return ground.replace(**parameters, name=str(name))

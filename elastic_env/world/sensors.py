@@ -1,8 +1,9 @@
-"""What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate of its own.
+"""What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate
+of its own.
 
-An `AttitudeSensor` shows the true attitude with errors. An `InertialSensor` computes it from a gyroscope and an
-accelerometer, as a device does, so that the acceleration of what carries it disturbs it. `PendulumImu` plays one on a
-link that hangs from a horizontal axis.
+An `AttitudeSensor` shows the true attitude with errors. An `InertialSensor` computes it from a
+gyroscope and an accelerometer, as a device does, so that the acceleration of what carries it
+disturbs it. `PendulumImu` plays one on a link that hangs from a horizontal axis.
 """
 
 import math
@@ -13,17 +14,29 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.world.control_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
+from elastic_env.world.control_kernels import (
+    complementary_filter,
+    in_whole_counts,
+    settled_vertical,
+    shown_angle,
+)
 
 
 class AttitudeSensor(Model):
-    """IMU attitude of one axis: bias, white noise, and a sample rate below or at the control rate."""
+    """IMU attitude of one axis: bias, white noise, and a sample rate below or at the control
+    rate.
+    """
 
-    noise_rad: float = quantity("rad", 0.0, ge=0, description="standard deviation of the white noise")
-    bias_rad: float = quantity("rad", 0.0, description="constant offset")
-    bias_spread_rad: float = quantity("rad", 0.0, ge=0, description="half-width of a further offset, drawn per episode")
-    sine_error_rad: float = quantity("rad", 0.0, description="amplitude of an error proportional to sin(angle)")
-    rate_hz: float = quantity("Hz", 100.0, gt=0, description="sample rate; the value is held in between")
+    noise_rad: float = quantity("rad", 0.0, ge=0)
+    """Standard deviation of the white noise [rad]."""
+    bias_rad: float = quantity("rad", 0.0)
+    """Constant offset [rad]."""
+    bias_spread_rad: float = quantity("rad", 0.0, ge=0)
+    """Half-width of a further offset, drawn per episode [rad]."""
+    sine_error_rad: float = quantity("rad", 0.0)
+    """Amplitude of an error proportional to sin(angle) [rad]."""
+    rate_hz: float = quantity("Hz", 100.0, gt=0)
+    """Sample rate; the value is held in between [Hz]."""
 
     @property
     def is_random(self) -> bool:
@@ -35,51 +48,54 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 class InertialSensor(Model):
-    r"""IMU that computes its attitude from its gyroscope and its accelerometer; by default the 3DM-GX4-25.
+    r"""IMU that computes its attitude from its gyroscope and its accelerometer; by default the
+    3DM-GX4-25.
 
-    Its filter is the explicit complementary filter of [Mahony2008] for the vertical u, without estimation of the
-    bias: it integrates the gyroscope's rate ω, and turns towards the accelerometer's specific force f with a time
-    constant τ. A bias b of the gyroscope tilts it by b τ, an acceleration a by atan(a/g), both as a first-order lag.
+    Its filter is the explicit complementary filter of [Mahony2008] for the vertical u, without
+    estimation of the bias: it integrates the gyroscope's rate ω, and turns towards the
+    accelerometer's specific force f with a time constant τ. A bias b of the gyroscope tilts it by b
+    τ, an acceleration a by atan(a/g), both as a first-order lag.
 
     .. math:: \dot u = u \times (\omega + \tfrac{1}{\tau} \, f / |f| \times u)
 
-    The device reports this filter's attitude beside that of a Kalman filter whose model is not published. Its time
-    constant for the vertical is a setting of 1 to 1000 s, 10 s by default (LORD 3DM-GX5-35 DCP manual, 4.2.21,
-    command 0x0C 0x51, of which it says that it is the same algorithm in this family of devices).
+    The device reports this filter's attitude beside that of a Kalman filter whose model is not
+    published. Its time constant for the vertical is a setting of 1 to 1000 s, 10 s by default (LORD
+    3DM-GX5-35 DCP manual, 4.2.21, command 0x0C 0x51, of which it says that it is the same algorithm
+    in this family of devices).
 
-    Figures of the data sheet with ± are typical ones: they are taken as standard deviations of a normal distribution.
-    Noise and in-run bias of the gyroscope are 0.005 °/s/√Hz and ±10 °/h, noise and initial bias of the accelerometer
-    100 µg/√Hz and ±0.002 g, attitude ±0.25° at rest and ±0.5° in motion (LORD 3DM-GX4-25 data sheet; the noises and
-    the bias of the accelerometer also in thormang3_imu_3dm_gx4, calib). The initial bias of the gyroscope is left out:
-    the device takes it away by a capture at rest (command 0x0C 0x39).
+    Figures of the data sheet with ± are typical ones: they are taken as standard deviations of a
+    normal distribution. Noise and in-run bias of the gyroscope are 0.005 °/s/√Hz and ±10 °/h, noise
+    and initial bias of the accelerometer 100 µg/√Hz and ±0.002 g, attitude ±0.25° at rest and ±0.5°
+    in motion (LORD 3DM-GX4-25 data sheet; the noises and the bias of the accelerometer also in
+    thormang3_imu_3dm_gx4, calib). The initial bias of the gyroscope is left out: the device takes
+    it away by a capture at rest (command 0x0C 0x39).
 
-    What the bias of both sensors leaves of the error at rest is drawn as an offset: alignment, scale and mounting.
+    What the bias of both sensors leaves of the error at rest is drawn as an offset: alignment,
+    scale and mounting.
     """
 
-    gyro_noise_density: float = quantity(
-        "rad/s/√Hz", math.radians(0.005), ge=0, description="noise density of the gyroscope"
-    )
-    gyro_bias_rad_s: float = quantity(
-        "rad/s", math.radians(10.0) / 3600.0, ge=0, description="standard deviation of the gyroscope's bias"
-    )
-    accelerometer_noise_density: float = quantity(
-        "m/s²/√Hz", 100e-6 * STANDARD_GRAVITY_M_S2, ge=0, description="noise density of the accelerometer"
-    )
-    accelerometer_bias_m_s2: float = quantity(
-        "m/s²", 0.002 * STANDARD_GRAVITY_M_S2, ge=0, description="standard deviation of the accelerometer's bias"
-    )
-    static_error_rad: float = quantity(
-        "rad", math.radians(0.25), ge=0, description="standard deviation of roll's and pitch's error at rest"
-    )
-    time_constant_s: float = quantity("s", 10.0, gt=0, description="time constant of the complementary filter")
-    bandwidth_hz: float = quantity("Hz", 125.0, gt=0, description="of the noise: half the control rate of 250 Hz")
+    gyro_noise_density: float = quantity("rad/s/√Hz", math.radians(0.005), ge=0)
+    """Noise density of the gyroscope [rad/s/√Hz]."""
+    gyro_bias_rad_s: float = quantity("rad/s", math.radians(10.0) / 3600.0, ge=0)
+    """Standard deviation of the gyroscope's bias [rad/s]."""
+    accelerometer_noise_density: float = quantity("m/s²/√Hz", 100e-6 * STANDARD_GRAVITY_M_S2, ge=0)
+    """Noise density of the accelerometer [m/s²/√Hz]."""
+    accelerometer_bias_m_s2: float = quantity("m/s²", 0.002 * STANDARD_GRAVITY_M_S2, ge=0)
+    """Standard deviation of the accelerometer's bias [m/s²]."""
+    static_error_rad: float = quantity("rad", math.radians(0.25), ge=0)
+    """Standard deviation of roll's and pitch's error at rest [rad]."""
+    time_constant_s: float = quantity("s", 10.0, gt=0)
+    """Time constant of the complementary filter [s]."""
+    bandwidth_hz: float = quantity("Hz", 125.0, gt=0)
+    """Of the noise: half the control rate of 250 Hz [Hz]."""
 
     @model_validator(mode="after")
     def _biases_are_within_the_static_error(self) -> Self:
         if self.static_error_rad < self._error_by_bias_rad:
             raise ValueError(
-                f"static_error_rad must be at least what the biases make of it, {self._error_by_bias_rad:.3g} rad, got "
-                f"{self.static_error_rad:g}; lower accelerometer_bias_m_s2, gyro_bias_rad_s or time_constant_s"
+                "static_error_rad must be at least what the biases make of it,"
+                f" {self._error_by_bias_rad:.3g} rad, got {self.static_error_rad:g}; lower"
+                " accelerometer_bias_m_s2, gyro_bias_rad_s or time_constant_s"
             )
         return self
 
@@ -90,11 +106,15 @@ class InertialSensor(Model):
 
     @property
     def accelerometer_noise_rad(self) -> float:
-        """Standard deviation of roll and pitch by the accelerometer's mean over a control period [rad].
+        """Standard deviation of roll and pitch by the accelerometer's mean over a control period
+        [rad].
 
-        Only noise across the vertical tilts the attitude, that along it has no effect to first order.
+        Only noise across the vertical tilts the attitude, that along it has no effect to first
+        order.
         """
-        return self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz) / STANDARD_GRAVITY_M_S2
+        return (
+            self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz) / STANDARD_GRAVITY_M_S2
+        )
 
     @property
     def offset_rad(self) -> float:
@@ -112,7 +132,8 @@ def quantise(angle: Array, count_rad: Array | float) -> Array:
 
     Args:
         angle: (...) [rad].
-        count_rad: Angle of a count, one for all or what goes with the shape of `angle` [rad]; 0 for none.
+        count_rad: Angle of a count, one for all or what goes with the shape of `angle` [rad]; 0 for
+            none.
 
     Returns:
         (...) [rad].
@@ -138,23 +159,29 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    return shown_angle(angle, drawn_bias, sensor.noise_rad * noise, sensor.bias_rad, sensor.sine_error_rad)
+    return shown_angle(
+        angle, drawn_bias, sensor.noise_rad * noise, sensor.bias_rad, sensor.sine_error_rad
+    )
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
     """Whether a sensor of its own rate delivers a new sample at a control step, (n,).
 
-    Step 0, the start of an episode, always does; a sensor faster than the control loop does at every step.
+    Step 0, the start of an episode, always does; a sensor faster than the control loop does at
+    every step.
     """
     samples_per_step = rate_hz * control_period_s
     # the small shift keeps a rate that divides the control rate exact in floating point
-    return (step == 0) | (np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9))
+    return (step == 0) | (
+        np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9)
+    )
 
 
 class NoiseStream:
     """Standard normal samples, one independent stream per world, drawn in blocks.
 
-    World i's samples depend on its generator and on how many it has used, never on the other worlds.
+    World i's samples depend on its generator and on how many it has used, never on the other
+    worlds.
 
     Args:
         num_worlds: How many.
@@ -165,9 +192,12 @@ class NoiseStream:
     def __init__(self, num_worlds: int, kind: np.dtype[Any], block: int = 250) -> None:
         # samples of a time are neighbours in memory: worlds mostly use theirs together
         self._samples = np.zeros((block, num_worlds), kind)
-        self._used, self._world = np.zeros(num_worlds, dtype=np.int64), np.arange(num_worlds)
+        self._used = np.zeros(num_worlds, dtype=np.int64)
+        self._world = np.arange(num_worlds)
         self._most_used = 0
-        self._generators: list[np.random.Generator] = [np.random.default_rng(0) for _ in range(num_worlds)]
+        self._generators: list[np.random.Generator] = [
+            np.random.default_rng(0) for _ in range(num_worlds)
+        ]
 
     def restart(self, world: int, generator: np.random.Generator) -> None:
         """Begin a new stream for one world."""
@@ -175,7 +205,9 @@ class NoiseStream:
         self._refill(world)
 
     def next(self, worlds: BoolArray) -> Any:
-        """The next sample of some worlds, (num_worlds,); the rows of the others are not to be used."""
+        """The next sample of some worlds, (num_worlds,); the rows of the others are not to be
+        used.
+        """
         samples, used = self.ready()
         sample = samples[np.minimum(used, len(samples) - 1), self._world]
         used += worlds
@@ -185,8 +217,8 @@ class NoiseStream:
         """Samples ahead, at least one of each world, for one step.
 
         Returns:
-            (block, num_worlds), and how many of each world's are used, (num_worlds,): its next one has that number, and
-            counting it is for the caller.
+            (block, num_worlds), and how many of each world's are used, (num_worlds,): its next one
+            has that number, and counting it is for the caller.
         """
         block = len(self._samples)
         if self._most_used >= block:
@@ -204,18 +236,22 @@ class NoiseStream:
 
 
 _PENDULUM_NOISE = np.dtype([("rate", np.float64), ("force", np.float64, (2,))])
-"""A sample of noise: of the gyroscope, and of the accelerometer along both axes in the plane of the motion [1]."""
+"""A sample of noise: of the gyroscope, and of the accelerometer along both axes in the plane of
+the motion [1].
+"""
 
 
 class PendulumImu:
-    r"""An `InertialSensor` on a link that hangs from a horizontal axis where q = 0, and turns with it.
+    r"""An `InertialSensor` on a link that hangs from a horizontal axis where q = 0, and turns with
+    it.
 
-    In the frame of the link, x along its motion and z towards the axis, the vertical is (sin q, 0, cos q). The specific
-    force at a distance r from the axis is
+    In the frame of the link, x along its motion and z towards the axis, the vertical is (sin q, 0,
+    cos q). The specific force at a distance r from the axis is
 
     .. math:: f = (r \ddot q + g \sin q, \; 0, \; r \dot q^2 + g \cos q)
 
-    The gyroscope shows the mean rate over a control period, the accelerometer the mean tangential acceleration.
+    The gyroscope shows the mean rate over a control period, the accelerometer the mean tangential
+    acceleration.
 
     Args:
         sensor: Its errors and its filter.
@@ -226,16 +262,29 @@ class PendulumImu:
     """
 
     def __init__(
-        self, sensor: InertialSensor, arm_m: float, gravity_m_s2: float, period_s: float, num_worlds: int
+        self,
+        sensor: InertialSensor,
+        arm_m: float,
+        gravity_m_s2: float,
+        period_s: float,
+        num_worlds: int,
     ) -> None:
-        self._sensor, self._arm_m, self._gravity, self._period_s = sensor, arm_m, gravity_m_s2, period_s
+        self._sensor = sensor
+        self._arm_m = arm_m
+        self._gravity = gravity_m_s2
+        self._period_s = period_s
         self._gain = 1.0 - math.exp(-period_s / sensor.time_constant_s)
-        self._up, self._last = np.zeros((num_worlds, 3)), np.zeros((num_worlds, 2))
-        self._bias = np.zeros((num_worlds, 3))  # of the gyroscope, then of the accelerometer along x and z
+        self._up = np.zeros((num_worlds, 3))
+        self._last = np.zeros((num_worlds, 2))
+        self._bias = np.zeros(
+            (num_worlds, 3)
+        )  # of the gyroscope, then of the accelerometer along x and z
         self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
 
     def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
-        """Draw the errors of an episode; the offset of the angle that is shown is for the caller [rad]."""
+        """Draw the errors of an episode; the offset of the angle that is shown is for the caller
+        [rad].
+        """
         sensor = self._sensor
         gyro, x, z, offset = generator.standard_normal(4)
         force = sensor.accelerometer_bias_m_s2
@@ -252,13 +301,23 @@ class PendulumImu:
             settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
 
     def advance(self, worlds: BoolArray, q: Array, q_dot: Array) -> None:
-        """The links of some worlds have moved to q, (num_worlds,) [rad], with rates q̇ [rad/s], in a control period."""
-        drawn, last, sensor = self._noise.next(worlds), self._last, self._sensor
+        """The links of some worlds have moved to q, (num_worlds,) [rad], with rates q̇ [rad/s],
+        in a control period.
+        """
+        drawn = self._noise.next(worlds)
+        last = self._last
+        sensor = self._sensor
         force = self._force(q, q_dot, (q_dot - last[:, 1]) / self._period_s)
         force[:, ::2] += sensor.accelerometer_noise_rad * self._gravity * drawn["force"]
-        turned = q - last[:, 0] + self._period_s * (self._bias[:, 0] + sensor.gyro_noise_rad_s * drawn["rate"])
+        turned = (
+            q
+            - last[:, 0]
+            + self._period_s * (self._bias[:, 0] + sensor.gyro_noise_rad_s * drawn["rate"])
+        )
         for world in np.flatnonzero(worlds):
-            complementary_filter(self._up[world], np.array([0.0, -turned[world], 0.0]), force[world], self._gain)
+            complementary_filter(
+                self._up[world], np.array([0.0, -turned[world], 0.0]), force[world], self._gain
+            )
         self._last[worlds] = np.stack([q, q_dot], axis=1)[worlds]
 
     @property
@@ -268,6 +327,9 @@ class PendulumImu:
 
     def _force(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Specific force with its bias in the frame of the link, (num_worlds, 3) [m/s²]."""
-        r, g, bias = self._arm_m, self._gravity, self._bias
-        tangential, radial = r * q_ddot + g * np.sin(q), r * np.square(q_dot) + g * np.cos(q)
+        r = self._arm_m
+        g = self._gravity
+        bias = self._bias
+        tangential = r * q_ddot + g * np.sin(q)
+        radial = r * np.square(q_dot) + g * np.cos(q)
         return np.stack([tangential + bias[:, 1], np.zeros_like(q), radial + bias[:, 2]], axis=1)

@@ -8,11 +8,13 @@ from typing import Any
 class StepInfo(dict[str, Any]):
     """A dictionary part of which is computed when it is first needed.
 
-    Looking at a key that is given from the start costs nothing; anything else computes the rest, once.
+    Looking at a key that is given from the start costs nothing; anything else computes the rest,
+    once.
 
     Args:
         given: What is known.
-        rest: Makes the rest, without any of the given keys; it must not depend on when it is called.
+        rest: Makes the rest, without any of the given keys; it must not depend on when it is
+            called.
     """
 
     __slots__ = ("_rest",)
@@ -28,7 +30,8 @@ class StepInfo(dict[str, Any]):
 
     def _settle(self) -> None:
         if self._rest is not None:
-            rest, self._rest = self._rest, None
+            rest = self._rest
+            self._rest = None
             for key, value in rest().items():
                 super().setdefault(key, value)
 
@@ -83,6 +86,16 @@ def _when_complete(name: str) -> Callable[..., Any]:
 
 
 for _name in (
-    "get", "keys", "values", "items", "pop", "popitem", "setdefault", "__iter__", "__len__", "__delitem__", "__repr__"
-):  # fmt: skip
+    "get",
+    "keys",
+    "values",
+    "items",
+    "pop",
+    "popitem",
+    "setdefault",
+    "__iter__",
+    "__len__",
+    "__delitem__",
+    "__repr__",
+):
     setattr(StepInfo, _name, _when_complete(_name))

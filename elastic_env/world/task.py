@@ -1,9 +1,10 @@
-"""The rules of a robot of elastic joints, in many worlds: one control step, from the command to the observation.
+"""The rules of a robot of elastic joints, in many worlds: one control step, from the command to the
+observation.
 
     command → (physics) → truth → measured → score → observation
 
-Kernels do the arithmetic, see `elastic_env.world.control_kernels`. The last control steps stand in blocks of
-records, from which signals and metrics are made when they are needed.
+Kernels do the arithmetic, see `elastic_env.world.control_kernels`. The last control steps stand in
+blocks of records, from which signals and metrics are made when they are needed.
 """
 
 from abc import ABC, abstractmethod
@@ -21,11 +22,25 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
 from elastic_env.core.robot_ranges import RobotDraw
-from elastic_env.core.signals import Array, BoolArray, Kind, Mirrored, Signal, SignalGroup, Signals, SignalTable
+from elastic_env.core.signals import (
+    Array,
+    BoolArray,
+    Kind,
+    Mirrored,
+    Signal,
+    SignalGroup,
+    Signals,
+    SignalTable,
+)
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import PlanTable
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.further_sensors import ACCELEROMETER, FurtherSensors, SensorInputs, specific_force
+from elastic_env.world.further_sensors import (
+    ACCELEROMETER,
+    FurtherSensors,
+    SensorInputs,
+    specific_force,
+)
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import Simulation, simulate, substeps
 from elastic_env.world.robot_model import RobotModel
@@ -36,16 +51,26 @@ from elastic_env.world.step_info import StepInfo
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
 DIVERGED = "diverged"
-"""Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
+"""Reason of termination where the simulation produced a bad number; MuJoCo alone would restart
+it silently.
+"""
 
-_SCORED_ROWS, _FEWEST_STEPS, _MOST_STEPS = 4096, 16, 256
-"""Rows (steps of all worlds) whose signals are computed together, and how many steps that can be."""
+_SCORED_ROWS = 4096
+_FEWEST_STEPS = 16
+_MOST_STEPS = 256
+"""Rows (steps of all worlds) whose signals are computed together, and how many steps that can
+be.
+"""
 
 
 def action_table(joints: Sequence[str]) -> SignalTable:
     """The action: an offset for every joint."""
-    offsets = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command").signals
-    return SignalTable(tuple(replace(own, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for own in offsets))
+    offsets = SignalGroup.of(
+        "command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command"
+    ).signals
+    return SignalTable(
+        tuple(replace(own, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for own in offsets)
+    )
 
 
 def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
@@ -151,10 +176,16 @@ class Task(ABC):
         self._begun = np.zeros(num_worlds, dtype=np.bool_)
         self._is_begun = False
         self._steps_at_once = min(max(_SCORED_ROWS // num_worlds, _FEWEST_STEPS), _MOST_STEPS)
-        self._begin_block(np.zeros((2, num_worlds, len(joints)), JOINT), np.zeros((2, num_worlds), self.world_type))
+        self._begin_block(
+            np.zeros((2, num_worlds, len(joints)), JOINT),
+            np.zeros((2, num_worlds), self.world_type),
+        )
 
-    def attach(self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False) -> None:
-        """Take what moves the robots, and compile all that a control step needs: hardware cannot wait for that later.
+    def attach(
+        self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False
+    ) -> None:
+        """Take what moves the robots, and compile all that a control step needs: hardware cannot
+        wait for that later.
 
         Args:
             simulation: What moves instead of MuJoCo, such as hardware.
@@ -169,7 +200,8 @@ class Task(ABC):
         compile_now(self._rehearse)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
-        """Begin new episodes in some worlds, a (num_worlds,) mask: at rest under zero offset, the springs deflected.
+        """Begin new episodes in some worlds, a (num_worlds,) mask: at rest under zero offset, the
+        springs deflected.
 
         Args:
             worlds: Which.
@@ -180,7 +212,8 @@ class Task(ABC):
         self._take_rows(2)
         simulation.restart(worlds)
         self._metrics.restart(worlds)
-        last, now = self._row - 1, self._row
+        last = self._row - 1
+        now = self._row
         for block in (self._joints, self._worlds):  # what samples keep stays as it is
             block[last] = block[last - 2]
             block[now] = block[now - 2]
@@ -204,7 +237,11 @@ class Task(ABC):
             ResetNeeded: A world has not begun an episode yet.
         """
         if not self._is_begun:
-            some = f", of the worlds {np.flatnonzero(~self._begun).tolist()} too" if self._begun.any() else ""
+            some = (
+                f", of the worlds {np.flatnonzero(~self._begun).tolist()} too"
+                if self._begun.any()
+                else ""
+            )
             raise gymnasium.error.ResetNeeded(f"reset() comes before the first step(){some}")
         offset, is_clipped = self._command(action)
         self._disturb()
@@ -216,7 +253,10 @@ class Task(ABC):
         if is_over:
             info["termination"] = self._reasons(ends)
             self.score()
-            info["episode_metrics"] = {**self._metrics.values(), **dict(zip(self._failures, ends, strict=False))}
+            info["episode_metrics"] = {
+                **self._metrics.values(),
+                **dict(zip(self._failures, ends, strict=False)),
+            }
         return Transition(observation, reward, ends[-2], ends[-1], info)
 
     def observe(self) -> Array:
@@ -232,18 +272,24 @@ class Task(ABC):
         return Sample(self._joints[self._row], self._worlds[self._row])
 
     def signals(self, sample: Sample | None = None) -> Signals:
-        """Truth and scores of samples by name, one value per row; by default of the present step."""
+        """Truth and scores of samples by name, one value per row; by default of the present
+        step.
+        """
         sample = self.sample() if sample is None else sample
         return self._signals(sample.joints["truth"], sample.worlds)
 
     def score(self) -> None:
-        """Take into the metrics the steps that are not yet; when that happens makes no difference to them."""
+        """Take into the metrics the steps that are not yet; when that happens makes no
+        difference to them.
+        """
         rows = slice(self._unscored, self._row + 1)
         shape = (rows.stop - rows.start, self.num_worlds)
         self._unscored = rows.stop
         if shape[0] <= 0:
             return
-        sample = Sample(self._joints[rows].reshape(-1, len(self._at)), self._worlds[rows].reshape(-1))
+        sample = Sample(
+            self._joints[rows].reshape(-1, len(self._at)), self._worlds[rows].reshape(-1)
+        )
         truth = sample.worlds["truth"]
         masks = self.masks(sample)
         if truth["diverged"].any():
@@ -258,9 +304,11 @@ class Task(ABC):
     def reward_terms(self, sample: Sample) -> dict[str, Array]:
         """Weighted terms whose sum is the reward, one value per row."""
         scores = sample.worlds["scores"]
-        return {name: scores[name].copy() for name in scores.dtype.names or ()} | self.further_reward_terms(sample)
+        return {
+            name: scores[name].copy() for name in scores.dtype.names or ()
+        } | self.further_reward_terms(sample)
 
-    def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002  there are none
+    def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002
         """Terms that a task of one's own adds to the reward, one value per row."""
         return {}
 
@@ -296,7 +344,8 @@ class Task(ABC):
 
     @abstractmethod
     def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        """Truth, measurements, ends, scores and observation of a control step; whether an episode ends.
+        """Truth, measurements, ends, scores and observation of a control step; whether an episode
+        ends.
 
         Args:
             commanded: `kernels.Commanded`.
@@ -356,14 +405,19 @@ class Task(ABC):
             raise self._refused(given)
         offset = given.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
-        joints, worlds = self._joints[self._row], self._worlds[self._row]
+        joints = self._joints[self._row]
+        worlds = self._worlds[self._row]
         inputs = self.simulation.ctrl
-        if not kernels.command(self._constants, joints, worlds, offset, self._bound, is_clipped, inputs):
+        if not kernels.command(
+            self._constants, joints, worlds, offset, self._bound, is_clipped, inputs
+        ):
             raise self._refused(given.astype(np.float64))
         return offset, is_clipped
 
     def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
-        """Observation, reward and ends of the control step that has gone by; whether an episode ends."""
+        """Observation, reward and ends of the control step that has gone by; whether an episode
+        ends.
+        """
         n = self.num_worlds
         observed = np.empty((n, self._width))
         reward = np.empty(n)
@@ -385,7 +439,9 @@ class Task(ABC):
             observed[:, -len(self._sensors.signals) :] = self._sensors.columns(is_delayed)
 
     def _sensor_inputs(self) -> SensorInputs:
-        """What further sensors need of the truth; the specific force lags one physics step behind."""
+        """What further sensors need of the truth; the specific force lags one physics step
+        behind.
+        """
         truth = self._joints[self._row]["truth"]
         has_force = ACCELEROMETER in self.config.sensors
         sensordata = self.simulation.bind("sensordata") if has_force else None
@@ -398,10 +454,16 @@ class Task(ABC):
     def _describe(self, sample: Sample) -> dict[str, Any]:
         """What a step tells of itself when somebody looks at it."""
         clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
-        return {"reward_terms": self.reward_terms(sample), **self.signals(sample), "clipped": clipped}
+        return {
+            "reward_terms": self.reward_terms(sample),
+            **self.signals(sample),
+            "clipped": clipped,
+        }
 
     def _take_rows(self, count: int) -> None:
-        """Go on to fresh records, in a fresh block where this one is full: samples may keep the old one."""
+        """Go on to fresh records, in a fresh block where this one is full: samples may keep the
+        old one.
+        """
         if self._row + count >= len(self._joints):
             self.score()
             present = slice(self._row - 1, self._row + 1)
@@ -442,14 +504,21 @@ class Task(ABC):
         shape = (self.num_worlds, len(self._bound))
         bounds = f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
-            return ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
+            return ActionError(
+                f"an action must be real numbers, {bounds}, got an array of {given.dtype}"
+            )
         if given.shape != shape:
             # a scalar environment adds the axis of worlds itself
-            expected, found = (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
-            return ActionError(f"an action must have shape {expected} [rad], {bounds}; got shape {found}")
+            expected, found = (
+                (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
+            )
+            return ActionError(
+                f"an action must have shape {expected} [rad], {bounds}; got shape {found}"
+            )
         world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
         return ActionError(
-            f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in world {world}"
+            f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in"
+            f" world {world}"
         )
 
 

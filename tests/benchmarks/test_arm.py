@@ -1,4 +1,5 @@
-"""An arm of seven joints: calls of the compensator for live robots, and the torque of a batch link by link.
+"""An arm of seven joints: calls of the compensator for live robots, and the torque of a batch link
+by link.
 
 Compare within a group of one run only.
 """
@@ -22,8 +23,11 @@ def arm() -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     body = spec.worldbody
     for i, name in enumerate(JOINTS):
-        body = body.add_body(name=f"link{i}", pos=[0, 0, 0.15], mass=3.0 - 0.3 * i, ipos=[0.03, 0, 0.07])
-        body.inertia, body.explicitinertial = [0.01, 0.01, 0.005], True
+        body = body.add_body(
+            name=f"link{i}", pos=[0, 0, 0.15], mass=3.0 - 0.3 * i, ipos=[0.03, 0, 0.07]
+        )
+        body.inertia = [0.01, 0.01, 0.005]
+        body.explicitinertial = True
         body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, i % 2, 1 - i % 2])
     return spec.compile()
 
@@ -41,4 +45,6 @@ def test_compensator_of_live_robots(benchmark: BenchmarkFixture, name: str) -> N
 def test_gravity_torque(benchmark: BenchmarkFixture, kind: Any, rows: int) -> None:
     """Of a batch in one pass, and row by row."""
     benchmark.group = f"gravity torque, {rows} rows"
-    benchmark(kind(arm(), JOINTS).gravity_torque, np.random.default_rng(0).uniform(-1.0, 1.0, (rows, 7)))
+    benchmark(
+        kind(arm(), JOINTS).gravity_torque, np.random.default_rng(0).uniform(-1.0, 1.0, (rows, 7))
+    )

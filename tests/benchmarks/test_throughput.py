@@ -1,6 +1,8 @@
-"""Control steps of the vector environments, their scalar ones and raw physics, as pytest-benchmark groups.
+"""Control steps of the vector environments, their scalar ones and raw physics, as pytest-benchmark
+groups.
 
-Compare within a group of one run only. `elastic speed` interleaves the same contenders and reports ratios.
+Compare within a group of one run only. `elastic speed` interleaves the same contenders and reports
+ratios.
 """
 
 import pytest

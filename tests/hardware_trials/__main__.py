@@ -1,4 +1,5 @@
-"""The table of all measurements: `python -m tests.hardware_trials`, about half an hour; `--help` has the options.
+"""The table of all measurements: `python -m tests.hardware_trials`, about half an hour; `--help`
+has the options.
 
 Exit code 3 if something is not as it must be.
 """
@@ -35,15 +36,22 @@ def prove(share: float = 1.0, only: tuple[str, ...] = (), output: Path | None = 
     for name in only:
         if name not in TRIALS:
             raise unknown_name("measurement", name, TRIALS)
-    trials, console = list[Trial](), Console()
+    trials = list[Trial]()
+    console = Console()
     with run_folder("prove", {"share": share, "only": only}, None, output) as folder:
         for name in only or TRIALS:
             trials.append(_measured(name, share))
             console.print(f"{trials[-1].name}: {escape(trials[-1].measured)}", soft_wrap=True)
-            (folder / "hardware.json").write_text(json.dumps([asdict(trial) for trial in trials], indent=2) + "\n")
+            (folder / "hardware.json").write_text(
+                json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
+            )
     table = Table("required", "measured", "", title="hardware against an emulated bus")
     for trial in trials:
-        table.add_row(escape(trial.required), escape(trial.measured), "met" if trial.is_met else "[bold red]NOT MET[/]")
+        table.add_row(
+            escape(trial.required),
+            escape(trial.measured),
+            "met" if trial.is_met else "[bold red]NOT MET[/]",
+        )
     console.print(table)
     console.print(f"wrote {folder / 'hardware.json'}", soft_wrap=True)
     return all(trial.is_met for trial in trials)

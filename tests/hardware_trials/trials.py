@@ -25,7 +25,13 @@ from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
 from elastic_env.hardware.safety.processes import child_command, child_environment
-from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime, sleep_until
+from elastic_env.hardware.safety.realtime import (
+    Pace,
+    Priority,
+    give_up_realtime,
+    prefer_realtime,
+    sleep_until,
+)
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
@@ -40,11 +46,14 @@ _CLOCK_S = 1e-3  # for a packet on its way between two processes
 _CYCLES_BETWEEN = 6
 _AROUND_S = 0.2
 _PATIENT = SafetyLimits().replace(**PATIENT_LIMITS)
-"""Where missing replies are counted, or are beside the point: a busy computer delays pseudo-terminals."""
+"""Where missing replies are counted, or are beside the point: a busy computer delays
+pseudo-terminals."""
 _COARSE = TestbedConfig(timestep_s=2e-3)
-"""Twelve joints in real time at 0.5 ms would fill a third of a core, and it is the bus that is measured."""
+"""Twelve joints in real time at 0.5 ms would fill a third of a core, and it is the bus that is
+measured."""
 _FAST = 4_000_000
-"""For twelve servos on one bus [bit/s]: the fastest of their rates that the SDK can set; not every adapter can."""
+"""For twelve servos on one bus [bit/s]: the fastest of their rates that the SDK can set; not
+every adapter can."""
 _PAIR = (1, 2)
 _UNIT = servo_model(54024).position_unit
 
@@ -75,31 +84,45 @@ def _times(number: int, share: float, least: int = 2) -> int:
 
 
 def identification(share: float) -> Trial:
-    """K of the emulated joint over the bus, against its true one and against the environment in this process."""
+    """K of the emulated joint over the bus, against its true one and against the environment in
+    this process."""
     hold: dict[str, Any] = {"kind": "hold"}
     if share < 1.0:
-        hold["positions"] = 5  # fewest; not quicker moves, which ring: at 0.4 rad/s the joint seems 3.6 % too soft
+        hold["positions"] = (
+            5  # fewest; not quicker moves, which ring: at 0.4 rad/s the joint seems 3.6 % too soft
+        )
     with RunningEmulator(EmulatorConfig(faults=_USB_LATENCY)) as emulator:
         real = gymnasium.make(
-            "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port,
-            imu_port=emulator.imu_port, reference=hold, confirm=False, approach_rad_s=1.0,
-            limits=_PATIENT, imu_oldest_s=0.2,
-        )  # fmt: skip
+            "elastic_env/HardwareTestbed-v0",
+            disable_env_checker=True,
+            port=emulator.port,
+            imu_port=emulator.imu_port,
+            reference=hold,
+            confirm=False,
+            approach_rad_s=1.0,
+            limits=_PATIENT,
+            imu_oldest_s=0.2,
+        )
         try:
             (over_bus,), _ = identify([real], seed=0)
         finally:
             real.close()
-    simulated: Any = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True, reference=hold)
+    simulated: Any = gymnasium.make(
+        "elastic_env/Testbed-v0", disable_env_checker=True, reference=hold
+    )
     (in_process,), _ = identify([simulated], seed=0)
     true = float(simulated.unwrapped.truth().model.stiffness[0])
-    found, beside = over_bus.stiffness_nm_per_rad, in_process.stiffness_nm_per_rad
-    off_true, off_beside = found / true - 1.0, found / beside - 1.0
+    found = over_bus.stiffness_nm_per_rad
+    beside = in_process.stiffness_nm_per_rad
+    off_true = found / true - 1.0
+    off_beside = found / beside - 1.0
     return Trial(
-        "identification", "K within 1 % of the joint's, 0.5 % of the environment's in this process",
+        "identification",
+        "K within 1 % of the joint's, 0.5 % of the environment's in this process",
         f"{found:.1f} N·m/rad: {100 * off_true:+.2f} %, {100 * off_beside:+.2f} %",
         abs(off_true) <= 0.01 and abs(off_beside) <= 0.005,
         {"over_bus": over_bus.model_dump(), "in_process": in_process.model_dump()},
-    )  # fmt: skip
+    )
 
 
 def loop(share: float) -> Trial:
@@ -108,15 +131,19 @@ def loop(share: float) -> Trial:
     block_s = max(min(60.0 * share, 5.0), 1.0)
     ids = tuple(range(1, 13))
     late: dict[str, list[float]] = {"bus": [], "sleep": []}
-    missed, took_s, stolen_s = 0, 0.0, 0.0
+    missed = 0
+    took_s = 0.0
+    stolen_s = 0.0
     config = EmulatorConfig(ids=ids, faults=_USB_LATENCY, testbed=_COARSE, baudrate=_FAST)
     with _beside_the_program(config) as emulator, SupervisedBus({emulator.port: ids}, _FAST) as bus:
         for _ in range(blocks):
             late["sleep"] += _sleep_loop(block_s)
             bus.enable(_PATIENT)
-            begin, stolen_before = time.monotonic(), _stolen_s()
+            begin = time.monotonic()
+            stolen_before = _stolen_s()
             lateness, misses = _bus_loop(bus, len(ids), block_s)
-            took_s, stolen_s = took_s + time.monotonic() - begin, stolen_s + _stolen_s() - stolen_before
+            took_s = took_s + time.monotonic() - begin
+            stolen_s = stolen_s + _stolen_s() - stolen_before
             late["bus"] += lateness
             missed += misses
             bus.disable()
@@ -124,24 +151,37 @@ def loop(share: float) -> Trial:
     overruns = {name: [x for x in values if is_overrun(x)] for name, values in late.items()}
     shares = {name: len(overruns[name]) / len(late[name]) for name in late}
     return Trial(
-        "loop", "12 servos, 250 Hz, 4 Mbit/s, 1 ms USB latency: at most 0.1 % overruns beyond a loop that only sleeps",
-        f"{100 * shares['bus']:.3f} % and {100 * shares['sleep']:.3f} % of {len(late['bus'])} cycles, "
-        f"{missed} cycles with a missing reply; of {took_s:.0f} s the host took {1e3 * stolen_s:.0f} ms away",
+        "loop",
+        "12 servos, 250 Hz, 4 Mbit/s, 1 ms USB latency: at most 0.1 % overruns beyond a loop that"
+        " only sleeps",
+        f"{100 * shares['bus']:.3f} % and {100 * shares['sleep']:.3f} % of {len(late['bus'])}"
+        f" cycles, {missed} cycles with a missing reply; of {took_s:.0f} s the host took"
+        f" {1e3 * stolen_s:.0f} ms away",
         shares["bus"] - shares["sleep"] <= 1e-3,
-        {"overruns_s": overruns, "missed": missed, "share": shares, "stolen_s": stolen_s, "took_s": took_s,
-         "jitter_rms_s": {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in late.items()}},
-    )  # fmt: skip
+        {
+            "overruns_s": overruns,
+            "missed": missed,
+            "share": shares,
+            "stolen_s": stolen_s,
+            "took_s": took_s,
+            "jitter_rms_s": {
+                name: float(np.sqrt(np.mean(np.square(values)))) for name, values in late.items()
+            },
+        },
+    )
 
 
 def _stolen_s() -> float:
-    """Time for which a virtual machine's host has left it waiting for a processor so far, of all of them [s]."""
+    """Time for which a virtual machine's host has left it waiting for a processor so far, of all
+    of them [s]."""
     ticks = Path("/proc/stat").read_text().splitlines()[0].split()[8]
     return int(ticks) / os.sysconf("SC_CLK_TCK")
 
 
 @contextlib.contextmanager
 def _beside_the_program(config: EmulatorConfig) -> Iterator[RunningEmulator]:
-    """An emulator with a core of its own, as servos have, and this program in real time on the others.
+    """An emulator with a core of its own, as servos have, and this program in real time on the
+    others.
 
     Linux takes 5 % of a core from real-time processes that fill it.
     """
@@ -158,7 +198,8 @@ def _beside_the_program(config: EmulatorConfig) -> Iterator[RunningEmulator]:
 
 
 def _sleep_loop(duration_s: float) -> list[float]:
-    late, pace = [], Pace(PERIOD_S)
+    late = []
+    pace = Pace(PERIOD_S)
     for _ in range(round(duration_s / PERIOD_S)):
         sleep_until(pace.next())
         late.append(pace.late(time.monotonic()))
@@ -167,8 +208,10 @@ def _sleep_loop(duration_s: float) -> list[float]:
 
 def _bus_loop(bus: SupervisedBus, servos: int, duration_s: float) -> tuple[list[float], int]:
     """How late each period was, and how many had no reply from a servo."""
-    late, missed = [], 0
-    begin, pace = time.monotonic(), Pace(PERIOD_S)
+    late = []
+    missed = 0
+    begin = time.monotonic()
+    pace = Pace(PERIOD_S)
     for _ in range(round(duration_s / PERIOD_S)):
         due = pace.next()
         cycle = bus.exchange(np.full(servos, 0.3 * goal(due - begin)), due)
@@ -179,15 +222,20 @@ def _bus_loop(bus: SupervisedBus, servos: int, duration_s: float) -> tuple[list[
 
 def faults(share: float) -> Trial:
     """Random faults during a motion that also asks for what it must not have."""
-    number, generator = _times(1000, share), np.random.default_rng(0)
+    number = _times(1000, share)
+    generator = np.random.default_rng(0)
     limits = SafetyLimits(lowest_rad=-0.5, highest_rad=0.5, slew_rad_s=1.5)
-    tally, reasons = Counter[str](), Counter[str]()
+    tally = Counter[str]()
+    reasons = Counter[str]()
     off_s: list[float] = []
     beyond: list[float] = []
     wrong: list[dict[str, Any]] = []
     left = number
     while left > 0:
-        with RunningEmulator(EmulatorConfig(ids=_PAIR)) as emulator, SupervisedBus({emulator.port: _PAIR}) as bus:
+        with (
+            RunningEmulator(EmulatorConfig(ids=_PAIR)) as emulator,
+            SupervisedBus({emulator.port: _PAIR}) as bus,
+        ):
             begin = time.monotonic()
             _enable(bus, limits)
             emulator.events()
@@ -200,7 +248,9 @@ def faults(share: float) -> Trial:
                 if not message:
                     more, message = _cycles(bus, begin, _CYCLES_BETWEEN, generator)
                     seen += more
-                events, is_moving, left = emulator.events(), not message, left - 1
+                events = emulator.events()
+                is_moving = not message
+                left = left - 1
                 counts, some_wrong = _taken(events, seen)
                 tally.update(counts)
                 wrong += some_wrong
@@ -209,19 +259,32 @@ def faults(share: float) -> Trial:
                     reasons[message.split(";")[0].split(":")[0]] += 1
                     off_s += _off_after_fault(events, emulator)
     stops = reasons.total()
-    held_up = f" ({stops - len(off_s)} because this program was held up)" if stops > len(off_s) else ""
-    slow, longest = sum(not t <= PERIOD_S + _CLOCK_S for t in off_s), max(off_s, default=0.0)
+    held_up = (
+        f" ({stops - len(off_s)} because this program was held up)" if stops > len(off_s) else ""
+    )
+    slow = sum(not t <= PERIOD_S + _CLOCK_S for t in off_s)
+    longest = max(off_s, default=0.0)
     return Trial(
-        "faults", "1000 faults: no wrong value taken, no goal beyond the limits, torque off within a cycle of a fault",
-        f"{number} faults: {tally['wrong']} wrong of {tally['accepted']} replies taken, {tally['missing']} missing, "
-        f"{len(beyond)} goals beyond, {stops} stops{held_up}, torque off after at most {1e3 * longest:.1f} ms",
+        "faults",
+        "1000 faults: no wrong value taken, no goal beyond the limits, torque off within a cycle of"
+        " a fault",
+        f"{number} faults: {tally['wrong']} wrong of {tally['accepted']} replies taken,"
+        f" {tally['missing']} missing, {len(beyond)} goals beyond, {stops} stops{held_up}, torque"
+        f" off after at most {1e3 * longest:.1f} ms",
         not (tally["wrong"] or beyond or slow),
-        {**tally, "beyond_rad": beyond, "reasons": dict(reasons), "off_s": off_s, "wrong_replies": wrong},
-    )  # fmt: skip
+        {
+            **tally,
+            "beyond_rad": beyond,
+            "reasons": dict(reasons),
+            "off_s": off_s,
+            "wrong_replies": wrong,
+        },
+    )
 
 
 def _enable(bus: SupervisedBus, limits: SafetyLimits) -> None:
-    """Torque on again; for a while, since a busy computer delays replies, and what was let go swings at first."""
+    """Torque on again; for a while, since a busy computer delays replies, and what was let go
+    swings at first."""
     end_s = time.monotonic() + _SWING_S
     while time.monotonic() < end_s:
         with contextlib.suppress(HardwareError):
@@ -231,7 +294,8 @@ def _enable(bus: SupervisedBus, limits: SafetyLimits) -> None:
 
 
 def _is_enabled_again(bus: SupervisedBus, limits: SafetyLimits, emulator: RunningEmulator) -> bool:
-    """Torque on again after a stop; not where joints have swung beyond the limits and a hand must set them back."""
+    """Torque on again after a stop; not where joints have swung beyond the limits and a hand
+    must set them back."""
     with contextlib.suppress(HardwareError):
         _enable(bus, limits)
         emulator.events()
@@ -253,7 +317,8 @@ def _random_fault(generator: np.random.Generator) -> tuple[dict[str, Any], int]:
 def _cycles(
     bus: SupervisedBus, begin: float, number: int, generator: np.random.Generator
 ) -> tuple[list[tuple[float, States]], str]:
-    """Cycles with now and then a wild goal: when each was read, what came, and what stopped them, "" if nothing."""
+    """Cycles with now and then a wild goal: when each was read, what came, and what stopped
+    them, "" if nothing."""
     seen = []
     for _ in range(number):
         due = time.monotonic() + PERIOD_S
@@ -272,58 +337,87 @@ def _taken(
     """Compare each position that was taken with what the servo had to say to that very request.
 
     Returns:
-        Counts, and what there is to know of the wrong ones: a figure that is not 0 must be explained.
+        Counts, and what there is to know of the wrong ones: a figure that is not 0 must be
+            explained.
     """
-    wrong, accepted, missing = [], 0, 0
+    wrong = []
+    accepted = 0
+    missing = 0
     for read_s, states in seen:
         for column, servo in enumerate(_PAIR):
             if not states.is_fresh[column]:
                 missing += 1
                 continue
             asked = [
-                value for t, who, name, value in events
-                if who == servo and name == "present_position" and read_s - _CLOCK_S <= t <= states.time_s
-            ]  # fmt: skip
+                value
+                for t, who, name, value in events
+                if who == servo
+                and name == "present_position"
+                and read_s - _CLOCK_S <= t <= states.time_s
+            ]
             accepted += 1
             taken = round(states.position[column] / _UNIT)
             if not asked or taken != asked[-1]:
                 around = [event for event in events if abs(event[0] - read_s) < _AROUND_S]
                 wrong.append(
-                    {"servo": servo, "taken": taken, "read_s": read_s, "time_s": states.time_s, "events": around}
+                    {
+                        "servo": servo,
+                        "taken": taken,
+                        "read_s": read_s,
+                        "time_s": states.time_s,
+                        "events": around,
+                    }
                 )
     return {"wrong": len(wrong), "accepted": accepted, "missing": missing}, wrong
 
 
 def _beyond(events: Sequence[Event], limits: SafetyLimits) -> list[float]:
-    """Goals [rad] that arrived at a servo beyond its limits, or farther from the last one than any cycle allows."""
-    reach, found = limits.slew_rad_s * 0.02 + _UNIT, []
+    """Goals [rad] that arrived at a servo beyond its limits, or farther from the last one than
+    any cycle allows."""
+    reach = limits.slew_rad_s * 0.02 + _UNIT
+    found = []
     for servo in _PAIR:
-        goals = [value * _UNIT for _, who, name, value in events if who == servo and name == "goal_position"]
+        goals = [
+            value * _UNIT
+            for _, who, name, value in events
+            if who == servo and name == "goal_position"
+        ]
         found += [after for before, after in pairwise(goals) if abs(after - before) > reach]
-        found += [angle for angle in goals if not limits.lowest_rad - _UNIT <= angle <= limits.highest_rad + _UNIT]
+        found += [
+            angle
+            for angle in goals
+            if not limits.lowest_rad - _UNIT <= angle <= limits.highest_rad + _UNIT
+        ]
     return found
 
 
 def _off_after_fault(events: Sequence[Event], emulator: RunningEmulator) -> list[float]:
     """Time from the end of the wait for the last reply to torque off at the servos [s].
 
-    Nothing where no servo was asked: this program was held up between two cycles until it counted as one that hangs.
+    Nothing where no servo was asked: this program was held up between two cycles until it counted
+    as one that hangs.
     """
     asked = max((t for t, _, name, _ in events if name == "present_position"), default=None)
     if asked is None:
         return [math.inf] if any(emulator.state()["torque_on"]) else []
-    off = [t for t, _, name, value in events if name == "torque_enable" and value == 0 and t >= asked]
+    off = [
+        t for t, _, name, value in events if name == "torque_enable" and value == 0 and t >= asked
+    ]
     return [max(min(off, default=math.inf) - asked - _REPLY_TIMEOUT_S, 0.0)]
 
 
 def killed(share: float) -> Trial:
     """SIGKILL of the program."""
-    return _ended("killed", "SIGKILL of the program: torque off within 100 ms", share, _kill(signal.SIGKILL))
+    return _ended(
+        "killed", "SIGKILL of the program: torque off within 100 ms", share, _kill(signal.SIGKILL)
+    )
 
 
 def hangs(share: float) -> Trial:
     """A program that hangs: it is stopped in the middle of whatever it does."""
-    return _ended("hangs", "the program hangs: torque off within 100 ms", share, _kill(signal.SIGSTOP))
+    return _ended(
+        "hangs", "the program hangs: torque off within 100 ms", share, _kill(signal.SIGSTOP)
+    )
 
 
 def interrupted(share: float) -> Trial:
@@ -337,7 +431,9 @@ def supervisor_ended(share: float) -> Trial:
     def end(_: Any, supervisor: int) -> None:
         os.kill(supervisor, signal.SIGTERM)
 
-    return _ended("supervisor-ended", "SIGTERM of the supervisor: torque off within 100 ms", share, end)
+    return _ended(
+        "supervisor-ended", "SIGTERM of the supervisor: torque off within 100 ms", share, end
+    )
 
 
 def supervisor_killed(share: float) -> Trial:
@@ -346,7 +442,9 @@ def supervisor_killed(share: float) -> Trial:
     def end(_: Any, supervisor: int) -> None:
         os.kill(supervisor, signal.SIGKILL)
 
-    return _ended("supervisor-killed", "SIGKILL of the supervisor: torque off within 100 ms", share, end)
+    return _ended(
+        "supervisor-killed", "SIGKILL of the supervisor: torque off within 100 ms", share, end
+    )
 
 
 def supervisor_hangs(share: float) -> Trial:
@@ -364,7 +462,8 @@ def _kill(number: signal.Signals) -> Callable[[Any, int], None]:
 
 def _ended(name: str, required: str, share: float, end: Callable[[Any, int], None]) -> Trial:
     """Start a motion, end it in some way at a random moment, and see when torque goes off."""
-    number, generator = _times(50, share), np.random.default_rng(0)
+    number = _times(50, share)
+    generator = np.random.default_rng(0)
     took: list[float] = []
     spoiled = 0
     with RunningEmulator(EmulatorConfig(faults=_USB_LATENCY)) as emulator:
@@ -385,11 +484,13 @@ def _ending(name: str, required: str, number: int, took: list[float], spoiled: i
         return Trial(name, f"{required}, {number} of {number}", said, False, figures)
     within = sum(t <= _TORQUE_OFF_S for t in took)
     return Trial(
-        name, f"{required}, {number} of {number}",
-        f"{within} of {number}; median {1e3 * float(np.median(took)):.1f} ms, at most {1e3 * max(took):.1f} ms"
-        + _stopped_before(spoiled),
-        within == number, figures,
-    )  # fmt: skip
+        name,
+        f"{required}, {number} of {number}",
+        f"{within} of {number}; median {1e3 * float(np.median(took)):.1f} ms, at most"
+        f" {1e3 * max(took):.1f} ms" + _stopped_before(spoiled),
+        within == number,
+        figures,
+    )
 
 
 def _stopped_before(spoiled: int) -> str:
@@ -402,9 +503,12 @@ def _end_once(
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
     emulator.wait_until_rest()
     program = subprocess.Popen(
-        child_command("tests.hardware_trials.wave", emulator.port, "1"), env=child_environment(),
-        stdout=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+        child_command("tests.hardware_trials.wave", emulator.port, "1"),
+        env=child_environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     try:
         assert program.stdout is not None
         said = program.stdout.readline()
@@ -418,12 +522,18 @@ def _end_once(
         begin = time.monotonic()
         end(program, supervisor)
         time.sleep(2.0 * _TORQUE_OFF_S)
-        off = [t for t, _, name, value in emulator.events() if name == "torque_enable" and value == 0]
+        off = [
+            t for t, _, name, value in emulator.events() if name == "torque_enable" and value == 0
+        ]
         for _ in range(20):  # a program that was itself to switch torque off is slower
             if off:
                 break
             time.sleep(_TORQUE_OFF_S)
-            off = [t for t, _, name, value in emulator.events() if name == "torque_enable" and value == 0]
+            off = [
+                t
+                for t, _, name, value in emulator.events()
+                if name == "torque_enable" and value == 0
+            ]
         return min(off, default=float("inf")) - begin
     finally:
         program.kill()
@@ -442,7 +552,8 @@ def _wait_until_free(port: str) -> None:
 
 def unplugged(share: float) -> Trial:
     """The adapter is pulled out in the middle of cycles."""
-    number, generator = _times(50, share), np.random.default_rng(0)
+    number = _times(50, share)
+    generator = np.random.default_rng(0)
     told: list[bool] = []
     spoiled = 0
     with RunningEmulator(EmulatorConfig(faults=_USB_LATENCY)) as emulator:
@@ -456,14 +567,21 @@ def unplugged(share: float) -> Trial:
             else:
                 told.append(one)
     return Trial(
-        "unplugged", f"unplug during a write: a clear statement that the bus is gone, {number} of {number}",
-        f"{sum(told)} of {number}{_stopped_before(spoiled)}", sum(told) == number, {"spoiled": spoiled},
-    )  # fmt: skip
+        "unplugged",
+        f"unplug during a write: a clear statement that the bus is gone, {number} of {number}",
+        f"{sum(told)} of {number}{_stopped_before(spoiled)}",
+        sum(told) == number,
+        {"spoiled": spoiled},
+    )
 
 
-def _unplug(emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.Generator) -> bool | None:
-    """Whether the program is told that its bus, by name, is gone; None if the motion had ended before."""
-    port, when = emulator.port, int(generator.integers(5, 15))
+def _unplug(
+    emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.Generator
+) -> bool | None:
+    """Whether the program is told that its bus, by name, is gone; None if the motion had ended
+    before."""
+    port = emulator.port
+    when = int(generator.integers(5, 15))
     for cycle in range(40):
         try:
             bus.exchange(np.zeros(1), time.monotonic() + float(generator.uniform(0.001, PERIOD_S)))
@@ -477,7 +595,8 @@ def _unplug(emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.
 
 
 def header_positions(share: float) -> Trial:
-    """Positions whose bytes look like a header, and their neighbours, written alone and to all, and read back."""
+    """Positions whose bytes look like a header, and their neighbours, written alone and to all,
+    and read back."""
     wrong = tried = 0
     for number in (54024, 54025, 2020):
         with (
@@ -491,9 +610,12 @@ def header_positions(share: float) -> Trial:
                 wrong += [bus.read(i, "goal_position") for i in bus.ids] != [value] * 3
                 tried += 1
     return Trial(
-        "header-positions", "legal positions that look like a header are written and read back exactly",
-        f"{tried - wrong} of {tried}", wrong == 0, {},
-    )  # fmt: skip
+        "header-positions",
+        "legal positions that look like a header are written and read back exactly",
+        f"{tried - wrong} of {tried}",
+        wrong == 0,
+        {},
+    )
 
 
 def second_program(share: float) -> Trial:
@@ -505,7 +627,9 @@ def second_program(share: float) -> Trial:
         except PortError as error:
             said = str(error)
         is_refused = "another program uses" in said and emulator.port in said
-    return Trial("second-program", "a second program is refused, and told which port", said, is_refused, {})
+    return Trial(
+        "second-program", "a second program is refused, and told which port", said, is_refused, {}
+    )
 
 
 TRIALS: dict[str, Callable[[float], Trial]] = {

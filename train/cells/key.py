@@ -18,7 +18,9 @@ from train.evaluate.robot_file import files_of_robot
 from train.workers.versions import physics
 
 _NOT_OF_THE_RESULT = {"policy": {"level", "track"}, "member": {"rival"}}
-"""Parts of a condition that change nothing of its episodes: what it is compared with, and where tables list it."""
+"""Parts of a condition that change nothing of its episodes: what it is compared with, and where
+tables list it.
+"""
 _LABELS = {"label": True, "policy": {"label"}, "member": {"base"}}
 """Parts of a condition that are text for people and name no files."""
 _SAVED = (residual.DESCRIPTION, residual.WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
@@ -28,11 +30,13 @@ _LARGEST_SOURCE = 10_000_000
 
 
 def cell_key(condition: Condition) -> str:
-    """SHA-256 digest of a condition, of the files that it names, and of the versions of the physics.
+    """SHA-256 digest of a condition, of the files that it names, and of the versions of the
+    physics.
 
-    Files are weights of residuals, tables of offsets and stiffness, robots with their models and joints, and Python
-    files of the user's, with those of their folder that they import. They are read and never imported. What such a file
-    reads when it runs is not seen. Labels are text and name no files.
+    Files are weights of residuals, tables of offsets and stiffness, robots with their models and
+    joints, and Python files of the user's, with those of their folder that they import. They are
+    read and never imported. What such a file reads when it runs is not seen. Labels are text and
+    name no files.
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
@@ -42,7 +46,9 @@ def cell_key(condition: Condition) -> str:
 
 
 def named_files(text: str) -> list[Path]:
-    """Files that a text of a configuration stands for: residual:FOLDER, FILE.py:NAME, module:NAME, or a path."""
+    """Files that a text of a configuration stands for: residual:FOLDER, FILE.py:NAME,
+    module:NAME, or a path.
+    """
     if is_saved(text):
         folder = located(Path(text.partition(":")[2]))
         return [folder / name for name in _SAVED if _is_file(folder / name)]
@@ -51,7 +57,11 @@ def named_files(text: str) -> list[Path]:
         return _with_imports(Path(place))
     if name.isidentifier() and (source := _source(place)):
         return _with_imports(source)
-    return [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)] if _is_file(Path(text)) else []
+    return (
+        [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
+        if _is_file(Path(text))
+        else []
+    )
 
 
 def _is_file(path: Path) -> bool:
@@ -62,12 +72,17 @@ def _is_file(path: Path) -> bool:
 
 
 def _source(module: str) -> Path | None:
-    """The file of a module; None where there is none. Neither it nor the packages around it are imported."""
+    """The file of a module; None where there is none.
+
+    Neither it nor the packages around it are imported.
+    """
     package, *parts = module.split(".")
     if not all(part.isidentifier() for part in (package, *parts)):
         return None
     try:
-        found = importlib.util.find_spec(package)  # which would import the packages around a name with dots
+        found = importlib.util.find_spec(
+            package
+        )  # which would import the packages around a name with dots
     except (ImportError, ValueError):
         return None
     if found is None:
@@ -87,7 +102,9 @@ def _files_of(module: Path) -> list[Path]:
 
 
 def _with_imports(file: Path) -> list[Path]:
-    """A Python file and those that it imports from its own folder, and these from there, in order of their names."""
+    """A Python file and those that it imports from its own folder, and these from there, in
+    order of their names.
+    """
     seen = set[Path]()
     waiting = [file]
     while waiting:
@@ -101,7 +118,9 @@ def _with_imports(file: Path) -> list[Path]:
 
 
 def _imports(file: Path) -> Iterator[str]:
-    """Modules that a file imports, by full name; none of a file that is no Python, which cannot be imported itself."""
+    """Modules that a file imports, by full name; none of a file that is no Python, which cannot
+    be imported itself.
+    """
     try:
         tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))
     except (SyntaxError, ValueError, RecursionError, MemoryError):

@@ -1,4 +1,6 @@
-"""The cells of a comparison, played side by side: what is kept, and what one that fails leaves of the others."""
+"""The cells of a comparison, played side by side: what is kept, and what one that fails leaves
+of the others.
+"""
 
 import os
 import tempfile
@@ -45,8 +47,9 @@ def run_conditions(
 ) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on where they are played. On hardware the conditions come one after the other, in this
-    process, at whose terminal somebody can agree to them; nothing is kept of them.
+    The results do not depend on where they are played. On hardware the conditions come one after
+    the other, in this process, at whose terminal somebody can agree to them; nothing is kept of
+    them.
 
     Args:
         conditions: What to play.
@@ -61,17 +64,28 @@ def run_conditions(
     """
     if any(condition.environment.is_real for condition in conditions):
         return [
-            _on_hardware(condition, f"{n} of {len(conditions)}", console) for n, condition in enumerate(conditions, 1)
+            _on_hardware(condition, f"{n} of {len(conditions)}", console)
+            for n, condition in enumerate(conditions, 1)
         ]
-    kept = [None] * len(conditions) if store is None or fresh else _load_kept(conditions, store, console)
-    missing = [condition for condition, found in zip(conditions, kept, strict=True) if found is None]
+    kept = (
+        [None] * len(conditions)
+        if store is None or fresh
+        else _load_kept(conditions, store, console)
+    )
+    missing = [
+        condition for condition, found in zip(conditions, kept, strict=True) if found is None
+    ]
     if len(missing) < len(conditions):
-        console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True)
+        console.print(
+            f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True
+        )
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if found is None else Outcome(found) for found in kept]
     finished = [result.value for result in results if result is not None and result.error is None]
     why = [
-        _failure_text(c, r) for c, r in zip(conditions, results, strict=True) if r is not None and r.error is not None
+        _failure_text(c, r)
+        for c, r in zip(conditions, results, strict=True)
+        if r is not None and r.error is not None
     ]
     if why:
         raise CellsFailedError(why, finished)
@@ -80,7 +94,9 @@ def run_conditions(
     return finished
 
 
-def _load_kept(conditions: Sequence[Condition], store: Store, console: Console) -> list[Evaluation | None]:
+def _load_kept(
+    conditions: Sequence[Condition], store: Store, console: Console
+) -> list[Evaluation | None]:
     """Cells that a store has; those whose files do not fit are said, once, and not taken."""
     found = list[Evaluation | None]()
     unfit = list[str]()
@@ -92,7 +108,9 @@ def _load_kept(conditions: Sequence[Condition], store: Store, console: Console) 
             unfit.append(f"{_name(condition)} ({error})")
     if unfit:
         more = f", and {len(unfit) - _MOST_NAMED} more" if len(unfit) > _MOST_NAMED else ""
-        said = f"kept cells that do not fit are played again: {'; '.join(unfit[:_MOST_NAMED])}{more}"
+        said = (
+            f"kept cells that do not fit are played again: {'; '.join(unfit[:_MOST_NAMED])}{more}"
+        )
         console.print(said, soft_wrap=True, markup=False, highlight=False)
     return found
 
@@ -101,7 +119,11 @@ class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
     def __init__(
-        self, conditions: Sequence[Condition], console: Console, place: Executors, store: Store | None
+        self,
+        conditions: Sequence[Condition],
+        console: Console,
+        place: Executors,
+        store: Store | None,
     ) -> None:
         self._conditions = conditions
         self._console = console
@@ -109,7 +131,10 @@ class _Playing:
         self._store = store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
-        batches = [(batch, sum(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
+        batches = [
+            (batch, sum(steps[number] for number in batch))
+            for batch in in_batches(conditions, cores)
+        ]
         longest_first = sorted(batches, key=lambda batch: -batch[1])
         self._batches = [batch for batch, _ in longest_first]
         self._steps = [steps for _, steps in longest_first]
@@ -122,12 +147,18 @@ class _Playing:
         self._show: Show = lambda *_: None
 
     def results(self) -> list[Outcome | None]:
-        """Outcomes in the order of the conditions; None for those that Ctrl-C kept from starting."""
+        """Outcomes in the order of the conditions; None for those that Ctrl-C kept from
+        starting.
+        """
         unit = "control steps"
         totals = {unit: sum(self._steps)}
         with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
-            if len(self._batches) == 1 and self._place.is_local:  # a process of its own takes seconds to start
-                cells = _evaluate(self._of(0), lambda played: self._report(0, played), self._place.jobs)
+            if (
+                len(self._batches) == 1 and self._place.is_local
+            ):  # a process of its own takes seconds to start
+                cells = _evaluate(
+                    self._of(0), lambda played: self._report(0, played), self._place.jobs
+                )
                 self._end(0, Outcome(cells))
             else:
                 self._beside()
@@ -165,7 +196,11 @@ class _Playing:
             self._outcomes[number] = own
             self._done += own.error is None
             self._failed += own.error is not None
-            if own.error is None and self._store is not None and not self._store.keep(own.value, self._keys[number]):
+            if (
+                own.error is None
+                and self._store is not None
+                and not self._store.keep(own.value, self._keys[number])
+            ):
                 name = _name(self._conditions[number])
                 said = f"{name} is not kept: a file that it names changed while it was played"
                 self._console.print(said, soft_wrap=True)
@@ -173,15 +208,19 @@ class _Playing:
 
     def _say_moved(self, batch: int) -> None:
         for condition in self._of(batch):
-            self._console.print(f"a worker was lost; {_name(condition)} is played again", soft_wrap=True)
+            self._console.print(
+                f"a worker was lost; {_name(condition)} is played again", soft_wrap=True
+            )
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
-    """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
+    """Conditions, by their numbers, that are played in one vector environment: many worlds cost
+    less each.
 
     Args:
         conditions: What to play.
-        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
+        cores: Batches that are played at a time. There are twice as many, if there can be: not all
+            last as long.
     """
     worlds = sum(condition.episodes for condition in conditions)
     most = min(worlds // (2 * cores), MOST_WORLDS)
@@ -213,7 +252,10 @@ def _failure_text(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     error = outcome.error
     assert error is not None
     found = explain(error)
-    said, code = found or (f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}", DEFECT)
+    said, code = found or (
+        f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}",
+        DEFECT,
+    )
     return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
 
 
@@ -221,15 +263,24 @@ def _name(condition: Condition) -> str:
     """Name of a cell for a user."""
     swept = "".join(f", {name}={value:g}" for name, value in condition.swept.items())
     member = condition.member
-    seed = "" if member is None or member.training_seed is None else f", training seed {member.training_seed}"
-    return f"{condition.policy.title!r} in {condition.scenario!r}, {condition.reference_name}{swept}{seed}"
+    seed = (
+        ""
+        if member is None or member.training_seed is None
+        else f", training seed {member.training_seed}"
+    )
+    return (
+        f"{condition.policy.title!r} in {condition.scenario!r},"
+        f" {condition.reference_name}{swept}{seed}"
+    )
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
     (total,) = num_steps([condition])
     done = 0
     say = plain_progress(console)
-    console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
+    console.print(
+        f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True
+    )
 
     def advance(steps: int) -> None:
         nonlocal done
@@ -247,7 +298,9 @@ def _evaluate_beside(
         return _evaluate(conditions, report)
 
 
-def _evaluate(conditions: Sequence[Condition], report: Callable[[int], None], num_threads: int = 1) -> list[Outcome]:
+def _evaluate(
+    conditions: Sequence[Condition], report: Callable[[int], None], num_threads: int = 1
+) -> list[Outcome]:
     """Evaluations, side by side, that report how many control steps they have played.
 
     Where the policy fails beside others, each is played alone, to say which ones it fails in.
@@ -260,8 +313,15 @@ def _evaluate(conditions: Sequence[Condition], report: Callable[[int], None], nu
         report(done)
 
     try:
-        return [Outcome(evaluation) for evaluation in evaluate_together(conditions, advance, num_threads)]
+        return [
+            Outcome(evaluation)
+            for evaluation in evaluate_together(conditions, advance, num_threads)
+        ]
     except PolicyFailedError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]
-    return [outcome for condition in conditions for outcome in _evaluate([condition], lambda _: None, num_threads)]
+    return [
+        outcome
+        for condition in conditions
+        for outcome in _evaluate([condition], lambda _: None, num_threads)
+    ]

@@ -1,6 +1,8 @@
-"""Finished cells on the disk: a file each under the key of its content, written whole or not at all.
+"""Finished cells on the disk: a file each under the key of its content, written whole or not at
+all.
 
-A file holds its key and a digest of the rest, and is checked against the condition before anything of it is used.
+A file holds its key and a digest of the rest, and is checked against the condition before anything
+of it is used.
 """
 
 import dataclasses
@@ -60,13 +62,17 @@ class Store:
         """
         file = self._file(condition)
         try:
-            return _from_bytes(condition, file.stem, read_bounded(file, _MOST_BYTES, within=self.folder))
+            return _from_bytes(
+                condition, file.stem, read_bounded(file, _MOST_BYTES, within=self.folder)
+            )
         except FileNotFoundError:
             return None
         except UnfitCellError as error:
             raise UnfitCellError(f"{file.name}: {error}") from None
-        except Exception as error:  # whatever a reader of archives makes of a file that somebody else may have written
-            raise UnfitCellError(f"{file.name}: {type(error).__name__}: {shown(str(error))}") from None
+        except Exception as error:  # whatever a reader of archives makes of a foreign file
+            raise UnfitCellError(
+                f"{file.name}: {type(error).__name__}: {shown(str(error))}"
+            ) from None
 
     def keep(self, evaluation: Evaluation, key: str | None = None) -> bool:
         """Keep what came out of a condition, unless what it depends on has changed since it began.
@@ -79,7 +85,8 @@ class Store:
             Whether it is kept.
 
         Raises:
-            OSError: The disk is full, or the folder cannot be written; cells that were kept before stay.
+            OSError: The disk is full, or the folder cannot be written; cells that were kept before
+                stay.
         """
         file = self._file(evaluation.condition)
         if key is not None and file.stem != key:
@@ -94,14 +101,18 @@ class Store:
 
 def _to_bytes(evaluation: Evaluation, key: str) -> bytes:
     """An evaluation as a file of NumPy's, from which no code can run."""
-    arrays: Arrays = {f"{_TRACE}/{name}": np.asarray(values) for name, values in evaluation.trace.items()}
+    arrays: Arrays = {
+        f"{_TRACE}/{name}": np.asarray(values) for name, values in evaluation.trace.items()
+    }
     if evaluation.points is not None:
         arrays |= {f"{_POINTS}/{name}": values for name, values in vars(evaluation.points).items()}
     episodes = json.dumps(evaluation.episodes, default=lambda number: number.item()).encode()
     arrays[_EPISODES] = np.frombuffer(episodes, dtype=np.uint8)
     arrays[_REST] = evaluation.rest_references
     content = io.BytesIO()
-    np.savez_compressed(content, allow_pickle=False, **arrays, **{_KEY: np.array(key)}, **{_DIGEST: _digest(arrays)})
+    np.savez_compressed(
+        content, allow_pickle=False, **arrays, **{_KEY: np.array(key)}, **{_DIGEST: _digest(arrays)}
+    )
     return content.getvalue()
 
 
@@ -122,10 +133,14 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         size = sum(part.file_size for part in archive.infolist())
-        _require(size <= _MOST_BYTES, f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read")
+        _require(
+            size <= _MOST_BYTES, f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read"
+        )
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         found = {name: arrays[name] for name in arrays.files}
-    _require(_KEY in found and _DIGEST in found, "it has no key and digest, as those of an older version")
+    _require(
+        _KEY in found and _DIGEST in found, "it has no key and digest, as those of an older version"
+    )
     kept_for = str(found.pop(_KEY))
     digest = str(found.pop(_DIGEST))
     _require(kept_for == key, "it is that of another cell")
@@ -143,11 +158,17 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
 
 
 def _part(found: Arrays, name: str) -> Arrays:
-    return {key.removeprefix(f"{name}/"): array for key, array in found.items() if key.startswith(f"{name}/")}
+    return {
+        key.removeprefix(f"{name}/"): array
+        for key, array in found.items()
+        if key.startswith(f"{name}/")
+    }
 
 
 def _episodes(condition: Condition, text: npt.NDArray[Any]) -> list[dict[str, Any]]:
-    """The records of a condition's episodes: all of them, in order, with finite scores where they did not fail."""
+    """The records of a condition's episodes: all of them, in order, with finite scores where
+    they did not fail.
+    """
     most = _EPISODE_BYTES * condition.episodes
     _require(text.nbytes <= most, f"its episodes have {text.nbytes} bytes, at most {most} are read")
     episodes = json.loads(text.tobytes())
@@ -156,7 +177,9 @@ def _episodes(condition: Condition, text: npt.NDArray[Any]) -> list[dict[str, An
         "it has no episodes",
     )
     count = len(episodes)
-    _require(count == condition.episodes, f"it has {count} episodes, the cell has {condition.episodes}")
+    _require(
+        count == condition.episodes, f"it has {count} episodes, the cell has {condition.episodes}"
+    )
     for number, record in enumerate(episodes):
         _require_record(condition, number, record)
         _require(
@@ -170,10 +193,16 @@ def _require_record(condition: Condition, number: int, record: dict[str, Any]) -
     for name, value in episode_labels(condition, number).items():
         own = record.get(name)
         same = type(own) is type(value) and own == value
-        _require(same, f"{name} of episode {number} is {shown(own)}, in the cell it is {shown(value)}")
-    _require(isinstance(record.get("termination"), str), f"episode {number} does not say how it ended")
+        _require(
+            same, f"{name} of episode {number} is {shown(own)}, in the cell it is {shown(value)}"
+        )
+    _require(
+        isinstance(record.get("termination"), str), f"episode {number} does not say how it ended"
+    )
     for name, value in record.items():
-        _require(isinstance(value, str | int | float), f"{name} of episode {number} is {shown(value)}")
+        _require(
+            isinstance(value, str | int | float), f"{name} of episode {number} is {shown(value)}"
+        )
     if record["termination"]:
         return
     for column in condition.environment.judged:
@@ -199,7 +228,9 @@ def _require_arrays(evaluation: Evaluation) -> None:
     lengths = {len(values) for values in trace.values()}
     _require(len(lengths) == 1 and lengths != {0}, f"its signals have {sorted(lengths)} samples")
     time_s = trace.get("time_s", np.zeros(1))
-    _require(bool(np.isfinite(time_s).all() and (np.diff(time_s) > 0.0).all()), "its time does not go on")
+    _require(
+        bool(np.isfinite(time_s).all() and (np.diff(time_s) > 0.0).all()), "its time does not go on"
+    )
     if evaluation.points is not None:
         series = vars(evaluation.points).values()
         same = all(values.shape == evaluation.rest_references.shape for values in series)

@@ -15,7 +15,15 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
+from elastic_env.core.config import (
+    LARGEST_SEED,
+    MOST_ENTRIES,
+    Locator,
+    Model,
+    Title,
+    load_yaml,
+    quantity,
+)
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
@@ -49,9 +57,13 @@ class BenchCase(Model):
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        motion = environment(self.env).default_reference if self.reference is None else self.reference
+        motion = (
+            environment(self.env).default_reference if self.reference is None else self.reference
+        )
         policy = PolicySpec(name=self.policy)
-        return Condition(env=self.env, policy=policy, scenario=self.scenario, seed=self.seed, reference=motion)
+        return Condition(
+            env=self.env, policy=policy, scenario=self.scenario, seed=self.seed, reference=motion
+        )
 
 
 class BenchConfig(Model):
@@ -109,7 +121,10 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
             for case, evaluation in zip(config.cases, evaluations, strict=True)
             for figure in _figures(case, evaluation, config.margin)
         ]
-        write_whole(folder / "bench.json", json.dumps([_plain(figure) for figure in figures], indent=2) + "\n")
+        write_whole(
+            folder / "bench.json",
+            json.dumps([_plain(figure) for figure in figures], indent=2) + "\n",
+        )
         markdown = _markdown(figures)
         write_whole(folder / "bench.md", markdown)
     summary = os.environ.get("GITHUB_STEP_SUMMARY")
@@ -121,9 +136,13 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
     if update:
         _accept(path, config, evaluations)
         console.print(f"accepted the figures into {path}", soft_wrap=True)
-    short = [figure for figure in figures if (np.isnan(figure.measured) if update else figure.problem)]
+    short = [
+        figure for figure in figures if (np.isnan(figure.measured) if update else figure.problem)
+    ]
     for figure in short:
-        console.print(f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False)
+        console.print(
+            f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False
+        )
     return not short
 
 
@@ -132,9 +151,15 @@ def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Fig
     name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"
     found = []
     for metric, accepted in case.figures.items():
-        measured = float(episode.get(metric, np.nan)) if not episode["termination"] else float("nan")
+        measured = (
+            float(episode.get(metric, np.nan)) if not episode["termination"] else float("nan")
+        )
         bound = None if accepted is None else accepted + margin * abs(accepted)
-        found.append(Figure(name, metric, measured, accepted, bound, _problem(metric, measured, bound, episode)))
+        found.append(
+            Figure(
+                name, metric, measured, accepted, bound, _problem(metric, measured, bound, episode)
+            )
+        )
     return found
 
 
@@ -145,8 +170,15 @@ def _problem(metric: str, measured: float, bound: float | None, episode: dict[st
         known = ", ".join(name for name in episode if name.endswith(("_m", "_rad", "_s", "_nm")))
         return f"{metric} is no metric of this episode; those are {known}"
     if bound is None:
-        return f"{metric} is {measured:.4g}, and nothing was accepted yet; elastic bench --update accepts it"
-    return f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted" if not measured <= bound else ""
+        return (
+            f"{metric} is {measured:.4g}, and nothing was accepted yet; elastic bench --update"
+            " accepts it"
+        )
+    return (
+        f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted"
+        if not measured <= bound
+        else ""
+    )
 
 
 def configuration(path: Path, update: bool = False) -> Path:
@@ -166,7 +198,9 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
     """Write measured figures in the place of accepted ones; what stands around them stays."""
     text = path.read_text(encoding="utf-8")
     changes = []
-    for case, evaluation, figures in zip(config.cases, evaluations, _figure_nodes(text), strict=True):
+    for case, evaluation, figures in zip(
+        config.cases, evaluations, _figure_nodes(text), strict=True
+    ):
         (episode,) = evaluation.episodes
         for metric in case.figures:
             if metric in episode and not episode["termination"]:
@@ -181,7 +215,9 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
 def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:
     """Nodes of the figures of every case in a configuration, by metric."""
     cases = _child(yaml.compose(text), "cases")
-    return [{key.value: value for key, value in _child(case, "figures").value} for case in cases.value]
+    return [
+        {key.value: value for key, value in _child(case, "figures").value} for case in cases.value
+    ]
 
 
 def _child(node: Any, name: str) -> Any:
@@ -189,7 +225,9 @@ def _child(node: Any, name: str) -> Any:
 
 
 def _plain(figure: Figure) -> dict[str, Any]:
-    return {name: None if value != value else value for name, value in asdict(figure).items()}  # nan is not JSON
+    return {
+        name: None if value != value else value for name, value in asdict(figure).items()
+    }  # nan is not JSON
 
 
 def _rows(figures: list[Figure]) -> list[tuple[str, ...]]:
@@ -201,7 +239,10 @@ def _rows(figures: list[Figure]) -> list[tuple[str, ...]]:
             return "kept"
         return "new" if figure.bound is None and np.isfinite(figure.measured) else "falls short"
 
-    return [(f.case, f.metric, text(f.measured), text(f.accepted), text(f.bound), verdict(f)) for f in figures]
+    return [
+        (f.case, f.metric, text(f.measured), text(f.accepted), text(f.bound), verdict(f))
+        for f in figures
+    ]
 
 
 _COLUMNS = ("rollout", "figure", "measured", "accepted", "at most", "")
@@ -229,14 +270,18 @@ def _markdown(figures: list[Figure]) -> str:
 class Bench(Model):
     """Guard figures in CI: short rollouts of both environments against what was accepted.
 
-    Exit code 1, and a line for every figure that falls short. Appends its table to the file that $GITHUB_STEP_SUMMARY
-    names. Example, to accept new figures: elastic bench --update
+    Exit code 1, and a line for every figure that falls short. Appends its table to the file that
+    $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench --update
     """
 
     config: Annotated[Path, tyro.conf.Positional] = USUAL
-    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml, that of the package."""
+    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml,
+    that of the package.
+    """
     update: bool = False
-    """Accept what is measured now: the figures in the configuration change, and nothing else of it."""
+    """Accept what is measured now: the figures in the configuration change, and nothing else of
+    it.
+    """
     output: Path | None = None
     """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
 

@@ -57,7 +57,10 @@ def _print_failure(error: Exception) -> int:
     found = explain(error)
     if found is None:
         sys.stderr.write(traceback_of(error))
-    said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
+    said, code = found or (
+        f"this is a defect of elastic-env, please report it: {type(error).__name__}",
+        DEFECT,
+    )
     line = Text.assemble(("error:", "bold red"), f" {_with_notes(error, said)}")
     PlainConsole(stderr=True).print(line, highlight=False, soft_wrap=True)
     return code
@@ -69,7 +72,9 @@ _SAME_WISH_S = 2.0
 
 @contextlib.contextmanager
 def _ended_by(*numbers: int) -> Iterator[None]:
-    """Signals that would end this program end what is within by an exception; ignored ones do not."""
+    """Signals that would end this program end what is within by an exception; ignored ones do
+    not.
+    """
     asked_s = -math.inf
 
     def end(number: int, _: Any) -> None:
@@ -81,7 +86,11 @@ def _ended_by(*numbers: int) -> Iterator[None]:
 
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in numbers if is_main}
-    taken = {n: handler for n, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)}
+    taken = {
+        n: handler
+        for n, handler in before.items()
+        if handler in (signal.SIG_DFL, signal.default_int_handler)
+    }
     for number in taken:
         signal.signal(number, end)
     try:
@@ -120,7 +129,8 @@ def _parse(arguments: list[str]) -> Any:
         return given
 
     command.__doc__ = options.__doc__
-    # without a name of its own, what is wrong with an option is an error of this program, and no box of tyro's
+    # without a name of its own, what is wrong with an option is an error of this program, and no
+    # box of tyro's
     command.__annotations__["given"] = Annotated[options, tyro.conf.arg(name="")]
     with name_options():
         return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
@@ -130,8 +140,13 @@ _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 
 
 def _parse_overview(arguments: list[str]) -> Any:
-    """Print the help of all commands, or refuse a command that does not exist; the commands need not be loaded."""
-    kinds = [dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)}) for name in COMMANDS]
+    """Print the help of all commands, or refuse a command that does not exist; the commands need
+    not be loaded.
+    """
+    kinds = [
+        dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
+        for name in COMMANDS
+    ]
     named = zip(COMMANDS, kinds, strict=True)
     members: Any = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in named]
     return tyro.cli(
@@ -139,8 +154,10 @@ def _parse_overview(arguments: list[str]) -> Any:
         prog="elastic",
         args=arguments,
         config=_STYLE,
-        description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each, "
-        "`elastic --version` says which version this is.",
+        description=(
+            "Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help`"
+            " explains each, `elastic --version` says which version this is."
+        ),
     )
 
 
@@ -165,6 +182,12 @@ def main(arguments: list[str] | None = None) -> None:
             sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
-            said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-            PlainConsole(stderr=True).print(_with_notes(error, said), highlight=False, soft_wrap=True)
+            said = (
+                "interrupted"
+                if number == signal.SIGINT
+                else f"ended by {signal.Signals(number).name}"
+            )
+            PlainConsole(stderr=True).print(
+                _with_notes(error, said), highlight=False, soft_wrap=True
+            )
             os._exit(128 + number)  # worker processes must not keep the terminal waiting

@@ -17,7 +17,14 @@ from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.commands.options import OnHardware
 from train.evaluate.changes import changes, merge_seeds
-from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
+from train.evaluate.conditions import (
+    MOST_EPISODES,
+    Condition,
+    GivenRanges,
+    GivenReference,
+    PolicySpec,
+    require_drawn,
+)
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.episodes import Evaluation
 from train.evaluate.families import expand
@@ -62,13 +69,17 @@ class CompareConfig(Model):
     """Motions, see `Condition.reference`; default the environment's."""
     scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     policies: list[PolicySpec] = Field(
-        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1, max_length=MOST_ENTRIES
+        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")],
+        min_length=1,
+        max_length=MOST_ENTRIES,
     )
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
     """Episodes per cell."""
     scenario_episodes: dict[str, int] = {}
-    """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
+    """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is
+    random.
+    """
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
     """Seed of the first episode."""
     ranges: GivenRanges = {}
@@ -80,13 +91,19 @@ class CompareConfig(Model):
     sweep: Sweep | None = None
     """An option of the policies to vary."""
     map: MapConfig | None = None
-    """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are then the references."""
+    """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are
+    then the references.
+    """
     groups: dict[str, list[str]] = {}
     """Scenarios that paired changes are also pooled over, by the name of the group."""
     reference_scenarios: dict[str, list[Title]] = {}
-    """Scenarios of single references, by their names in tables, where not all are played: {24 s: [nominal]}."""
+    """Scenarios of single references, by their names in tables, where not all are played: {24 s:
+    [nominal]}.
+    """
     leaderboard: bool = False
-    """Write a leaderboard: policies in tracks, groups and motions as columns, and the time of a step."""
+    """Write a leaderboard: policies in tracks, groups and motions as columns, and the time of a
+    step.
+    """
 
     @model_validator(mode="before")
     @classmethod
@@ -95,7 +112,10 @@ class CompareConfig(Model):
         if not isinstance(name, str):
             return values
         known = environment(name)
-        return {"references": _along(values.get("map"), known) or [known.default_reference], **values}
+        return {
+            "references": _along(values.get("map"), known) or [known.default_reference],
+            **values,
+        }
 
     _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
 
@@ -103,7 +123,9 @@ class CompareConfig(Model):
     @classmethod
     def _names_are_policies(cls, value: Any) -> Any:
         return (
-            [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
+            [{"name": item} if isinstance(item, str) else item for item in value]
+            if isinstance(value, list)
+            else value
         )
 
     @model_validator(mode="after")
@@ -112,9 +134,13 @@ class CompareConfig(Model):
         titles = [policy.title for policy in self.policies]
         for title in titles:
             if titles.count(title) > 1:
-                raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
+                raise ConfigurationError(
+                    f"two policies are called {title!r}; give one of them a label"
+                )
         if self.sweep is not None and all(policy.level for policy in self.policies):
-            raise ConfigurationError("a sweep needs a policy that it varies; level: true leaves all of them out of it")
+            raise ConfigurationError(
+                "a sweep needs a policy that it varies; level: true leaves all of them out of it"
+            )
         self._require_map()
         _require_each_once("reference", self._reference_names())
         _require_each_once("scenario", self.scenarios)
@@ -125,40 +151,55 @@ class CompareConfig(Model):
         for scenario, episodes in self.scenario_episodes.items():
             if not 1 <= episodes <= MOST_EPISODES:
                 raise ConfigurationError(
-                    f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
+                    f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got"
+                    f" {shown(episodes)}"
                 )
         self._require_reference_scenarios()
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
-                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; "
-                    f"got {shown(scenarios)}"
+                    f"group {name!r} must have a name that no scenario has, and scenarios, each"
+                    f" once; got {shown(scenarios)}"
                 )
             require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
         return self
 
     def _require_reference_scenarios(self) -> None:
-        """Refuse scenarios of references that are not played, and a leaderboard of what none can be of."""
-        require_known("reference with scenarios of its own", self.reference_scenarios, self._reference_names())
+        """Refuse scenarios of references that are not played, and a leaderboard of what none can
+        be of.
+        """
+        require_known(
+            "reference with scenarios of its own", self.reference_scenarios, self._reference_names()
+        )
         for name, scenarios in self.reference_scenarios.items():
             if not scenarios:
-                raise ConfigurationError(f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}")
+                raise ConfigurationError(
+                    f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
+                )
             _require_each_once(f"scenario of {name!r}", scenarios)
             require_known(f"scenario of {name!r}", scenarios, self.scenarios)
-        if self.leaderboard and (self.sweep is not None or self.map is not None or environment(self.env).is_real):
-            raise ConfigurationError("a leaderboard is of simulated cells without a sweep or a map; leave these out")
+        if self.leaderboard and (
+            self.sweep is not None or self.map is not None or environment(self.env).is_real
+        ):
+            raise ConfigurationError(
+                "a leaderboard is of simulated cells without a sweep or a map; leave these out"
+            )
 
     def _require_map(self) -> None:
-        """Refuse a map that its environment does not have, or that something else of the comparison contradicts."""
+        """Refuse a map that its environment does not have, or that something else of the
+        comparison contradicts.
+        """
         if self.map is None:
             return
         self.map.require(environment(self.env))
         if self.sweep is not None or any(policy.level for policy in self.policies):
-            raise ConfigurationError("a map has two axes of its own; leave out sweep, and level of the policies")
+            raise ConfigurationError(
+                "a map has two axes of its own; leave out sweep, and level of the policies"
+            )
         if self.map.motion is not None and self.references != self.map.motion.values:
             raise ConfigurationError(
-                f"an axis of the map varies the {self.map.motion.what}, so its values are the references; "
-                f"leave out references, got {shown(self.references)}"
+                f"an axis of the map varies the {self.map.motion.what}, so its values are the"
+                f" references; leave out references, got {shown(self.references)}"
             )
 
     def conditions(self, with_bases: bool = True) -> list[Condition]:
@@ -171,14 +212,17 @@ class CompareConfig(Model):
             ConfigurationError: Residuals that do not exist, or are no family.
         """
         entrants = expand(self.policies, with_bases)
-        swept = len(self.sweep.values) if self.sweep else len(self.map.coordinates()) if self.map else 1
+        swept = (
+            len(self.sweep.values) if self.sweep else len(self.map.coordinates()) if self.map else 1
+        )
         own = self.reference_scenarios
         played = {name: own.get(name, self.scenarios) for name in self._reference_names()}
         cells = sum(map(len, played.values())) * len(entrants) * swept
         if cells > _MOST_CELLS:
             raise ConfigurationError(
-                f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)} references x "
-                f"{len(self.scenarios)} scenarios x {len(entrants)} policies x {swept} values are {cells}; split it"
+                f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)}"
+                f" references x {len(self.scenarios)} scenarios x {len(entrants)} policies x"
+                f" {swept} values are {cells}; split it"
             )
         return [
             Condition(
@@ -213,14 +257,23 @@ class CompareConfig(Model):
         """Names of the references in tables."""
         known = environment(self.env)
         labels = self._reference_labels()
-        return [label or known.label(reference) for label, reference in zip(labels, self.references, strict=True)]
+        return [
+            label or known.label(reference)
+            for label, reference in zip(labels, self.references, strict=True)
+        ]
 
     def _reference_labels(self) -> list[str | None]:
-        """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
+        """Names that tell references of one kind apart by their parameters; None where the kind
+        is enough.
+        """
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
         return [
-            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)])) if kinds.count(kind) > 1 else None
+            (
+                " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)]))
+                if kinds.count(kind) > 1
+                else None
+            )
             for kind, reference in zip(kinds, self.references, strict=True)
         ]
 
@@ -251,7 +304,11 @@ class Work:
 
 @each_once()
 def compare(
-    config: CompareConfig, console: Console, output: Path | None = None, work: Work | None = None, report: bool = True
+    config: CompareConfig,
+    console: Console,
+    output: Path | None = None,
+    work: Work | None = None,
+    report: bool = True,
 ) -> Comparison:
     """Run a comparison, write its folder, and print its tables.
 
@@ -260,8 +317,8 @@ def compare(
         console: Where progress and table go.
         output: Folder for the results; default runs/<name>, numbered if taken.
         work: How it is played; None for this machine and a new run.
-        report: Whether policies are compared with one another, and bases of residuals added for it; else they are
-            scored alone, and no cells are kept.
+        report: Whether policies are compared with one another, and bases of residuals added for it;
+            else they are scored alone, and no cells are kept.
 
     Raises:
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
@@ -285,11 +342,17 @@ def compare(
         files.append(write_summary(cells, folder / "summary.md"))
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
         maps = [] if config.map is None else heat_maps(evaluations, config.map)
-        files += draw_maps(maps, folder) if maps else draw_figures(cells, folder, config.figure_policies, axis)
+        files += (
+            draw_maps(maps, folder)
+            if maps
+            else draw_figures(cells, folder, config.figure_policies, axis)
+        )
         if maps:
             files.append(write_maps(maps, folder / "map.csv"))
         rows = changes(evaluations, config.groups) if report else []
-        if config.leaderboard or maps:  # which find the best policy of every column or cell themselves
+        if (
+            config.leaderboard or maps
+        ):  # which find the best policy of every column or cell themselves
             rows = [row for row in rows if not row.is_rival]
         board = []
         if config.leaderboard:
@@ -298,7 +361,9 @@ def compare(
             files += write_leaderboard(board, folder)
         if report:
             files.append(write_statistics(rows, folder / "statistics.csv"))
-            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps, board, robots))
+            files += write_report(
+                Results(config.name, evaluations, rows, folder, axis, maps, board, robots)
+            )
     print_summary(cells, console)
     print_robots(robots, console)
     print_changes(rows, console)
@@ -353,7 +418,10 @@ def _play_cells(
         if error.finished:
             write_summary(merge_seeds(error.finished), folder / "summary.md")
             kept = write_episodes(error.finished, folder / "episodes.csv")
-            console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
+            console.print(
+                f"the other {len(error.finished)} cells are in {kept} and summary.md",
+                soft_wrap=True,
+            )
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
         if any((folder / CELLS).glob("*.npz")):
@@ -364,7 +432,9 @@ def _play_cells(
 def _require_each_once(what: str, values: Sequence[object]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise ConfigurationError(f"the {what} {shown(value)} stands twice; its episodes would count double")
+            raise ConfigurationError(
+                f"the {what} {shown(value)} stands twice; its episodes would count double"
+            )
 
 
 def try_out(conditions: Sequence[Condition]) -> None:
@@ -375,15 +445,20 @@ def try_out(conditions: Sequence[Condition]) -> None:
         except ConfigurationError as error:
             if not condition.swept:
                 raise
-            raise ConfigurationError(f"{error}; level: true leaves a policy out of the sweep") from None
+            raise ConfigurationError(
+                f"{error}; level: true leaves a policy out of the sweep"
+            ) from None
         if not hasattr(policy, "predict"):
             raise ConfigurationError(
-                f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
+                f"policy {condition.policy.name!r} has no method predict(), got"
+                f" {type(policy).__name__}"
             )
 
 
 def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
-    """Conditions with an environment, or a policy at a motion, that no earlier one has: a sum of them, no product."""
+    """Conditions with an environment, or a policy at a motion, that no earlier one has: a sum of
+    them, no product.
+    """
     seen = set[str]()
     for condition in conditions:
         own = {
@@ -397,26 +472,34 @@ def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
 
 def _along(axes: Any, known: Environment) -> list[Any]:
     """Values of the axis of a raw map that varies the motion; empty where none does."""
-    found = [axis for axis in axes.values() if isinstance(axis, dict)] if isinstance(axes, dict) else []
-    along = [axis["values"] for axis in found if axis.get("what") == known.motion and "values" in axis]
+    found = (
+        [axis for axis in axes.values() if isinstance(axis, dict)] if isinstance(axes, dict) else []
+    )
+    along = [
+        axis["values"] for axis in found if axis.get("what") == known.motion and "values" in axis
+    ]
     return along[0] if along and isinstance(along[0], list) else []
 
 
 def _parameters(reference: Reference, known: Environment) -> list[str]:
     if not isinstance(reference, dict):
         return []
-    return [f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)]
+    return [
+        f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)
+    ]
 
 
 class Compare(Model):
     """Compare policies × scenarios × references × seeds as a configuration says.
 
-    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts and tables, works
-    offline), report.md, summary.md and figures beside the resolved configuration, seed, versions and commit.
+    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts
+    and tables, works offline), report.md, summary.md and figures beside the resolved configuration,
+    seed, versions and commit.
 
-    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all training seeds of a
-    residual, compared with their base on the same episodes, with intervals over training seeds. The base is added if
-    it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of the package.
+    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all
+    training seeds of a residual, compared with their base on the same episodes, with intervals over
+    training seeds. The base is added if it is not among the policies. residual:walker_3s/seed_* and
+    the like are the trained ones of the package.
 
     Example, one joint: elastic compare configs/testbed.yaml
 
@@ -430,13 +513,19 @@ class Compare(Model):
     """
 
     config: Annotated[Path | None, tyro.conf.Positional] = None
-    """YAML configuration, see configs/; with --resume the one of the run unless another is named."""
+    """YAML configuration, see configs/; with --resume the one of the run unless another is
+    named.
+    """
     output: Path | None = None
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
     jobs: int = 0
-    """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
+    """Conditions that run at the same time, 0 for one per core; on hardware they come one after
+    the other.
+    """
     on: str = "local"
-    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see
+    docs/cluster.md.
+    """
     resume: Path | None = None
     """Folder of a run to go on with: what is missing or has changed is played."""
     fresh: bool = False
@@ -461,7 +550,9 @@ class Compare(Model):
 
     def _require(self) -> None:
         if self.config is None and self.resume is None:
-            raise ConfigurationError("name a configuration or, with --resume, the run to go on with")
+            raise ConfigurationError(
+                "name a configuration or, with --resume, the run to go on with"
+            )
         if self.resume is not None and self.output is not None:
             raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
         if self.resume is None and self.fresh:

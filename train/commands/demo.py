@@ -1,4 +1,6 @@
-"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10) in short."""
+"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10)
+in short.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -77,9 +79,9 @@ class Demo(Model):
         recorded = {"conditions": [condition.model_dump(mode="json") for condition in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
             console.print(
-                "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a "
-                "pendulum of 60 N·m, and a humanoid that walks in place on twelve of them; at the end with joints "
-                "that are softer than assumed (scenario soft)"
+                "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic"
+                " gear and a pendulum of 60 N·m, and a humanoid that walks in place on twelve of"
+                " them; at the end with joints that are softer than assumed (scenario soft)"
             )
             evaluations = iter(run_conditions(conditions, console))
             static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
@@ -146,5 +148,7 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
 
 
 def _pelvis_peaks(walk: Evaluation) -> str:
-    roll, pitch = (1e3 * np.max(walk.values(f"pelvis_{axis}_peak_rad")) for axis in ("roll", "pitch"))
+    roll, pitch = (
+        1e3 * np.max(walk.values(f"pelvis_{axis}_peak_rad")) for axis in ("roll", "pitch")
+    )
     return f"{roll:.1f} and {pitch:.1f}"

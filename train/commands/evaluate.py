@@ -6,14 +6,21 @@ from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
 from train.commands.compare import CompareConfig, compare, print_files
-from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options, reference_of
+from train.commands.options import (
+    MotionOrDefault,
+    OnHardware,
+    Stiffness,
+    name_options,
+    reference_of,
+)
 from train.evaluate.conditions import MOST_EPISODES, PolicySpec
 
 
 class Evaluate(Model):
     """Play episodes of one policy under one scenario and print its metrics.
 
-    Example, one joint: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+    Example, one joint: elastic evaluate --policy input --scenario soft --reference multisine
+        --episodes 10
 
     Example, a walk: elastic evaluate --env walker --policy input_wrench --reference 3
     """
@@ -28,16 +35,16 @@ class Evaluate(Model):
     input_wrench, adaptive, posture, adaptive_posture,
     torque_sensor, hip_sensor, thormang, talos."""
     env: str = "testbed"
-    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
-    robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a JointRobot."""
+    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in
+    place), robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
+    JointRobot."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
     sensor, ideal+soft; on the walker also imu, push, slope, drawn, drawn_beyond."""
     reference: MotionOrDefault = None
-    """MotionOrDefault. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some seconds),
-    or a mapping such as '{kind: sine, amplitude: 0.3}'.
-    Walker: step period 24, 3 (default), 1.6 or 1.1 [s],
-    or its durations of double, single, double support '[0.8, 0.6, 0.8]',
+    """MotionOrDefault. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some
+    seconds), or a mapping such as '{kind: sine, amplitude: 0.3}'. Walker: step period 24, 3
+    (default), 1.6 or 1.1 [s], or its durations of double, single, double support '[0.8, 0.6, 0.8]',
     or a mapping such as '{step_period: 3, num_steps: 2}'."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
     """Number of episodes, seeds following --seed."""

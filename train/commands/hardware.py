@@ -54,16 +54,25 @@ class Scan(Model):
         """Scan; exit code 3 where no servo answers."""
         if self.baudrate is not None:
             HardwareSettings(port=self.port, baudrate=self.baudrate)  # checks it
-        table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {self.port}")
+        table = Table(
+            "bit/s", "id", "model number", "model", "firmware", title=f"servos at {self.port}"
+        )
         for rate in RATES if self.baudrate is None else (self.baudrate,):
             with DynamixelBus(self.port, rate) as bus:
                 for servo in bus.scan():
                     model = servo_models().get(servo.model_number)
                     name = model.name if model is not None else "not known here"
-                    table.add_row(str(rate), str(servo.servo_id), str(servo.model_number), name, str(servo.firmware))
+                    table.add_row(
+                        str(rate),
+                        str(servo.servo_id),
+                        str(servo.model_number),
+                        name,
+                        str(servo.firmware),
+                    )
         if not table.row_count:
             console.print(
-                f"no servo answers at {self.port}; check power, wiring and baud rate, and whether it is the IMU's port",
+                f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
+                " it is the IMU's port",
                 soft_wrap=True,
             )
             sys.exit(3)
@@ -71,7 +80,8 @@ class Scan(Model):
 
 
 class Check(Model):
-    """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there is anything to do.
+    """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there
+    is anything to do.
 
     Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
     """
@@ -90,7 +100,10 @@ class Check(Model):
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
         HardwareSettings(  # checks them
-            port=self.port, baudrate=self.baudrate, imu_port=self.imu_port, imu_baudrate=self.imu_baudrate
+            port=self.port,
+            baudrate=self.baudrate,
+            imu_port=self.imu_port,
+            imu_baudrate=self.imu_baudrate,
         )
         require_ids(self.ids)
         with DynamixelBus(self.port, self.baudrate) as bus:
@@ -98,11 +111,18 @@ class Check(Model):
         if self.imu_port is not None:
             with AttitudeStream(self.imu_port, self.imu_baudrate) as stream:
                 sample = stream.latest()
-            angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw"))
+            angles = ", ".join(
+                f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw")
+            )
             checks.append(BusCheck("IMU", f"{angles} rad"))
         table = Table("", "", "what to do", title=f"check of {self.port}", show_header=True)
         for one in checks:
-            table.add_row(one.what, one.value, escape(one.cure) or "fine", style="" if one.is_good else "bold yellow")
+            table.add_row(
+                one.what,
+                one.value,
+                escape(one.cure) or "fine",
+                style="" if one.is_good else "bold yellow",
+            )
         console.print(table)
         if not all(one.is_good for one in checks):
             sys.exit(3)
@@ -111,7 +131,8 @@ class Check(Model):
 class Run(Model):
     """Play one episode on the real testbed, show it as it goes, and keep every step.
 
-    Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input --reference sine
+    Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input
+        --reference sine
     A short one: --reference '{kind: sine, amplitude: 0.2, duration_s: 5}'
     """
 
@@ -120,20 +141,30 @@ class Run(Model):
     reference: MotionOrDefault = None
     """MotionOrDefault, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None
-    """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if taken."""
+    """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if
+    taken.
+    """
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Play one episode, show it as it goes, and keep every step in log.csv, also of one that is cut short."""
+        """Play one episode, show it as it goes, and keep every step in log.csv, also of one that
+        is cut short.
+        """
         if not (arguments := self.on.arguments):
-            raise ConfigurationError("--port is needed; see: elastic hardware scan PORT, elastic hardware emulate")
+            raise ConfigurationError(
+                "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
+            )
         reference = reference_of("hardware", self.reference)
         spec = PolicySpec(name=self.policy)
         name = environment("hardware").id
         env: Any = gymnasium.make(name, disable_env_checker=True, reference=reference, **arguments)
         with contextlib.closing(env):
             policy = make_policy(spec, env)
-            configuration = {"policy": spec.model_dump(mode="json"), "reference": reference, **arguments}
+            configuration = {
+                "policy": spec.model_dump(mode="json"),
+                "reference": reference,
+                **arguments,
+            }
             with run_folder("hardware", configuration, None, self.output) as folder:
                 metrics: dict[str, Any] = {}
                 with _open_log(folder / "log.csv", console) as log:
@@ -141,7 +172,9 @@ class Run(Model):
                         log.write(info)
                         metrics = info.get("episode_metrics", metrics)
                 (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True)
+        console.print(
+            f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True
+        )
 
 
 def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
@@ -151,14 +184,18 @@ def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
     start = np.array(True)
     truncated = False
     while not truncated:
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        action, state = policy.predict(
+            observation, state=state, episode_start=start, deterministic=True
+        )
         observation, _, _, truncated, info = env.step(action)
         start = np.array(False)
         yield info
 
 
 class _Log:
-    """The rows of log.csv, and a line on the console once a second, up to which all rows are on the disk."""
+    """The rows of log.csv, and a line on the console once a second, up to which all rows are on
+    the disk.
+    """
 
     _SHOWN = (
         ("t", "s", "time_s", 1.0, "7.1f"),
@@ -184,13 +221,17 @@ class _Log:
             self._writer = csv.DictWriter(self._file, list(row))
             self._writer.writeheader()
             for heading in (0, 1):
-                self._print([f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in self._SHOWN])
+                self._print(
+                    [f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in self._SHOWN]
+                )
         self._writer.writerow(row)
         self.num_rows += 1
         if row["time_s"] >= self._next_s:
             self._next_s += _SHOWN_S
             self._file.flush()
-            self._print([format(row[key] * factor, spec) for _, _, key, factor, spec in self._SHOWN])
+            self._print(
+                [format(row[key] * factor, spec) for _, _, key, factor, spec in self._SHOWN]
+            )
 
     def _print(self, cells: list[str]) -> None:
         self._console.print("".join(cells), soft_wrap=True, highlight=False)
@@ -205,16 +246,20 @@ def _open_log(path: Path, console: Console) -> Iterator[_Log]:
             yield log
         except BaseException:
             if log.num_rows:
-                console.print(f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True)
+                console.print(
+                    f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True
+                )
             else:
                 path.unlink()
             raise
 
 
 class Emulate(Model):
-    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without hardware.
+    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without
+    hardware.
 
-    Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware emulate --lost 0.01
+    Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
+    emulate --lost 0.01
     """
 
     ids: list[int] = [1]
@@ -230,7 +275,9 @@ class Emulate(Model):
     unheard: float = 0.0
     """Share of instructions that reach no servo."""
     lost: float = 0.0
-    """Share of replies that do not come; this and the next three are drawn for every reply, each by itself."""
+    """Share of replies that do not come; this and the next three are drawn for every reply, each
+    by itself.
+    """
     late: float = 0.0
     """Share of replies that come 6 ms late."""
     corrupted: float = 0.0
@@ -240,8 +287,8 @@ class Emulate(Model):
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
     fault: list[str] = []
-    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
-    imu_frozen."""
+    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf,
+    imu_out_of_range, imu_frozen."""
     fault_after_s: float = 20.0
     """When that happens, after the start [s]."""
     seed: int = 0
@@ -251,7 +298,10 @@ class Emulate(Model):
         """Emulate."""
         switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
         require_known("fault", self.fault, switches)
-        shares = {name: getattr(self, name) for name in ("unheard", "lost", "late", "corrupted", "truncated")}
+        shares = {
+            name: getattr(self, name)
+            for name in ("unheard", "lost", "late", "corrupted", "truncated")
+        }
         config = EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
@@ -264,7 +314,10 @@ class Emulate(Model):
 
 
 def emulate(
-    config: EmulatorConfig, console: Console, later: Mapping[str, bool] | None = None, after_s: float = 0.0
+    config: EmulatorConfig,
+    console: Console,
+    later: Mapping[str, bool] | None = None,
+    after_s: float = 0.0,
 ) -> None:
     """Emulate until Ctrl-C.
 
@@ -278,13 +331,17 @@ def emulate(
         ConfigurationError: That is no time that somebody can wait for.
     """
     if not 0.0 <= after_s <= _LATEST_FAULT_S:
-        raise ConfigurationError(f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {shown(after_s)}")
+        raise ConfigurationError(
+            f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {shown(after_s)}"
+        )
     with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
-        console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True)
+        console.print(
+            f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True
+        )
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
         console.print(
-            f"for example: elastic hardware check {emulator.port}, or\n"
-            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
+            f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
+            f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
             soft_wrap=True,
         )
         if later:

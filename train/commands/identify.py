@@ -31,14 +31,16 @@ from train.runs.progress import plain_progress, show_progress
 class Identify(Model):
     """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
 
-    Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and separates stiffness,
-    friction, dead band and offset. Writes identification.json, which the environment and the compensators take as their
-    K, and a figure. Example: elastic identify --scenario backlash
+    Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and
+    separates stiffness, friction, dead band and offset. Writes identification.json, which the
+    environment and the compensators take as their K, and a figure. Example: elastic identify
+    --scenario backlash
 
     On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
 
-    An arm from a log of static poses, with joints.yaml for compensator and environment, see docs/identification.md:
-    elastic identify --robot arm.urdf --log poses.csv --end-effector tool0 --plan 20
+    An arm from a log of static poses, with joints.yaml for compensator and environment, see
+    docs/identification.md: elastic identify --robot arm.urdf --log poses.csv --end-effector tool0
+    --plan 20
     """
 
     scenario: Title | None = None
@@ -46,9 +48,13 @@ class Identify(Model):
     stiffness: float | None = quantity("N·m/rad", None, gt=0)
     """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
     second_mass: float | None = quantity("1", None, gt=0)
-    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q from K; such as 0.5."""
+    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q
+    from K; such as 0.5.
+    """
     positions: int = quantity("1", 20, ge=5, le=200)
-    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take five."""
+    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take
+    five.
+    """
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
     """Seed of the sensor noise."""
     repeats: int = quantity("1", 1, ge=1, le=10_000)
@@ -61,11 +67,14 @@ class Identify(Model):
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
         if self.second_mass == 1.0:
-            raise ValueError("second_mass must differ from 1: two equal masses do not separate anything")
+            raise ValueError(
+                "second_mass must differ from 1: two equal masses do not separate anything"
+            )
         return self
 
     def run(self, console: Console) -> list[Identification] | ArmIdentification | None:
-        """Identify the testbed, simulated or real, or an arm; write `identification.json` and the figure.
+        """Identify the testbed, simulated or real, or an arm; write `identification.json` and the
+        figure.
 
         Returns:
             One result per repetition; of an arm its result, or None for a plan without a log.
@@ -77,9 +86,15 @@ class Identify(Model):
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
         given = {"seed": self.seed, "output": self.output}
-        if others := [name for name, value in Identify(**given, arm=self.arm) if value != getattr(self, name)]:
-            names = ", ".join("--port and the like" if name == "on" else option_name((name,)) for name in others)
-            raise ConfigurationError(f"options of the testbed: {names}; leave them out beside --robot and --log")
+        if others := [
+            name for name, value in Identify(**given, arm=self.arm) if value != getattr(self, name)
+        ]:
+            names = ", ".join(
+                "--port and the like" if name == "on" else option_name((name,)) for name in others
+            )
+            raise ConfigurationError(
+                f"options of the testbed: {names}; leave them out beside --robot and --log"
+            )
         return run_arm_identification(self.arm, console, **given)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
@@ -107,7 +122,10 @@ class Identify(Model):
             ]
             console.print(result_table(results[0]))
             if self.repeats > 1:
-                repeats = [{"seed": self.seed + i, **result.model_dump()} for i, result in enumerate(results)]
+                repeats = [
+                    {"seed": self.seed + i, **result.model_dump()}
+                    for i, result in enumerate(results)
+                ]
                 files.append(write_records(repeats, folder / "repeats.csv"))
                 console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
         for path in files:
@@ -124,9 +142,13 @@ class Identify(Model):
                 "an identification on hardware needs the link's angle: name the IMU with --imu-port"
             )
         if self.stiffness is not None or self.repeats > 1:
-            raise ConfigurationError("stiffness and repeats are of a simulated joint; leave them out on hardware")
+            raise ConfigurationError(
+                "stiffness and repeats are of a simulated joint; leave them out on hardware"
+            )
         if self.second_mass is not None and not hardware.get("confirm", True):
-            raise ConfigurationError("somebody must change the mass between the runs: a second_mass excludes --yes")
+            raise ConfigurationError(
+                "somebody must change the mass between the runs: a second_mass excludes --yes"
+            )
 
 
 @contextmanager
@@ -148,8 +170,17 @@ def result_table(result: Identification) -> Table:
     rows = [
         ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
         ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
-        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}"),
-        ("friction", f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to {result.friction_high_nm:.2f})"),
+        (
+            "  plain line",
+            f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}",
+        ),
+        (
+            "friction",
+            (
+                f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to"
+                f" {result.friction_high_nm:.2f})"
+            ),
+        ),
         ("dead band", f"{1e3 * result.dead_band_rad:.2f} mrad"),
         ("offset", f"{1e3 * result.offset_rad:+.2f} mrad"),
         ("directions differ", "yes (hysteresis)" if result.hysteresis else "no"),
@@ -174,10 +205,16 @@ def identified_environments(options: Identify) -> list[Any]:
     else:
         name = "elastic_env/Testbed-v0"
         scenario = options.on.scenario(options.scenario)
-        arguments = {"num_envs": options.repeats, "scenario": scenario, "stiffness": options.stiffness}
+        arguments = {
+            "num_envs": options.repeats,
+            "scenario": scenario,
+            "stiffness": options.stiffness,
+        }
     arguments["reference"] = {"kind": "hold", "positions": options.positions}
     return [
-        gymnasium.make_vec(name, vectorization_mode="vector_entry_point", pendulum=pendulum, **arguments)
+        gymnasium.make_vec(
+            name, vectorization_mode="vector_entry_point", pendulum=pendulum, **arguments
+        )
         for pendulum in pendulums
     ]
 
@@ -185,12 +222,15 @@ def identified_environments(options: Identify) -> list[Any]:
 def _spread(results: Sequence[Identification], truth: float) -> str:
     """Spread over the seeds, and how often the intervals hold the truth."""
     stiffness = np.array([result.stiffness_nm_per_rad for result in results])
-    covered = sum(r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results)
+    covered = sum(
+        r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results
+    )
     widest = max(result.half_width for result in results)
     return (
-        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to {stiffness.max():.1f} "
-        f"N·m/rad (true {truth:g}); friction median {np.median([r.friction_nm for r in results]):.2f} N·m; "
-        f"r median {np.median([r.pearson_r for r in results]):.4f}; plain line median "
-        f"{np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\n"
-        f"the 95 % interval holds the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
+        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to"
+        f" {stiffness.max():.1f} N·m/rad (true {truth:g}); friction median"
+        f" {np.median([r.friction_nm for r in results]):.2f} N·m; r median"
+        f" {np.median([r.pearson_r for r in results]):.4f}; plain line median"
+        f" {np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\nthe 95 % interval holds"
+        f" the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
     )

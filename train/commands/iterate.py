@@ -1,4 +1,6 @@
-"""`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as a policy."""
+"""`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as
+a policy.
+"""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -33,11 +35,13 @@ _MOST_ROBOTS = 64
 
 
 class Iterate(Model):
-    """Learn on the robot itself, from walk to walk: iterative learning control, without any training in simulation.
+    """Learn on the robot itself, from walk to walk: iterative learning control, without any
+    training in simulation.
 
-    After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on the testbed the IMU
-    of the link, have shown at the same time. Prints a table trial by trial; trial 0 is the base, the last one has all
-    that was learned. Writes the learned offsets as a policy iterative:FOLDER, trials.csv and a picture.
+    After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on
+    the testbed the IMU of the link, have shown at the same time. Prints a table trial by trial;
+    trial 0 is the base, the last one has all that was learned. Writes the learned offsets as a
+    policy iterative:FOLDER, trials.csv and a picture.
 
     Example: elastic iterate --scenario soft --trials 10
 
@@ -67,8 +71,9 @@ class Iterate(Model):
         condition = self.condition
         if condition.environment.draws(condition.reference):
             raise ConfigurationError(
-                f"the reference {condition.reference!r} draws another motion for every seed, and what is "
-                "learned for one is wrong for another; name one that repeats, such as sine or hold"
+                f"the reference {condition.reference!r} draws another motion for every seed, and"
+                " what is learned for one is wrong for another; name one that repeats, such as"
+                " sine or hold"
             )
         return self
 
@@ -90,7 +95,8 @@ class Iterate(Model):
         )
 
     def run(self, console: Console) -> list[Trial]:
-        """Learn, play a last trial with what was learned, write the run, and print a table of the trials.
+        """Learn, play a last trial with what was learned, write the run, and print a table of the
+        trials.
 
         Returns:
             The trials; the first has no offsets, the last has what was learned.
@@ -136,19 +142,30 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
 
 
 def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
-    """The judged metrics and the failures of every trial, the mean over the robots that did not fail."""
+    """The judged metrics and the failures of every trial, the mean over the robots that did not
+    fail.
+    """
     title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
     head = ["trial", *(column.label for column in columns), condition.environment.failures]
     rows = []
     for trial in trials:
-        values = [f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}" for column in columns]
-        rows.append([str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"])
+        values = [
+            f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}"
+            for column in columns
+        ]
+        rows.append(
+            [str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"]
+        )
     return make_table(title, head, rows, left=0)
 
 
 def trial_mean(trial: Trial, metric: str) -> float:
     """A metric of a trial, the mean over the robots that did not fail; nan where all did."""
-    found = [metrics[metric] for metrics, failed in zip(trial.metrics, trial.failed, strict=True) if not failed]
+    found = [
+        metrics[metric]
+        for metrics, failed in zip(trial.metrics, trial.failed, strict=True)
+        if not failed
+    ]
     return float(np.mean(found)) if found else float("nan")
 
 
@@ -160,7 +177,8 @@ def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, 
             "seed": seed + robot,
             "failed": bool(trial.failed[robot]),
             **{
-                f"measured_{name}": rms for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True)
+                f"measured_{name}": rms
+                for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True)
             },
             **metrics,
         }
@@ -171,7 +189,9 @@ def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, 
 
 
 def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-    """Write the offsets of every robot: to the folder itself for one, else to folders by their seeds."""
+    """Write the offsets of every robot: to the folder itself for one, else to folders by their
+    seeds.
+    """
     model = env.unwrapped.assumed_model
     base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
     folders = []

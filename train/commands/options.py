@@ -1,4 +1,6 @@
-"""Options that several commands of `elastic` share, and how the text of an option becomes a value."""
+"""Options that several commands of `elastic` share, and how the text of an option becomes a
+value.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,8 +38,8 @@ def _read_reference(text: Any) -> Any:
         value = parse_yaml(text) if isinstance(text, str) else text
     except yaml.YAMLError:
         raise ConfigurationError(
-            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
-            "'{step_period: 3, num_steps: 2}'"
+            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}'"
+            " or '{step_period: 3, num_steps: 2}'"
         ) from None
     return value if isinstance(value, int | float | list | dict) else text
 
@@ -66,7 +68,9 @@ PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 
 
 class Mounting(HardwareSettings):
-    """Content of the file of `--mounting`: wiring and mounting of the testbed, and the pendulum that hangs there."""
+    """Content of the file of `--mounting`: wiring and mounting of the testbed, and the pendulum
+    that hangs there.
+    """
 
     pendulum: Pendulum = Pendulum()
 
@@ -83,8 +87,8 @@ class OnHardware(Model):
     yes: bool = False
     """Begin to move without asking."""
     patient: bool = False
-    """Bear ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for emulators, whose
-    pseudo-terminals stall where the computer is busy."""
+    """Bear ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for
+    emulators, whose pseudo-terminals stall where the computer is busy."""
 
     @cached_property
     def arguments(self) -> dict[str, Any]:
@@ -97,17 +101,30 @@ class OnHardware(Model):
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
                     option = "--" + name.replace("_", "-")
-                    raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
+                    raise ConfigurationError(
+                        f"{option} is for a real testbed: name its servo's port too, with --port"
+                    )
             return {}
-        options = {"port": self.port, "imu_port": self.imu_port, "confirm": False if self.yes else None}
+        options = {
+            "port": self.port,
+            "imu_port": self.imu_port,
+            "confirm": False if self.yes else None,
+        }
         given = {name: value for name, value in options.items() if value is not None}
-        chosen = Mounting(**given) if self.mounting is None else load_yaml(self.mounting, Mounting, given)
+        chosen = (
+            Mounting(**given)
+            if self.mounting is None
+            else load_yaml(self.mounting, Mounting, given)
+        )
         names = chosen.model_fields_set | options.keys() | {"limits"}
         values = {name: getattr(chosen, name) for name in names}
         if self.patient:
             values["limits"] = chosen.limits.replace(**PATIENT_LIMITS)
             values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
-        return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
+        return {
+            name: value.model_dump() if isinstance(value, Model) else value
+            for name, value in values.items()
+        }
 
     def environment(self, env: str) -> dict[str, Any]:
         """The environment of a comparison: the named one, or a real testbed with its arguments.
@@ -120,12 +137,14 @@ class OnHardware(Model):
         real = environment(env).on_hardware
         if not real:
             raise ConfigurationError(
-                f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
+                f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or"
+                " --port and --mounting"
             )
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
-        """The named scenario, or the default; on hardware, which has none, the word for it in tables.
+        """The named scenario, or the default; on hardware, which has none, the word for it in
+        tables.
 
         Raises:
             ConfigurationError: A scenario is named for hardware.
@@ -134,7 +153,8 @@ class OnHardware(Model):
             return named or DEFAULT_SCENARIO
         if named is not None:
             raise ConfigurationError(
-                f"scenario {named!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
+                f"scenario {named!r} is of a simulation, hardware is what it is: leave --scenario"
+                " out, or --port"
             )
         return "hardware"
 
@@ -155,7 +175,9 @@ def option_name(path: ParameterPath) -> str:
 
 @contextmanager
 def name_options() -> Iterator[None]:
-    """Let errors of a configuration that is made from options name the options in place of its parameters."""
+    """Let errors of a configuration that is made from options name the options in place of its
+    parameters.
+    """
     try:
         yield
     except ModelError as error:

@@ -13,7 +13,13 @@ from rich.console import Console
 from rich.progress import track
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
-from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra, shortened
+from elastic_env.core.errors import (
+    ElasticError,
+    ResultsExistError,
+    SystemFailedError,
+    missing_extra,
+    shortened,
+)
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options, reference_of
 from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
 from train.evaluate.environments import environment
@@ -22,7 +28,9 @@ from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 _FRAMES_PER_S = 25
 
 
-def play(condition: Condition, console: Console, video: Path | None = None, max_s: float | None = None) -> None:
+def play(
+    condition: Condition, console: Console, video: Path | None = None, max_s: float | None = None
+) -> None:
     """Play one episode in a window in real time, or into a video file as fast as it goes.
 
     Args:
@@ -36,7 +44,9 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         MissingExtraError: The video writer is not installed.
     """
     env: Any = gymnasium.make(
-        condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
+        condition.environment.id,
+        render_mode="human" if video is None else "rgb_array",
+        **condition.arguments,
     )
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
@@ -91,7 +101,9 @@ def episode(
     for step in islice(control_steps(env, policy, condition.seed, condition), steps):
         yield step.number, step.info
         if step.terminated:
-            console.print(f"the episode ended after {step.info['time_s']:.2f} s: {step.info['termination']}")
+            console.print(
+                f"the episode ended after {step.info['time_s']:.2f} s: {step.info['termination']}"
+            )
 
 
 def _window(episode: Iterator[int], period: float) -> None:
@@ -100,9 +112,13 @@ def _window(episode: Iterator[int], period: float) -> None:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
 
 
-def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console) -> None:
+def _film(
+    env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console
+) -> None:
     if video.exists() or video.is_symlink():
-        raise ResultsExistError(f"{shortened(video)} exists and is not overwritten; name another file")
+        raise ResultsExistError(
+            f"{shortened(video)} exists and is not overwritten; name another file"
+        )
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
     try:
@@ -117,7 +133,8 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     gif = io.BytesIO()
     is_gif = video.suffix == ".gif"
     timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
-    # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise
+    # a GIF is made in memory in any case, and its writer would print what a full disk makes it
+    # raise
     target: Any = gif if is_gif else video
     with imageio.get_writer(target, "gif" if is_gif else None, **timing) as writer:
         for step in track(episode, "filming", total=steps, console=console, transient=True):
@@ -145,8 +162,8 @@ def _require_whole(video: Path, frames: int) -> None:
         found = 0
     if found != frames:
         raise SystemFailedError(
-            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full: free some space, "
-            "then play again"
+            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full:"
+            " free some space, then play again"
         )
 
 

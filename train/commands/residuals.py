@@ -1,9 +1,11 @@
-"""Every residual of the package trained anew from its configuration, and compared with the one of the package.
+"""Every residual of the package trained anew from its configuration, and compared with the one of
+the package.
 
     make residuals                                       # or, for some of them:
     python -m train.commands.residuals testbed walker_3s_posture --seeds 0 1 --jobs 2
 
-Training and comparison of each are runs in runs/residuals. A call goes on where the last one was interrupted.
+Training and comparison of each are runs in runs/residuals. A call goes on where the last one was
+interrupted.
 """
 
 from collections.abc import Sequence
@@ -33,7 +35,9 @@ RESIDUALS = {
     "walker_1600ms_posture": "learned_posture_1600ms",
     "walker_1100ms_posture": "learned_posture_1100ms",
 }
-"""Residuals of the package: configs/train_NAME.yaml trains them, and this configuration compares them."""
+"""Residuals of the package: configs/train_NAME.yaml trains them, and this configuration compares
+them.
+"""
 
 CONFIGS = Path("configs")
 _SHIPPED = Path("baselines/trained")
@@ -41,11 +45,14 @@ _SHIPPED = Path("baselines/trained")
 
 def shipped_seeds(name: str) -> list[int]:
     """Training seeds of a residual that the package has."""
-    return sorted(int(folder.name.removeprefix("seed_")) for folder in (_SHIPPED / name).glob("seed_*"))
+    return sorted(
+        int(folder.name.removeprefix("seed_")) for folder in (_SHIPPED / name).glob("seed_*")
+    )
 
 
 def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> CompareConfig:
-    """A comparison in which the residual of the package stands beside the one that was trained anew.
+    """A comparison in which the residual of the package stands beside the one that was trained
+    anew.
 
     Args:
         config: Comparison with `residual:NAME/seed_*` among its policies.
@@ -55,17 +62,28 @@ def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> Compa
     Raises:
         ConfigurationError: The residual is not among the policies.
     """
-    (shipped,) = [policy for policy in config.policies if policy.name.startswith(f"residual:{name}/")] or [None]
+    (shipped,) = [
+        policy for policy in config.policies if policy.name.startswith(f"residual:{name}/")
+    ] or [None]
     if shipped is None:
-        raise ConfigurationError(f"{config.name} does not compare residual:{name}/seed_*; add it to its policies")
+        raise ConfigurationError(
+            f"{config.name} does not compare residual:{name}/seed_*; add it to its policies"
+        )
     anew = PolicySpec(name=f"residual:{trained}/seed_*/last", label="trained anew")
     others = [policy for policy in config.policies if policy is not shipped]
     own = shipped.replace(label="of the package")
-    return config.replace(name=f"residuals_{name}", policies=[*others, own, anew], figure_policies=[])
+    return config.replace(
+        name=f"residuals_{name}", policies=[*others, own, anew], figure_policies=[]
+    )
 
 
 def reproduce(
-    name: str, folder: Path, console: Console, seeds: Sequence[int], executors: Executors, configs: Path = CONFIGS
+    name: str,
+    folder: Path,
+    console: Console,
+    seeds: Sequence[int],
+    executors: Executors,
+    configs: Path = CONFIGS,
 ) -> Comparison:
     """Train a residual of the package anew, and compare it with that of the package.
 
@@ -95,7 +113,8 @@ def main(
     output: Path = RUNS / "residuals",
     jobs: int = 0,
 ) -> None:
-    """Train residuals of the package anew and compare them with those of the package; all takes hours.
+    """Train residuals of the package anew and compare them with those of the package; all takes
+    hours.
 
     Args:
         names: Residuals of the package; all if none is named.

@@ -1,6 +1,8 @@
-"""`elastic robot`: a robot from its model, made elastic, played with and without compensation, in one call.
+"""`elastic robot`: a robot from its model, made elastic, played with and without compensation, in
+one call.
 
-Its folder holds the robot's file, a comparison with report, a picture, and the two tables that it prints.
+Its folder holds the robot's file, a comparison with report, a picture, and the two tables that it
+prints.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +43,9 @@ from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 
 SCENARIO = "nominal"
-"""The robot as its joints are described, friction and encoders included; `ideal` would leave these out."""
+"""The robot as its joints are described, friction and encoders included; `ideal` would leave
+these out.
+"""
 POLICIES = ("uncompensated", "input", "dynamic")
 _TIP = "tip"
 _STYLE: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
@@ -50,12 +54,14 @@ _POSES_SHOWN = 2
 
 
 class Robot(Model):
-    """Try a robot of your own: make its joints elastic, play it with and without compensation, and say what it gains.
+    """Try a robot of your own: make its joints elastic, play it with and without compensation, and
+    say what it gains.
 
-    Plays static poses and a motion with the policies uncompensated, input and dynamic, in the scenario nominal: with
-    friction and encoders as the joints file has them. Prints the error of the end effector [mm], and how much of it
-    comes from each joint. The folder has robot.yaml (for --env of the other commands), joints.yaml, picture.png,
-    end_effector.csv, joints.csv, and a comparison with report.html.
+    Plays static poses and a motion with the policies uncompensated, input and dynamic, in the
+    scenario nominal: with friction and encoders as the joints file has them. Prints the error of
+    the end effector [mm], and how much of it comes from each joint. The folder has robot.yaml (for
+    --env of the other commands), joints.yaml, picture.png, end_effector.csv, joints.csv, and a
+    comparison with report.html.
 
     Example: elastic robot arm.urdf --stiffness joints.yaml --end-effector tool0
 
@@ -65,23 +71,30 @@ class Robot(Model):
     """
 
     model: Annotated[Locator, tyro.conf.Positional]
-    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, ROBOT.yaml (a file of a robot, see
-    docs/robots.md), or a name of the gallery, such as panda, ur5, xarm7, so101."""
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, ROBOT.yaml (a file of a
+    robot, see docs/robots.md), or a name of the gallery, such as panda, ur5, xarm7, so101."""
     stiffness: StiffnessOrFile = None
-    """YAML file of the elastic joints, or one K of all hinges [N·m/rad]. Has no default, as K is a property of your
-    robot; elastic identify --robot finds it. K of the gallery is assumed."""
+    """YAML file of the elastic joints, or one K of all hinges [N·m/rad]. Has no default, as K is a
+    property of your robot; elastic identify --robot finds it. K of the gallery is assumed."""
     end_effector: Locator | None = None
-    """Site or body that is to be placed; default that of the robot's file or of the gallery, or the outermost body."""
+    """Site or body that is to be placed; default that of the robot's file or of the gallery, or
+    the outermost body.
+    """
     poses: Annotated[Poses, tyro.conf.Suppress] = Poses(positions=4)
     """Static poses; fewer than an environment plays, for a result within a minute."""
     motion: Motion = Field(default={"kind": "moves", "positions": 4})
-    """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind and parameters."""
+    """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind
+    and parameters.
+    """
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the episodes."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/robot, numbered if taken."""
     video: bool = False
-    """Film the motion, uncompensated and with input. Off by default: a second of motion is 50 frames to draw."""
+    """Film the motion, uncompensated and with input.
+
+    Off by default: a second of motion is 50 frames to draw.
+    """
 
     def run(self, console: Console) -> None:
         """Play, write, print."""
@@ -110,17 +123,22 @@ class Placed:
 
 @dataclass(frozen=True)
 class JointShare:
-    """Share of a joint in the error of the end effector at rest, uncompensated and without friction.
+    """Share of a joint in the error of the end effector at rest, uncompensated and without
+    friction.
 
     Attributes:
         joint: Its name.
         stiffness_Nm_per_rad: K of its transmission.
-        position_gain_Nm_per_rad: k_p of a servo that gives way; infinite where the servo holds its angle.
+        position_gain_Nm_per_rad: k_p of a servo that gives way; infinite where the servo holds its
+            angle.
         gravity_torque_rms_Nm: Torque that it carries, rms over the poses.
-        deflection_rms_rad: How far its link is from the command, rms over the poses; a servo that gives way adds to it.
+        deflection_rms_rad: How far its link is from the command, rms over the poses; a servo that
+            gives way adds to it.
         end_effector_rms_m: How far that alone moves the end effector, rms over the poses.
-        share: Part of the error that it explains; the joints together make 1, and one that helps another is negative.
-        friction_leaves_m: How far friction F can hold the end effector off by F/K, rms over the poses.
+        share: Part of the error that it explains; the joints together make 1, and one that helps
+            another is negative.
+        friction_leaves_m: How far friction F can hold the end effector off by F/K, rms over the
+            poses.
     """
 
     joint: str
@@ -151,7 +169,8 @@ def try_robot(trial: Robot, console: Console) -> RobotResult:
         console: Where progress and tables go.
 
     Raises:
-        ConfigurationError: The model, its joints or the motion cannot be used; found before a folder is made.
+        ConfigurationError: The model, its joints or the motion cannot be used; found before a
+            folder is made.
         ResultsExistError: The output folder holds results.
         MissingExtraError: A package for reports or videos is missing.
     """
@@ -166,7 +185,9 @@ def try_robot(trial: Robot, console: Console) -> RobotResult:
     moving.robot.plant(moving)  # refuses what its servos cannot follow
     plant = config.robot.plant(config)
     if trial.stiffness is None and trial.model in GALLERY:
-        console.print(f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness")
+        console.print(
+            f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
+        )
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
@@ -207,8 +228,8 @@ def _of_model(name: str) -> dict[str, Any]:
         return {"model": name, "joints": {}}
     if not is_file(name):
         raise ConfigurationError(
-            f"no model at {name_of(name)}; give a file of MJCF (.xml) or URDF (.urdf), a file of a robot (.yaml), or a "
-            f"robot of the gallery: {', '.join(GALLERY)}"
+            f"no model at {name_of(name)}; give a file of MJCF (.xml) or URDF (.urdf), a file of a"
+            f" robot (.yaml), or a robot of the gallery: {', '.join(GALLERY)}"
         )
     if name.endswith(ENDINGS):
         return read_robot_file(name)
@@ -216,7 +237,10 @@ def _of_model(name: str) -> dict[str, Any]:
 
 
 def _of_gallery(name: str) -> dict[str, Any]:
-    """A robot of the gallery with its assumed joints. Its own file, if nothing has to be changed in it."""
+    """A robot of the gallery with its assumed joints.
+
+    Its own file, if nothing has to be changed in it.
+    """
     known = GALLERY[name]
     file = gallery_file(name)
     end_effector = known.end_effector
@@ -228,7 +252,12 @@ def _of_gallery(name: str) -> dict[str, Any]:
         spec.compile()
         model = spec.to_xml()
     joints = {name: _settings(joint) for name, joint in gallery_joints(name).items()}
-    return {"model": model, "joints": joints, "end_effector": end_effector, "home": dict(known.home)}
+    return {
+        "model": model,
+        "joints": joints,
+        "end_effector": end_effector,
+        "home": dict(known.home),
+    }
 
 
 def _settings(joint: ElasticJoint) -> dict[str, Any]:
@@ -247,12 +276,15 @@ def _given_joints(stiffness: str | float) -> dict[str, Any]:
     if isinstance(stiffness, str):
         return dict(read_mapping(Path(stiffness)))
     if not stiffness > 0.0:
-        raise ConfigurationError(f"stiffness must be > 0 N·m/rad or a file of joints, got {shown(stiffness)}")
+        raise ConfigurationError(
+            f"stiffness must be > 0 N·m/rad or a file of joints, got {shown(stiffness)}"
+        )
     return {"*": stiffness}
 
 
 def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
-    """Write a robot's file and its joints into a folder; the model stays where it is, unless it is text.
+    """Write a robot's file and its joints into a folder; the model stays where it is, unless it is
+    text.
 
     Args:
         arguments: Of `elastic_env/Robot-v0`.
@@ -310,8 +342,9 @@ def rest_poses(plant: JointPlant) -> Array:
 def joint_shares(plant: JointPlant) -> list[JointShare]:
     r"""Shares of the joints in the error of the end effector at rest, in closed form.
 
-    Nothing is played: a link rests where spring and weight balance, K(θ − q) = τ_g(q), with θ = q_ref. With column
-    J_j of the end effector's Jacobian the error is, to first order, the sum over the joints
+    Nothing is played: a link rests where spring and weight balance, K(θ − q) = τ_g(q), with θ =
+    q_ref. With column J_j of the end effector's Jacobian the error is, to first order, the sum over
+    the joints
 
     .. math:: e = \sum_j J_j(q_{ref}) (q_j - q_{ref,j}), \quad s_j = \frac{\sum e \cdot e_j}{\sum e \cdot e}
 
@@ -319,7 +352,7 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
 
     Args:
         plant: A robot with an end effector, and static poses as its reference.
-    """
+    """  # noqa: E501
     tool = plant.end_effector
     assert tool is not None
     q_ref = rest_poses(plant)
@@ -327,7 +360,9 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
     parts = tool.parts(q_ref, q)
     torque = plant.static_torque(q)
     error = parts.sum(axis=-1)
-    shares = np.einsum("pi,pij->j", error, parts) / max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
+    shares = np.einsum("pi,pij->j", error, parts) / max(
+        float(np.sum(error**2)), np.finfo(np.float64).tiny
+    )
     lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
     friction = lever * plant.true.coulomb_friction / plant.true.rest_stiffness("tendon")
     with np.errstate(divide="ignore"):
@@ -366,7 +401,8 @@ def _pictures(config: RobotConfig, plant: JointPlant, folder: Path, console: Con
 
 
 def picture(config: RobotConfig, plant: JointPlant) -> Image:
-    """The poses with the largest sag, in rows: left without, right with the command of `PositionCompensator`.
+    """The poses with the largest sag, in rows: left without, right with the command of
+    `PositionCompensator`.
 
     It is in closed form, as `joint_shares`. Deviations from the translucent reference are enlarged.
 
@@ -376,7 +412,9 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     tool = plant.end_effector
     assert tool is not None
     known = plant.assumed
-    in_series = known.rest_stiffness("tendon").tolist()  # of spring and servo, as the command has to lead both
+    in_series = known.rest_stiffness(
+        "tendon"
+    ).tolist()  # of spring and servo, as the command has to lead both
     compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
     q_ref = rest_poses(plant)
     order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
@@ -388,7 +426,10 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
         errors = 1e3 * tool.errors(twice, links)[0]
         caption = [
             f"end effector off by {errors[0]:.2f} mm without, {errors[1]:.3f} mm with compensation",
-            f"at rest without friction; deviations from the translucent reference drawn x {ENLARGED:g}",
+            (
+                "at rest without friction; deviations from the translucent reference drawn x"
+                f" {ENLARGED:g}"
+            ),
         ]
         rows.append(with_text(views.drawn(twice, links), caption))
     return np.concatenate(rows)
@@ -399,7 +440,11 @@ def _films(trial: Robot, file: Path, folder: Path, console: Console) -> list[Pat
     films = []
     for policy in POLICIES[:2]:
         condition = Condition(
-            env=str(file), policy=PolicySpec(name=policy), scenario=SCENARIO, reference=trial.motion, seed=trial.seed
+            env=str(file),
+            policy=PolicySpec(name=policy),
+            scenario=SCENARIO,
+            reference=trial.motion,
+            seed=trial.seed,
         )
         films.append(folder / f"{policy}.mp4")
         play(condition, console, films[-1])
@@ -414,7 +459,9 @@ def _placed_table(placed: Sequence[Placed]) -> Table:
         left = best / errors[0] if errors[0] > 0.0 else np.nan
         cells = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
         rows.append([motion, *cells, "-" if np.isnan(left) else f"{100.0 * left:.1f} %"])
-    return make_table("end effector, rms error [mm]", ["motion", *POLICIES, "left by the best"], rows, **_STYLE)
+    return make_table(
+        "end effector, rms error [mm]", ["motion", *POLICIES, "left by the best"], rows, **_STYLE
+    )
 
 
 def _shares_table(shares: Sequence[JointShare]) -> Table:
@@ -431,9 +478,14 @@ def _shares_table(shares: Sequence[JointShare]) -> Table:
     }
     if not gives_way:
         del columns["k_p\nNm/rad"]
-    caption = "closed form, uncompensated: springs and servos that give way; F/K is what friction can leave"
+    caption = (
+        "closed form, uncompensated: springs and servos that give way; F/K is what friction can"
+        " leave"
+    )
     rows = zip(*columns.values(), strict=True)
-    table = make_table("where the error at rest comes from", list(columns), rows, caption=caption, **_STYLE)
+    table = make_table(
+        "where the error at rest comes from", list(columns), rows, caption=caption, **_STYLE
+    )
     for column in table.columns[1:]:
         column.vertical = "bottom"
     return table

@@ -1,4 +1,6 @@
-"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO, in one run."""
+"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO, in
+one run.
+"""
 
 import cProfile
 import importlib
@@ -39,25 +41,31 @@ _PPO_PROCESSES = 2
 class Speed(Model):
     """Measure throughput against raw mj_step on the same model, in one interleaved run.
 
-    Timed are the vector environment, without and with a policy and a residual network in its loop; scalar environments,
-    under the vector environments of Gymnasium and SB3 too; and PPO end to end.
+    Timed are the vector environment, without and with a policy and a residual network in its loop;
+    scalar environments, under the vector environments of Gymnasium and SB3 too; and PPO end to end.
 
-    Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024 --no-others --no-ppo
+    Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024
+        --no-others --no-ppo
 
-    With --real-time one policy is timed alone, as on a robot: it is called with recorded observations, once in every
-    control period. Printed are late cycles and latencies. Example: elastic speed --real-time --policy dynamic
+    With --real-time one policy is timed alone, as on a robot: it is called with recorded
+    observations, once in every control period. Printed are late cycles and latencies. Example:
+    elastic speed --real-time --policy dynamic
     """
 
     env: str = "walker"
     """Environment: testbed or walker."""
     policy: str | None = None
-    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the testbed; with
-    --real-time adaptive_posture on the walker."""
-    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field([64, 256], min_length=1, max_length=100)
+    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the
+    testbed; with --real-time adaptive_posture on the walker."""
+    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field(
+        [64, 256], min_length=1, max_length=100
+    )
     """Numbers of worlds."""
     others: bool = True
     """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
-    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field([2, 4], min_length=1, max_length=100)
+    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field(
+        [2, 4], min_length=1, max_length=100
+    )
     """Numbers of processes to try with them."""
     ppo: bool = True
     """Time PPO end to end too."""
@@ -70,11 +78,15 @@ class Speed(Model):
     threads: int = quantity("1", 0, ge=0, le=1024)
     """Threads of both contenders, 0 for all cores."""
     real_time: bool = False
-    """Time a policy alone against the clock, in place of all that; reads env, policy, seconds and output alone."""
+    """Time a policy alone against the clock, in place of all that; reads env, policy, seconds
+    and output alone.
+    """
     seconds: float = quantity("s", 60.0, gt=0, le=86_400)
     """How long, with --real-time [s]."""
     output: Path | None = None
-    """Folder for speed.json and speed.csv, or real_time.json, new or empty; default runs/speed, numbered if taken."""
+    """Folder for speed.json and speed.csv, or real_time.json, new or empty; default runs/speed,
+    numbered if taken.
+    """
 
     @property
     def threads_used(self) -> int:
@@ -131,7 +143,8 @@ def measure(config: Speed, progress: Callable[[float], None] | None = None) -> l
 
     Args:
         config: What to measure.
-        progress: Called after every contender of every round with the share of the work that is done.
+        progress: Called after every contender of every round with the share of the work that is
+            done.
 
     Raises:
         ConfigurationError: Environment or policy does not exist.
@@ -179,7 +192,9 @@ def _entries(config: Speed) -> list[_Entry]:
     return entries
 
 
-def _result(config: Speed, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
+def _result(
+    config: Speed, entries: Sequence[_Entry], rates: list[list[float]], number: int
+) -> SpeedResult:
     entry = entries[number]
     reference = entries[entries[number].against]
     mine = rates[number][1:]
@@ -221,7 +236,8 @@ def measure_all(config: Speed, console: Console) -> Path:
 
     Raises:
         ConfigurationError: Environment or policy does not exist; found before the work begins.
-        ModuleNotFoundError: Stable-Baselines3 is not installed, and a contender needs it; found before, too.
+        ModuleNotFoundError: Stable-Baselines3 is not installed, and a contender needs it; found
+            before, too.
         ResultsExistError: The output folder holds results.
     """
     if config.others or config.ppo:
@@ -244,7 +260,10 @@ def measure_all(config: Speed, console: Console) -> Path:
 
 def _table(config: Speed, results: Sequence[SpeedResult]) -> Table:
     title = f"{config.env}: control steps per second, medians of one interleaved run"
-    rows = [(r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against) for r in results]
+    rows = [
+        (r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against)
+        for r in results
+    ]
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     return table

@@ -17,10 +17,11 @@ from train.workers.executors import Executors
 class Train(Model):
     """Train a residual on top of a base policy, for every training seed of a configuration.
 
-    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train --resume runs/NAME.
-    The seeds of several configurations share the workers: elastic train a.yaml b.yaml --jobs 4.
-    Each configuration has a run of its own. It keeps, for every seed, checkpoint/ to go on from, best/ and last/ as
-    policies, which elastic evaluate and compare take as residual:PATH, progress.csv, and files for TensorBoard.
+    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train
+    --resume runs/NAME. The seeds of several configurations share the workers: elastic train a.yaml
+    b.yaml --jobs 4. Each configuration has a run of its own. It keeps, for every seed, checkpoint/
+    to go on from, best/ and last/ as policies, which elastic evaluate and compare take as
+    residual:PATH, progress.csv, and files for TensorBoard.
     """
 
     config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
@@ -32,18 +33,28 @@ class Train(Model):
     decisions: int | None = None
     """Decisions of all worlds together instead of the configurations' own."""
     output: Path | None = None
-    """Folder for the run, new or empty, or for the folders of several; default runs/<name>, numbered if taken."""
+    """Folder for the run, new or empty, or for the folders of several; default runs/<name>,
+    numbered if taken.
+    """
     trust_code: bool = False
-    """With --resume: run the code that the run's algorithm names, where it is none of Stable-Baselines3's."""
+    """With --resume: run the code that the run's algorithm names, where it is none of
+    Stable-Baselines3's.
+    """
     jobs: int = 1
-    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
+    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner
+    than one by one.
+    """
     on: str = "local"
-    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see
+    docs/cluster.md.
+    """
 
     def run(self, console: Console) -> None:
         """Train, or go on with it."""
         if bool(self.config) == bool(self.resume):
-            raise ConfigurationError("name either configurations or, with --resume, the runs to go on with")
+            raise ConfigurationError(
+                "name either configurations or, with --resume, the runs to go on with"
+            )
         given = {"seeds": self.seeds, "decisions": self.decisions}
         changes = {name: value for name, value in given.items() if value is not None}
         if self.resume and (changes or self.output is not None):

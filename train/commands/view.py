@@ -1,4 +1,6 @@
-"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
+"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side
+by side.
+"""
 
 import bisect
 import contextlib
@@ -16,7 +18,15 @@ from typing import Any
 
 import gymnasium
 import mujoco
-from mujoco.studio import app, launch_thread, messages, plugin, viewer_handle, viewer_protocol, web_viewer
+from mujoco.studio import (
+    app,
+    launch_thread,
+    messages,
+    plugin,
+    viewer_handle,
+    viewer_protocol,
+    web_viewer,
+)
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from rich.console import Console
 
@@ -62,7 +72,9 @@ class Recording:
 
 @dataclass
 class Playback:
-    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether time stands still."""
+    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether
+    time stands still.
+    """
 
     recording: Recording
     time_s: float = 0.0
@@ -102,9 +114,12 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         picture = env.unwrapped.picture
         if not hasattr(picture, "sides"):
             raise ElasticError(
-                f"{type(picture).__name__} has no sides: see HasSides in elastic_env.rendering.side_by_side"
+                f"{type(picture).__name__} has no sides: see HasSides in"
+                " elastic_env.rendering.side_by_side"
             )
-        for step, now in episode(env, make_policy(condition.policy, env), condition, steps, console):
+        for step, now in episode(
+            env, make_policy(condition.policy, env), condition, steps, console
+        ):
             if step % every == 0:
                 times_s.append(float(now["time_s"]))
                 frames.append(picture.sides(now))
@@ -120,7 +135,9 @@ class _Poses(plugin.SimPlugin):
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
-        """Keep the three robots: no file of a page, nor its button to reload, puts another model in their place."""
+        """Keep the three robots: no file of a page, nor its button to reload, puts another model
+        in their place.
+        """
         return True
 
     @messages.handler
@@ -130,7 +147,9 @@ class _Poses(plugin.SimPlugin):
             return
         self._playback.tick()
         event.data.time = self._playback.time_s
-        self._scene.pose(event.data, self._playback.recording.at(self._playback.time_s), self._playback.factor)
+        self._scene.pose(
+            event.data, self._playback.recording.at(self._playback.time_s), self._playback.factor
+        )
         time.sleep(_PAUSE_S)
 
 
@@ -146,14 +165,19 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.Once)
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
-            _, play.factor = imgui.SliderFloat("deviations drawn x", play.factor, 0.0, LARGEST_FACTOR)
-            _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, play.recording.times_s[-1])
+            _, play.factor = imgui.SliderFloat(
+                "deviations drawn x", play.factor, 0.0, LARGEST_FACTOR
+            )
+            _, play.time_s = imgui.SliderFloat(
+                "time [s]", play.time_s, 0.0, play.recording.times_s[-1]
+            )
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
 
 
 class _PrivateViewer(web_viewer.WebViewer):
-    """MuJoCo's web viewer at a socket of ours, in place of a port that everybody reaches; it takes no models.
+    """MuJoCo's web viewer at a socket of ours, in place of a port that everybody reaches; it takes
+    no models.
 
     Args:
         endpoint: To the side that poses the robots.
@@ -164,7 +188,9 @@ class _PrivateViewer(web_viewer.WebViewer):
     def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
         self._listener = listener
         config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=_free_port())
-        with contextlib.redirect_stdout(io.StringIO()):  # the address that it prints is not the page's
+        with contextlib.redirect_stdout(
+            io.StringIO()
+        ):  # the address that it prints is not the page's
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
@@ -210,7 +236,10 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
     """
     browsers = listen(host, port)
     access = Access(host, browsers.getsockname()[1])
-    with contextlib.closing(browsers), tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder:
+    with (
+        contextlib.closing(browsers),
+        tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder,
+    ):
         place = f"{folder}/viewer"
         with _launch(recording, place) as handle:
             proxy = Proxy(browsers, place, access)
@@ -247,11 +276,13 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
 
 
 class View(WatchedEpisode):
-    """Look at one episode in the browser: reference, motor side and link side of the robot, side by side.
+    """Look at one episode in the browser: reference, motor side and link side of the robot, side by
+    side.
 
-    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C. Sliders set the time,
-    and the factor by which deviations from the reference are enlarged. The page is reached from this machine alone, at
-    the address that is printed, with its token; from elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
+    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C.
+    Sliders set the time, and the factor by which deviations from the reference are enlarged. The
+    page is reached from this machine alone, at the address that is printed, with its token; from
+    elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
 
     Example, one joint: elastic view --policy input --reference sine
 
@@ -259,7 +290,9 @@ class View(WatchedEpisode):
     """
 
     host: str = LOOPBACK
-    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others reach it too."""
+    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others
+    reach it too.
+    """
     port: int = 0
     """Port of the page; 0 takes the first free one from 8080 on."""
 
@@ -273,7 +306,8 @@ class View(WatchedEpisode):
             console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False)
             if not page.access.is_local:
                 console.print(
-                    "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
+                    "who has this address sees the page and moves its sliders; nothing on the way"
+                    " is encrypted",
                     soft_wrap=True,
                 )
             console.print("Ctrl-C ends it", soft_wrap=True)
@@ -284,5 +318,9 @@ class View(WatchedEpisode):
 
 def _open_tab(address: str) -> None:
     """Open a tab of the browser, where there is a display."""
-    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if (
+        not sys.platform.startswith("linux")
+        or os.environ.get("DISPLAY")
+        or os.environ.get("WAYLAND_DISPLAY")
+    ):
         threading.Thread(target=webbrowser.open, args=(address, 2), daemon=True).start()

@@ -1,10 +1,12 @@
 """A reverse proxy before MuJoCo's web viewer, which lets in only who has the page's own address.
 
-The viewer listens on every address, checks no Origin, and takes any model that is dropped on its page. Here it listens
-on a Unix socket in a folder of this user's. The proxy listens on a port, and refuses with 403
+The viewer listens on every address, checks no Origin, and takes any model that is dropped on its
+page. Here it listens on a Unix socket in a folder of this user's. The proxy listens on a port, and
+refuses with 403
 
 * a request without the token, which the printed address carries and a cookie keeps;
-* a Host that is not the page's (DNS rebinding), and an Origin that is not the Host's (another web page);
+* a Host that is not the page's (DNS rebinding), and an Origin that is not the Host's (another web
+  page);
 * uploads: every method but GET, and every WebSocket but the two that the page draws from.
 """
 
@@ -163,7 +165,9 @@ class Access:
         given = [part.removeprefix(f"{_TOKEN}=") for part in parts if part.startswith(f"{_TOKEN}=")]
         has_address = any(self._is_token(value) for value in given)
         if not has_address and not any(self._is_token(value) for value in self._cookies(request)):
-            raise RefusedError("the token is missing: open the address that elastic view has printed")
+            raise RefusedError(
+                "the token is missing: open the address that elastic view has printed"
+            )
         is_socket = bool(request.values("Upgrade"))
         _require_download(method, path, request, is_socket)
         query = "&".join(part for part in parts if part and not part.startswith(f"{_TOKEN}="))
@@ -172,9 +176,14 @@ class Access:
     def _require_own_host(self, request: Head) -> None:
         hosts = request.values("Host")
         if len(hosts) != 1 or not self._is_own(hosts[0].lower()):
-            raise RefusedError("the Host is not this page's: open the address that elastic view has printed")
+            raise RefusedError(
+                "the Host is not this page's: open the address that elastic view has printed"
+            )
         origins = request.values("Origin")
-        if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins) or len(origins) > 1:
+        if (
+            any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins)
+            or len(origins) > 1
+        ):
             raise RefusedError("the request comes from another page")
 
     def _is_own(self, host: str) -> bool:
@@ -195,7 +204,11 @@ class Access:
         return secrets.compare_digest(value.encode(), self.token.encode())
 
     def _cookies(self, request: Head) -> list[str]:
-        pairs = [pair.strip().partition("=") for line in request.values("Cookie") for pair in line.split(";")]
+        pairs = [
+            pair.strip().partition("=")
+            for line in request.values("Cookie")
+            for pair in line.split(";")
+        ]
         return [value for name, _, value in pairs if name == self.cookie]
 
 
@@ -217,7 +230,9 @@ def _is_address(name: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
-    return host.lower() == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+    return host.lower() == "localhost" or (
+        _is_address(host) and ipaddress.ip_address(host).is_loopback
+    )
 
 
 def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
@@ -232,12 +247,17 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         SystemFailedError: The port is taken, or this machine has no such address.
     """
     if not 0 <= port <= _LARGEST_PORT:
-        raise ConfigurationError(f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {shown(port)}")
+        raise ConfigurationError(
+            f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {shown(port)}"
+        )
     try:
-        family, *_ = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        family, *_ = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
     except (socket.gaierror, UnicodeError):
         raise ConfigurationError(
-            f"--host must be an address or a name of this machine, such as {LOOPBACK}, got {shown(host)}"
+            f"--host must be an address or a name of this machine, such as {LOOPBACK}, got"
+            f" {shown(host)}"
         ) from None
     problem = OSError()
     for one in [port] if port else [*range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED), 0]:
@@ -246,8 +266,8 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         except OSError as error:
             problem = error
     raise SystemFailedError(
-        f"the page cannot listen at {shown(host)}, port {port}: {problem.strerror}; name another --port, or 0 for a "
-        "free one"
+        f"the page cannot listen at {shown(host)}, port {port}: {problem.strerror}; name another"
+        " --port, or 0 for a free one"
     ) from None
 
 
@@ -302,9 +322,15 @@ class Proxy:
         writer.close()
 
     async def _pass_on(
-        self, request: Head, asked: Asked, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        self,
+        request: Head,
+        asked: Asked,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
     ) -> None:
-        viewer_reader, viewer_writer = await asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
+        viewer_reader, viewer_writer = await asyncio.open_unix_connection(
+            self._viewer, limit=_LARGEST_HEAD
+        )
         try:
             viewer_writer.write(_for_viewer(request, asked).encode())
             answer = Head.parse(await viewer_reader.readuntil(b"\r\n\r\n"))
@@ -321,7 +347,10 @@ class Proxy:
         kept = [(name, value) for name, value in answer.headers if not _opens_page(name)]
         headers = [*kept, *_PRIVATE]
         if not asked.is_socket:
-            headers = [*(header for header in headers if header[0].lower() != "connection"), ("Connection", "close")]
+            headers = [
+                *(header for header in headers if header[0].lower() != "connection"),
+                ("Connection", "close"),
+            ]
         if asked.has_address:
             kind = "Path=/; HttpOnly; SameSite=Strict"
             headers.append(("Set-Cookie", f"{self._access.cookie}={self._access.token}; {kind}"))
@@ -345,13 +374,18 @@ def _for_viewer(request: Head, asked: Asked) -> Head:
 
 def _opens_page(name: str) -> bool:
     """True if a header of the viewer lets other pages read an answer."""
-    return name.lower().startswith("access-control-") or name.lower() == "cross-origin-resource-policy"
+    return (
+        name.lower().startswith("access-control-") or name.lower() == "cross-origin-resource-policy"
+    )
 
 
 def _refusal(reason: str) -> bytes:
     body = f"403: {reason}\n".encode()
     headers = [("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))]
-    return Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encode() + body
+    return (
+        Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encode()
+        + body
+    )
 
 
 async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:

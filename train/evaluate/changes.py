@@ -1,6 +1,8 @@
-"""Paired changes of a comparison: every residual against its base and against the best policy without learning.
+"""Paired changes of a comparison: every residual against its base and against the best policy
+without learning.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first policy.
+Every baseline is compared with the base of the residuals, or without residuals with the first
+policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,18 +30,20 @@ from train.evaluate.table import EpisodeTable, failures
 
 CEILING = "ceiling on the training condition"
 SAME_ROBOT = "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
-training, so that evaluation differs by noise alone."""
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
+is that of the training, so that evaluation differs by noise alone."""
 HELD_OUT = "held out"
 PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
 """Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
-misses the truth, over five every eleventh."""
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
+every other one misses the truth, over five every eleventh."""
 CLAIM_SEEDS = 10
-"""Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
+"""Training seeds that a claim needs; with fewer, intervals exclude zero too often without any
+effect.
+"""
 
 SIGNS = {"none": "*", "unclear": "?"}
 """Signs behind a change that is not shown, by its verdict."""
@@ -68,16 +72,18 @@ class Change:
         marks: What the reader has to know of the row: a ceiling, something held out.
         column: The metric.
         is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
+            baseline one value.
         relative: Interquartile mean of it over training seeds.
         improvement: Probability that an episode is better than the base's.
-        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
-            seeds.
+        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile
+            mean over training seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
-        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
+        is_rival: Whether `base` is not the base of the residual but the best policy without
+            learning.
     """
 
     policy: str
@@ -115,7 +121,9 @@ class Change:
 
     @property
     def verdict(self) -> Verdict:
-        """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
+        """lower, higher, none (the interval includes zero), or unclear (too few training seeds
+        to say).
+        """
         low = self.relative.low
         high = self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
@@ -138,7 +146,10 @@ class Change:
         parts = [self._first_words()]
         missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
-            parts.append(f"{missing} of {self.num_seeds} training seeds have nothing to compare and are not in it")
+            parts.append(
+                f"{missing} of {self.num_seeds} training seeds have nothing to compare and are not"
+                " in it"
+            )
         if self.falls_more:
             parts.append(f"MORE {self.failure.upper()} than {self.base}")
         elif self.falls_less:
@@ -148,8 +159,15 @@ class Change:
     def _first_words(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "in one of the scenarios there is no episode in which" if self.is_group else "in no episode did"
-            return f"nothing to compare: {where} both {'stayed' if self.is_group else 'stay'} up to the end"
+            where = (
+                "in one of the scenarios there is no episode in which"
+                if self.is_group
+                else "in no episode did"
+            )
+            return (
+                f"nothing to compare: {where} both {'stayed' if self.is_group else 'stay'} up to"
+                " the end"
+            )
         direction = (
             "no change"
             if value == 0.0
@@ -190,20 +208,26 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     if estimate.low is None or estimate.high is None:
         return percent(estimate.value, signed)
     values = estimate.value, estimate.low, estimate.high
-    is_fine = 0.0 < max(map(abs, values)) < _SMALL or any(0.0 < abs(value) < _LEAST for value in values)
+    is_fine = 0.0 < max(map(abs, values)) < _SMALL or any(
+        0.0 < abs(value) < _LEAST for value in values
+    )
     number = f"{'+' if signed else ''}.{1 if is_fine else 0}f"
     value, low, high = (f"{100.0 * value:{number}}".replace("-", "−") for value in values)
     return f"{value} % [{low}, {high}]"
 
 
 def signed_interval(estimate: Estimate, verdict: str) -> str:
-    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *; - where there is none."""
+    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *; - where
+    there is none.
+    """
     text = percent_interval(estimate)
     return signed_off(text, verdict) if np.isfinite(estimate.value) else text
 
 
 def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-    """Cells with the training seeds of a family put together: all of their episodes, the trace of the first."""
+    """Cells with the training seeds of a family put together: all of their episodes, the trace
+    of the first.
+    """
     together: dict[tuple[object, ...], Evaluation] = {}
     for number, e in enumerate(evaluations):
         c = e.condition
@@ -216,7 +240,9 @@ def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def opponents(table: EpisodeTable) -> dict[str, list[str]]:
-    """Titles of those whom each policy is compared with: base and rival, or of a baseline the bases, or the first."""
+    """Titles of those whom each policy is compared with: base and rival, or of a baseline the
+    bases, or the first.
+    """
     members = {title: next(reversed(own.values())) for title, own in table.members.items()}
     default = list(dict.fromkeys(member.base for member in members.values())) or table.policies[:1]
     found = {}
@@ -230,7 +256,8 @@ def opponents(table: EpisodeTable) -> dict[str, list[str]]:
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
-    """All paired changes: residuals against bases and rivals, baselines against bases or, without residuals, the first.
+    """All paired changes: residuals against bases and rivals, baselines against bases or, without
+    residuals, the first.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -263,7 +290,11 @@ class Pairing:
         self.base = base
         known = table.environment
         self.columns = (*known.judged, *known.also)
-        self.cells = {cell: other for cell in table.cells_of(policy) if (other := self._cell_of_base(cell)) is not None}
+        self.cells = {
+            cell: other
+            for cell in table.cells_of(policy)
+            if (other := self._cell_of_base(cell)) is not None
+        }
         """Number of the base's cell, by that of the policy's."""
         self._pairs: dict[tuple[int, str], pd.DataFrame] = {}
 
@@ -277,7 +308,9 @@ class Pairing:
         return None
 
     def pairs(self, cell: int, metric: str) -> pd.DataFrame:
-        """Figures of every training seed over the pairs of a cell: means `mine` and `base`, number `played`, `won`."""
+        """Figures of every training seed over the pairs of a cell: means `mine` and `base`,
+        number `played`, `won`.
+        """
         if (cell, metric) not in self._pairs:
             mine = self.table.of(self.policy, cell)
             base = self.table.of(self.base, self.cells[cell])
@@ -317,12 +350,15 @@ class Pairing:
         """
         pairs = [self.pairs(cell, column.metric) for cell in cells]
         mine, base, played, won = (
-            np.column_stack([own[name] for own in pairs]) for name in ("mine", "base", "played", "won")
+            np.column_stack([own[name] for own in pairs])
+            for name in ("mine", "base", "played", "won")
         )
         relative = change(mine, base)
         condition = self.table.conditions[self.policy, cells[0]]
         falls, episodes = failures(self.table.of(self.policy, *cells))
-        base_falls, base_episodes = failures(self.table.of(self.base, *(self.cells[cell] for cell in cells)))
+        base_falls, base_episodes = failures(
+            self.table.of(self.base, *(self.cells[cell] for cell in cells))
+        )
         return Change(
             policy=self.policy,
             base=self.base,
@@ -368,7 +404,8 @@ class Pairings:
 
 
 def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Episodes of two policies in one cell with the same seed, in which neither failed: `member`, `mine`, `base`.
+    """Episodes of two policies in one cell with the same seed, in which neither failed: `member`,
+    `mine`, `base`.
 
     Args:
         mine: Rows of a policy, with `member`, `seed`, `failed` and the metric.
@@ -380,15 +417,21 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
     for rows in (mine, base):
         if len(set(zip(rows["member"], rows["seed"], strict=True))) < len(rows):
-            raise ValueError(f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}")
+            raise ValueError(
+                f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
+            )
     own = mine.sort_values("seed", kind="stable")
-    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(own["seed"].to_numpy())
+    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(
+        own["seed"].to_numpy()
+    )
     figures = {"member": own["member"], "mine": own[metric], "base": others}
     return pd.DataFrame({name: column.to_numpy() for name, column in figures.items()}).dropna()
 
 
 def _against(pairing: Pairing, groups: Groups) -> list[Change]:
-    """Rows of one policy and one base: every cell, and every group behind the last one of its scenarios."""
+    """Rows of one policy and one base: every cell, and every group behind the last one of its
+    scenarios.
+    """
     conditions = {cell: pairing.table.conditions[pairing.policy, cell] for cell in pairing.cells}
     blocks = group_by(conditions, lambda cell: _apart_from_scenario(conditions[cell]))
     rows = []
@@ -419,7 +462,9 @@ def _scope_rows(pairing: Pairing, scope: str, cells: Sequence[int], is_group: bo
 
 
 def _mean(values: Array) -> float:
-    """Interquartile mean, over the training seeds that have all, of means over scenarios and episodes."""
+    """Interquartile mean, over the training seeds that have all, of means over scenarios and
+    episodes.
+    """
     means = np.mean(values, axis=-1)
     means = means[np.isfinite(means)]
     return float(interquartile_mean(means)) if len(means) else float("nan")
@@ -458,7 +503,9 @@ def _marks(
 
 
 def _seen_as(condition: Condition, trained: Origin | None) -> str:
-    """The scenario of a condition; one whose fields are varied by the name under which training has seen the same."""
+    """The scenario of a condition; one whose fields are varied by the name under which training
+    has seen the same.
+    """
     played = condition.scenario_played
     ranges = {} if trained is None else trained.ranges
     if isinstance(played, str) and not ranges:
@@ -466,13 +513,19 @@ def _seen_as(condition: Condition, trained: Origin | None) -> str:
     seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
     played = make_scenario(played)
     same = (
-        name for name in seen if make_scenario(name).with_ranges(ranges).replace(name="") == played.replace(name="")
+        name
+        for name in seen
+        if make_scenario(name).with_ranges(ranges).replace(name="") == played.replace(name="")
     )
     if condition.swept:
         return next(same, f"varied {condition.scenario}")
     return next(
         same,
-        f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario,
+        (
+            f"{condition.scenario} of other ranges"
+            if condition.scenario in seen
+            else condition.scenario
+        ),
     )
 
 
@@ -483,5 +536,7 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
+    lines = group_by(
+        rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items())
+    )
     return list(lines.values())

@@ -1,4 +1,6 @@
-"""Cells of a comparison: which policy plays which motion in which environment, as configurations say it."""
+"""Cells of a comparison: which policy plays which motion in which environment, as configurations
+say it.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -37,8 +39,8 @@ def _options(value: dict[str, Any]) -> dict[str, Any]:
 def _reference(value: Any) -> Reference:
     if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
         raise ValueError(
-            "a reference is a name, a step period [s], three durations [s] or a mapping of parameters, "
-            f"got {shown(value)}"
+            "a reference is a name, a step period [s], three durations [s] or a mapping of"
+            f" parameters, got {shown(value)}"
         )
     if isinstance(value, dict):
         _refuse(value.keys() & set(RESERVED), "part of a reference")
@@ -48,7 +50,11 @@ def _reference(value: Any) -> Reference:
 def _refuse(taken: set[str], what: str) -> None:
     """Refuse arguments of the environments that stand in the wrong place."""
     for name in sorted(taken):
-        place = "the commands set it themselves" if name in UNPLACED else "it has a key, or an option, of its own"
+        place = (
+            "the commands set it themselves"
+            if name in UNPLACED
+            else "it has a key, or an option, of its own"
+        )
         raise ValueError(f"{name} cannot be {what}; {shortened(place)}")
 
 
@@ -66,8 +72,8 @@ GivenRanges = Annotated[
     dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)],
     AfterValidator(_ranges),
 ]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
-mappings, each of an equal share of the robots."""
+"""Intervals of drawn robots that differ from those of their scenario, by the names of
+`RobotRanges`; or several such mappings, each of an equal share of the robots."""
 
 
 def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
@@ -78,12 +84,15 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     """
     if ranges and not any(len(make_scenario(scenario).ranges) == 1 for scenario in scenarios):
         raise ConfigurationError(
-            f"ranges need a scenario whose robots are drawn from them, such as 'drawn', got {shown(list(scenarios))}"
+            "ranges need a scenario whose robots are drawn from them, such as 'drawn', got"
+            f" {shown(list(scenarios))}"
         )
 
 
 class PolicySpec(Model):
-    """A policy of a comparison: a baseline's name, or "FILE.py:function" for one's own, with options."""
+    """A policy of a comparison: a baseline's name, or "FILE.py:function" for one's own, with
+    options.
+    """
 
     name: Locator
     label: Locator | None = None
@@ -95,7 +104,9 @@ class PolicySpec(Model):
     level: bool = False
     """In a sweep: whether it plays once without the swept option, as a level to compare with."""
     track: Track | None = None
-    """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the standard sensors."""
+    """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the
+    standard sensors.
+    """
 
     _checked = field_validator("env_options")(_options)
 
@@ -115,8 +126,8 @@ class Member(Model):
     base: str
     """Title of the policy that it corrects."""
     rival: str | None = None
-    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
-    plays it."""
+    """Title of the best policy without learning and with the standard sensors; None where that is
+    the base, or nobody plays it."""
 
 
 class Condition(Model):
@@ -127,8 +138,9 @@ class Condition(Model):
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
     reference: GivenReference = "hold"
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
-    or a mapping with `step_period` and further arguments of the environment."""
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
+    three durations [s], or a mapping with `step_period` and further arguments of the
+    environment."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
@@ -137,15 +149,13 @@ class Condition(Model):
     ranges: GivenRanges = {}
     """Intervals in place of those of the scenario, where it draws robots from ranges."""
     swept: dict[str, float] = {}
-    """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it one of the scenario."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
-    seed: int = quantity(
-        "1",
-        0,
-        ge=0,
-        le=LARGEST_SEED - MOST_EPISODES,
-        description="seed of the first episode; the next ones follow",
-    )
+    """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it
+    one of the scenario.
+    """
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    """Number of episodes [1]."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    """Seed of the first episode; the next ones follow [1]."""
 
     _checked = field_validator("env_options")(_options)
 
@@ -166,12 +176,15 @@ class Condition(Model):
 
     @property
     def number(self) -> float | None:
-        """Number of the reference that scores can be drawn against, such as the step period [s]; None for nothing."""
+        """Number of the reference that scores can be drawn against, such as the step period [s];
+        None for nothing.
+        """
         return next(iter(self.environment.abscissa(self.reference).values()), None)
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the environment; what the policy says goes before, and what the reference says before that.
+        """Arguments of the environment; what the policy says goes before, and what the reference
+        says before that.
 
         The environment also has the sensors that a baseline reads.
         """
@@ -184,13 +197,17 @@ class Condition(Model):
         }
         needed = sensors_needed(self.policy.name)
         given = found.get("sensors", [])
-        if not needed or not isinstance(given, list | tuple):  # the environment says what sensors are
+        if not needed or not isinstance(
+            given, list | tuple
+        ):  # the environment says what sensors are
             return found
         return {**found, "sensors": [*given, *(name for name in needed if name not in given)]}
 
     @property
     def scenario_played(self) -> str | Scenario:
-        """The scenario with ranges of its own and the fields that are varied; its name where it has neither."""
+        """The scenario with ranges of its own and the fields that are varied; its name where it
+        has neither.
+        """
         fields = {name: value for name, value in self.swept.items() if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
@@ -209,7 +226,8 @@ class Condition(Model):
 
 
 def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
-    """A scenario with other values of some fields, such as {"scenario.pelvis_imu.bias_spread_rad": 0.002} [SI].
+    """A scenario with other values of some fields, such as {"scenario.pelvis_imu.bias_spread_rad":
+    0.002} [SI].
 
     Raises:
         ConfigurationError: A value is beyond the bounds of its field.
@@ -223,7 +241,9 @@ def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
 
 @lru_cache(maxsize=1)
 def scenario_fields() -> Mapping[str, tuple[str, str]]:
-    """Numbers of a scenario that can be varied: description and unit, by name with `SCENARIO` before it."""
+    """Numbers of a scenario that can be varied: description and unit, by name with `SCENARIO`
+    before it.
+    """
     return _numbers_of(Scenario, SCENARIO)
 
 

@@ -1,4 +1,6 @@
-"""The environments as the commands know them: how it is made, what of it is kept, and how its figures are shown."""
+"""The environments as the commands know them: how it is made, what of it is kept, and how its
+figures are shown.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,7 +18,9 @@ from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
 
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
-"""The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
+"""The motion: a name, a number, durations, or a mapping of parameters; each environment says
+which of them it takes.
+"""
 
 UNPLACED = (
     "num_envs",
@@ -29,7 +33,9 @@ UNPLACED = (
     "wrappers",
     "self",
 )
-"""Arguments of the environments, and of the functions that make them, that have no place in a comparison."""
+"""Arguments of the environments, and of the functions that make them, that have no place in a
+comparison.
+"""
 RESERVED = ("scenario", *UNPLACED)
 """These, and the argument that has a key of its own."""
 
@@ -105,16 +111,19 @@ class Environment:
     Attributes:
         id: Its name for `gymnasium.make`.
         robot: Name of its task, under which trained policies are kept.
-        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
+        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration
+            calls its reference.
         default_reference: Reference where none is named.
         watched_reference: The same for a picture; None for the default.
-        looped_policy: Policy in the loop of which the speed is measured, the best that needs no truth.
+        looped_policy: Policy in the loop of which the speed is measured, the best that needs no
+            truth.
         live_policy: Policy that is timed against the clock; None for the looped one.
         on_hardware: Short name of the same robot on hardware; empty where there is none.
         arguments: Arguments of `gymnasium.make` for a reference.
         label: How tables and figures call a reference.
         draws: Whether episodes of a reference have motions of their own.
-        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
+        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where
+            there is nothing.
         traced: Signals of the first episode that are kept.
         columns: The summary table.
         splits: Further tables of the summary, title and columns.
@@ -123,13 +132,15 @@ class Environment:
         figures: Names of the time series to draw, see `train.figures.comparison_figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
-        learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
+        learned_from: Further arguments of worlds that are learned from, which keep them apart from
+            those of evaluation.
         judged: Columns that policies are compared by, pair by pair.
         also: Columns whose paired changes stand in the tables too.
         curves: Signals over time in the report.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
-        is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
+        is_real: Whether it is hardware: one world at a time, in this process, without a truth to
+            score by.
         walks: Whether its policies are those of the walker.
     """
 
@@ -188,8 +199,8 @@ def environment(name: str) -> Environment:
     """The environment of a short name, or that of a robot of one's own.
 
     Args:
-        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or "module:ROBOT", a
-            `JointRobot`, which is imported and registered.
+        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or
+            "module:ROBOT", a `JointRobot`, which is imported and registered.
 
     Raises:
         ConfigurationError: It does not exist.
@@ -205,16 +216,22 @@ def environment(name: str) -> Environment:
 
 def _of_file(name: str) -> Environment:
     of_robot = read_robot_file(name)
-    return replace(ENVIRONMENTS["robot"], arguments=lambda reference: {**of_robot, "reference": reference})
+    return replace(
+        ENVIRONMENTS["robot"], arguments=lambda reference: {**of_robot, "reference": reference}
+    )
 
 
 @lru_cache(maxsize=64)
 def _of_ones_own(name: str) -> Environment:
     robot = named_object(name)
     if not isinstance(robot, JointRobot):
-        raise ConfigurationError(f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}")
+        raise ConfigurationError(
+            f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
+        )
     robot.register()
-    return replace(_JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id, robot=robot.name)
+    return replace(
+        _JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id, robot=robot.name
+    )
 
 
 def _kind(reference: Reference) -> str:
@@ -227,8 +244,8 @@ def _step_period(reference: Reference) -> Any:
         return reference
     if "step_period" not in reference:
         raise ConfigurationError(
-            f"a reference of the walker that is a mapping needs the key 'step_period', got {shown(reference)}; "
-            "for example {step_period: 24, num_steps: 2}"
+            "a reference of the walker that is a mapping needs the key 'step_period', got"
+            f" {shown(reference)}; for example {{step_period: 24, num_steps: 2}}"
         )
     return reference["step_period"]
 
@@ -241,10 +258,15 @@ def _walk_arguments(reference: Reference) -> dict[str, Any]:
 
 
 def _walk_label(reference: Reference) -> str:
-    """Step period or durations, and the number of steps where it is not the one that goes without saying."""
+    """Step period or durations, and the number of steps where it is not the one that goes
+    without saying.
+    """
     period = _step_period(reference)
     parts = period if isinstance(period, list | tuple) else [period]
-    label = "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts) + " s"
+    label = (
+        "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts)
+        + " s"
+    )
     steps = reference.get("num_steps") if isinstance(reference, dict) else None
     usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
     return label if steps in usual else f"{label} num_steps={steps}"
@@ -378,7 +400,9 @@ _WALKER = Environment(
             on_console=False,
             note="error of its attitude, roll and pitch together",
         ),
-        Column("early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"),
+        Column(
+            "early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"
+        ),
         Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
         Column("COM jump", "com_jump_mean_m", decimals=1),
     ),
@@ -427,7 +451,9 @@ _WALKER = Environment(
 _HARDWARE = replace(
     _TESTBED,
     id=IDS["hardware"],
-    columns=tuple(column for column in _TESTBED.columns if column.title not in ("est.", "peak")),  # IMU- or IMU+ is it
+    columns=tuple(
+        column for column in _TESTBED.columns if column.title not in ("est.", "peak")
+    ),  # IMU- or IMU+ is it
     traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
     subject="link error by the IMU",
     note="On hardware there is no truth to score an estimate by.",
@@ -440,5 +466,9 @@ _OWN = {
     "hardware": _HARDWARE,
     "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], robot="robot", default_reference="poses"),
 }
-ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known, robot=name) for name, known in IDS.items()}
-"""Environments by their short names: those with figures of their own, and other robots of elastic joints."""
+ENVIRONMENTS = {
+    name: _OWN.get(name) or replace(_JOINTS, id=known, robot=name) for name, known in IDS.items()
+}
+"""Environments by their short names: those with figures of their own, and other robots of
+elastic joints.
+"""

@@ -1,4 +1,6 @@
-"""Episodes of a policy under a condition: metrics of each, one time series, and the static points."""
+"""Episodes of a policy under a condition: metrics of each, one time series, and the static
+points.
+"""
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import closing
@@ -34,7 +36,8 @@ class Evaluation:
     Attributes:
         condition: The condition.
         episodes: Flat records, one per episode: seed, metrics, termination.
-        trace: Signals of the first episode over time, those that the environment's description names.
+        trace: Signals of the first episode over time, those that the environment's description
+            names.
         points: Static points of the first episode, with reference "hold".
         rest_references: References of the static points, (visits,) [rad].
     """
@@ -46,8 +49,14 @@ class Evaluation:
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
     def values(self, metric: str, failed: bool = False) -> Array:
-        """A metric over the episodes that did not fail, or over those that did, (n,); empty where none has it."""
-        found = [episode.get(metric) for episode in self.episodes if bool(episode["termination"]) == failed]
+        """A metric over the episodes that did not fail, or over those that did, (n,); empty
+        where none has it.
+        """
+        found = [
+            episode.get(metric)
+            for episode in self.episodes
+            if bool(episode["termination"]) == failed
+        ]
         return np.array([value for value in found if value is not None], dtype=np.float64)
 
     @property
@@ -62,28 +71,38 @@ class Evaluation:
 
     @property
     def is_steady(self) -> BoolArray:
-        """Samples of the trace that a figure's range goes by: all but those shortly before a fall."""
+        """Samples of the trace that a figure's range goes by: all but those shortly before a
+        fall.
+        """
         time_s = self.trace["time_s"]
         return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
 
 
 def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
-    """Items such as evaluations by what they have in common, in the order in which it first occurs."""
+    """Items such as evaluations by what they have in common, in the order in which it first
+    occurs.
+    """
     groups: dict[KeyT, list[ItemT]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
     return groups
 
 
-def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
-    """Play all episodes of a condition. Episode i has seed + i, whatever the number of worlds and threads.
+def evaluate(
+    condition: Condition, progress: Progress | None = None, num_threads: int = 0
+) -> Evaluation:
+    """Play all episodes of a condition.
 
-    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it may play episodes of
-    the robots that it is scored on, under other noise, see `baselines.adaptation.iterative`.
+    Episode i has seed + i, whatever the number of worlds and threads.
+
+    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it
+    may play episodes of the robots that it is scored on, under other noise, see
+    `baselines.adaptation.iterative`.
 
     Args:
         condition: What to play.
-        progress: Called with the number of control steps done since the last call, of all episodes together.
+        progress: Called with the number of control steps done since the last call, of all episodes
+            together.
         num_threads: Threads of the physics, 0 for all cores.
     """
     return evaluate_together([condition], progress, num_threads)[0]
@@ -92,25 +111,33 @@ def evaluate(condition: Condition, progress: Progress | None = None, num_threads
 def evaluate_together(
     conditions: Sequence[Condition], progress: Progress | None = None, num_threads: int = 0
 ) -> list[Evaluation]:
-    """Play conditions of one policy side by side, which costs less; their results are those of `evaluate`.
+    """Play conditions of one policy side by side, which costs less; their results are those of
+    `evaluate`.
 
     Args:
-        conditions: What to play: one, or several with the same `shared_settings` that can share worlds.
+        conditions: What to play: one, or several with the same `shared_settings` that can share
+            worlds.
         progress: See `evaluate`.
         num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
-    episodes = [(result, number) for result in results for number in range(result.condition.episodes)]
+    episodes = [
+        (result, number) for result in results for number in range(result.condition.episodes)
+    ]
     at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), at_once):
         batch = episodes[first : first + at_once]
-        with closing(make_shared_env([result.condition for result, _ in batch], num_threads)) as env:
+        with closing(
+            make_shared_env([result.condition for result, _ in batch], num_threads)
+        ) as env:
             _play(env, batch, progress or (lambda _: None))
     return results
 
 
 def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress) -> None:
-    """Episodes of conditions, by their numbers, a world each; in every world the first episode counts."""
+    """Episodes of conditions, by their numbers, a world each; in every world the first episode
+    counts.
+    """
     condition = episodes[0][0].condition
     seeds = [result.condition.seed + number for result, number in episodes]
     policy = make_policy(condition.policy, env, condition.policy_options)
@@ -124,7 +151,10 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
         for world in np.flatnonzero(step.is_over).tolist():
             if world not in records:
                 result, number = episodes[world]
-                metrics = {name: values[world].item() for name, values in step.info["episode_metrics"].items()}
+                metrics = {
+                    name: values[world].item()
+                    for name, values in step.info["episode_metrics"].items()
+                }
                 records[world] = {
                     **episode_labels(result.condition, number),
                     "termination": str(step.info["termination"][world]),
@@ -144,7 +174,9 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
 
 
 def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
-    """The part of a record that is known before the episode: cell, training seed, and seed of the episode."""
+    """The part of a record that is known before the episode: cell, training seed, and seed of
+    the episode.
+    """
     member = condition.member
     seed = None if member is None else member.training_seed
     return {
@@ -160,7 +192,9 @@ def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
 
 
 class _Observers:
-    """Figures that no environment keeps: of the IMU, of a policy's estimate, and the trace of first episodes."""
+    """Figures that no environment keeps: of the IMU, of a policy's estimate, and the trace of
+    first episodes.
+    """
 
     def __init__(self, env: Any, policy: Any, episodes: Sequence[tuple[Evaluation, int]]) -> None:
         task = env.unwrapped.task
@@ -173,7 +207,9 @@ class _Observers:
         self._estimates = _Estimates(task, len(episodes)) if has_estimate else None
         self._imu = _ImuError(task, len(episodes)) if walks else None
         self._traces = {
-            world: _Trace(task, environment.traced, world) for world, (_, number) in enumerate(episodes) if number == 0
+            world: _Trace(task, environment.traced, world)
+            for world, (_, number) in enumerate(episodes)
+            if number == 0
         }
         self._ended = set[int]()
 
@@ -238,7 +274,9 @@ class _ImuError:
         self._attitude = task.observation_table.group("imu_attitude")
 
     def take(self, observation: Array, info: dict[str, Any]) -> None:
-        error = observation[:, self._attitude] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+        error = observation[:, self._attitude] - np.stack(
+            [info["pelvis_roll"], info["pelvis_pitch"]], axis=1
+        )
         self._rms.take(np.square(error).sum(axis=1))
 
     def metrics(self, world: int) -> dict[str, float]:
@@ -247,11 +285,17 @@ class _ImuError:
 
 
 class _Estimates:
-    """A policy's estimate of the link angles against the truth, and on a walker what it makes of the local frame."""
+    """A policy's estimate of the link angles against the truth, and on a walker what it makes of
+    the local frame.
+    """
 
     def __init__(self, task: Any, worlds: int) -> None:
         self._rms = _Rms(task, worlds)
-        self._changes = SupportChanges(task.assumed_model) if isinstance(task.assumed_model, WalkerModel) else None
+        self._changes = (
+            SupportChanges(task.assumed_model)
+            if isinstance(task.assumed_model, WalkerModel)
+            else None
+        )
 
     def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
         self._rms.take(np.square(estimate - truth.q).mean(axis=1))
@@ -274,7 +318,9 @@ class _Trace:
         self.references = np.zeros(0)
         self._recorder: HoldRecorder | None = None
         visits = getattr(getattr(task.config, "reference", None), "visits", None)
-        if visits is not None and "link_angle_imu" in traced:  # static points need the IMU of the only link
+        if (
+            visits is not None and "link_angle_imu" in traced
+        ):  # static points need the IMU of the only link
             self.references, directions = visits
             self._recorder = HoldRecorder(directions)
         self._rows: list[tuple[float, ...]] = []
@@ -285,7 +331,9 @@ class _Trace:
         self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
         if self._recorder is not None:
             encoder = observation[own, self._encoder][:, 0]
-            self._recorder.take(encoder, info["link_angle_imu"][own], int(info["rest"][self._world]))
+            self._recorder.take(
+                encoder, info["link_angle_imu"][own], int(info["rest"][self._world])
+            )
 
     def signals(self) -> dict[str, Array]:
         """Time series by name."""

@@ -1,6 +1,8 @@
-"""Policies of a comparison with all training seeds of a residual, and with whom each residual is compared.
+"""Policies of a comparison with all training seeds of a residual, and with whom each residual is
+compared.
 
-A residual is compared with its base, and with the best policy without learning that reads the same sensors.
+A residual is compared with its base, and with the best policy without learning that reads the same
+sensors.
 """
 
 import difflib
@@ -60,15 +62,16 @@ class Origin:
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
-    """All who play: a residual's pattern as one entrant per folder, and bases and rivals that nobody named.
+    """All who play: a residual's pattern as one entrant per folder, and bases and rivals that
+    nobody named.
 
     Args:
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
         with_bases: Whether a base or a rival that is not among them is added, before its residual.
 
     Raises:
-        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
-            together.
+        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders
+            that do not belong together.
     """
     entrants: list[Entrant] = []
     bases = [policy for policy in policies if not is_residual(policy)]
@@ -124,15 +127,23 @@ def origin(members: Sequence[Member]) -> Origin:
 
 
 def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
-    """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
+    """Folders of a pattern in natural order, with training seed and description; shipped ones
+    where none lie there.
+    """
     is_family = bool(_WILD.search(pattern))
     folders = [Path(pattern)]
     if is_family:
-        folders = sorted(_matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
+        folders = sorted(
+            _matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural
+        )
         if not folders:
-            raise ConfigurationError(f"no folder matches {shown(pattern)}; {_nearest(Path(pattern))}")
+            raise ConfigurationError(
+                f"no folder matches {shown(pattern)}; {_nearest(Path(pattern))}"
+            )
     descriptions = [read_description(folder) for folder in folders]
-    members = [(f, _training_seed(f, said), said) for f, said in zip(folders, descriptions, strict=True)]
+    members = [
+        (f, _training_seed(f, said), said) for f, said in zip(folders, descriptions, strict=True)
+    ]
     if is_family:
         _require_one_family(pattern, members)
     return members
@@ -142,19 +153,28 @@ def _matching(pattern: str) -> list[Path]:
     """Folders whose paths match a pattern.
 
     Raises:
-        ConfigurationError: The pattern stands for folders of any depth, which may be all of the disk.
+        ConfigurationError: The pattern stands for folders of any depth, which may be all of the
+            disk.
     """
     if "**" in pattern:
-        raise ConfigurationError(f"* stands for one part of a path, got {shown(pattern)}; leave ** out")
+        raise ConfigurationError(
+            f"* stands for one part of a path, got {shown(pattern)}; leave ** out"
+        )
     anchor = Path(pattern).anchor
     try:
-        return [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
+        return [
+            path
+            for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
+            if path.is_dir()
+        ]
     except OSError:  # a name that is too long
         return []
 
 
 def _require_motion(folder: Path, description: ResidualDescription) -> None:
-    """Refuse a residual whose training names a motion that its environment cannot read: the report would need it."""
+    """Refuse a residual whose training names a motion that its environment cannot read: the
+    report would need it.
+    """
     known = ENVIRONMENTS.get(description.robot)
     reference = description.origin.config.reference
     if known is None or reference is None:
@@ -162,17 +182,32 @@ def _require_motion(folder: Path, description: ResidualDescription) -> None:
     try:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
-        raise ConfigurationError(f"{shortened(folder / DESCRIPTION)}: training.config.reference: {error}") from None
+        raise ConfigurationError(
+            f"{shortened(folder / DESCRIPTION)}: training.config.reference: {error}"
+        ) from None
 
 
 def _nearest(pattern: Path) -> str:
-    """The folders beside a pattern that matches none, the most similar names first, and those that are shipped."""
-    there = next(path for path in pattern.parents if os.path.isdir(path) and not _WILD.search(str(path)))  # noqa: PTH112
-    names = [path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    near = difflib.get_close_matches(pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0)
+    """The folders beside a pattern that matches none, the most similar names first, and those
+    that are shipped.
+    """
+    there = next(
+        path
+        for path in pattern.parents
+        if os.path.isdir(path) and not _WILD.search(str(path))  # noqa: PTH112
+    )
+    names = [
+        path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")
+    ]
+    near = difflib.get_close_matches(
+        pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0
+    )
     families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())
     where = "this folder" if there == Path() else str(there)
-    return f"{where} has {', '.join(near) or 'no folders'}; with the package come {', '.join(families)}"
+    return (
+        f"{where} has {', '.join(near) or 'no folders'}; with the package come"
+        f" {', '.join(families)}"
+    )
 
 
 def _training_seed(folder: Path, description: ResidualDescription) -> int | None:
@@ -183,7 +218,9 @@ def _training_seed(folder: Path, description: ResidualDescription) -> int | None
     return int(found[-1]) if found else None
 
 
-def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, ResidualDescription]]) -> None:
+def _require_one_family(
+    pattern: str, members: Sequence[tuple[Path, int | None, ResidualDescription]]
+) -> None:
     """Refuse folders that are no training seeds of one configuration."""
     first, _, expected = members[0]
     seen: dict[int, Path] = {}
@@ -193,16 +230,19 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
         for what in {**mine, **theirs}:
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
-                    f"{pattern!r} must match training seeds of one configuration, but {what} of {shortened(folder)} is "
-                    f"{mine.get(what)!r} and of {first} {theirs.get(what)!r}; give each an entry of its own"
+                    f"{pattern!r} must match training seeds of one configuration, but {what} of"
+                    f" {shortened(folder)} is {mine.get(what)!r} and of {first}"
+                    f" {theirs.get(what)!r}; give each an entry of its own"
                 )
         if seed is None:
             raise ConfigurationError(
-                f"{folder} does not say its training seed: residual.json has no training.seed and the path no seed_N"
+                f"{folder} does not say its training seed: residual.json has no training.seed and"
+                " the path no seed_N"
             )
         if seed in seen:
             raise ConfigurationError(
-                f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and {shortened(folder)}"
+                f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and"
+                f" {shortened(folder)}"
             )
         seen[seed] = folder
 
@@ -215,11 +255,15 @@ def _kin(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
     trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
-    return trained | {name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")}
+    return trained | {
+        name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")
+    }
 
 
 def _plays(known: PolicySpec, description: ResidualDescription, residual: PolicySpec) -> bool:
-    """True if a policy is the base of a residual, with the same options, in the same environment."""
+    """True if a policy is the base of a residual, with the same options, in the same
+    environment.
+    """
     return (
         known.name == description.base
         and _set_options(known.options) == _base_options(description, residual)
@@ -228,7 +272,9 @@ def _plays(known: PolicySpec, description: ResidualDescription, residual: Policy
     )
 
 
-def _base(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec:
+def _base(
+    description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]
+) -> PolicySpec:
     """The base of a residual as a policy of its own, under a title that nobody has."""
     options = _base_options(description, residual)
     return _beside(residual, taken, description.base, f"base of {residual.title}", options)
@@ -241,7 +287,9 @@ def _beside(
     role: str,
     options: dict[str, object],
 ) -> PolicySpec:
-    """Whom a residual is compared with, under its name, or where a policy is called so under one that says its role."""
+    """Whom a residual is compared with, under its name, or where a policy is called so under one
+    that says its role.
+    """
     label = f"{name} ({role})" if name in {policy.title for policy in taken} else None
     return PolicySpec(
         name=name,
@@ -252,11 +300,15 @@ def _beside(
     )
 
 
-def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
-    """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
+def _rival(
+    description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]
+) -> PolicySpec | None:
+    """The best policy without learning, with the same sensors, in the same environment; None where
+    that is the base.
 
-    One that is among the policies counts if it assumes the same stiffness, whatever its other options. Where the base
-    is that policy with options, it is compared with the plain one if that is among the policies.
+    One that is among the policies counts if it assumes the same stiffness, whatever its other
+    options. Where the base is that policy with options, it is compared with the plain one if that
+    is among the policies.
     """
     known = ENVIRONMENTS.get(description.robot)
     name = best_analytic(known is not None and known.walks)
@@ -267,7 +319,11 @@ def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequen
     assumed = {option: value for option, value in options.items() if option in ASSUMED_OPTIONS}
     for policy in taken:
         given = _set_options(policy.options)
-        mine = given if is_base else {option: v for option, v in given.items() if option in ASSUMED_OPTIONS}
+        mine = (
+            given
+            if is_base
+            else {option: v for option, v in given.items() if option in ASSUMED_OPTIONS}
+        )
         same = policy.env_options == residual.env_options and policy.level == residual.level
         if policy.name == name and mine == assumed and same:
             return policy if not is_base or options != assumed else None
@@ -285,4 +341,7 @@ def _set_options(options: dict[str, object]) -> dict[str, object]:
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
     """Key that sorts seed_2 before seed_10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", str(path))]
+    return [
+        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        for part in re.split(r"(\d+)", str(path))
+    ]

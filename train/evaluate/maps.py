@@ -1,4 +1,5 @@
-"""Maps over two axes: which policy is best where, and how far learning is ahead of the best policy without it.
+"""Maps over two axes: which policy is best where, and how far learning is ahead of the best policy
+without it.
 
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
@@ -29,8 +30,9 @@ class Axis(Model):
     """An axis of a map."""
 
     what: Title
-    """A field of the scenario, such as scenario.stiffness_scale or scenario.pelvis_imu.bias_spread_rad, or the motion:
-    step_period on the walker, reference on the testbed."""
+    """A field of the scenario, such as scenario.stiffness_scale or
+    scenario.pelvis_imu.bias_spread_rad, or the motion: step_period on the walker, reference on the
+    testbed."""
     values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""
     label: Title | None = None
@@ -54,8 +56,12 @@ class Axis(Model):
     def ticks(self, known: Environment) -> list[str]:
         """Its values as they are shown."""
         if self.is_motion:
-            numbers = [f"{number:g}" for value in self.values for number in known.abscissa(value).values()]
-            return numbers or [known.label(known.arguments(value)[known.motion]) for value in self.values]
+            numbers = [
+                f"{number:g}" for value in self.values for number in known.abscissa(value).values()
+            ]
+            return numbers or [
+                known.label(known.arguments(value)[known.motion]) for value in self.values
+            ]
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
 
@@ -64,7 +70,11 @@ class Axis(Model):
         values: list[Any] = self.values
         if self.is_motion:
             values = [condition.environment.arguments(value) for value in values]
-        mine = condition.environment.arguments(condition.reference) if self.is_motion else condition.swept[self.what]
+        mine = (
+            condition.environment.arguments(condition.reference)
+            if self.is_motion
+            else condition.swept[self.what]
+        )
         return values.index(mine)
 
 
@@ -100,14 +110,18 @@ class MapConfig(Model):
         """
         for name, axis in (("x", self.x), ("y", self.y)):
             if axis.what != known.motion and axis.what not in scenario_fields():
-                raise ConfigurationError(f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}")
+                raise ConfigurationError(
+                    f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}"
+                )
             for value in axis.values:
                 if axis.values.count(value) > 1:
                     raise ConfigurationError(f"the value {shown(value)} of map.{name} stands twice")
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
-                    raise ConfigurationError(f"values of map.{name} must be numbers, got {shown(value)}")
+                    raise ConfigurationError(
+                        f"values of map.{name} must be numbers, got {shown(value)}"
+                    )
                 varied(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
@@ -115,13 +129,19 @@ class MapConfig(Model):
         found: list[dict[str, float]] = [{}]
         for axis in self.axes:
             if not axis.is_motion:
-                found = [{**fields, axis.what: float(value)} for fields in found for value in axis.values]
+                found = [
+                    {**fields, axis.what: float(value)} for fields in found for value in axis.values
+                ]
         return found
 
 
 def _choices(what: str, known: Environment) -> str:
     """Names that an axis can have."""
-    hint = "; an option of the policies is varied by sweep, not by a map" if what in PolicyOptions.model_fields else ""
+    hint = (
+        "; an option of the policies is varied by sweep, not by a map"
+        if what in PolicyOptions.model_fields
+        else ""
+    )
     return choices_listed(what, [known.motion, *scenario_fields()]) + hint
 
 
@@ -130,7 +150,8 @@ class MapCell:
     """One cell of a map.
 
     Attributes:
-        levels: Mean score of every policy over the episodes that did not fail; of residuals over training seeds [SI].
+        levels: Mean score of every policy over the episodes that did not fail; of residuals over
+            training seeds [SI].
         failed: Episodes of every policy that failed, and all.
         best: The best policy; None where no episode of any reached its end.
         best_analytic: The best one without learning and with the standard sensors.
@@ -182,7 +203,9 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        motion = [] if config.motion else [e.condition.environment.title(e.condition.reference_name)]
+        motion = (
+            [] if config.motion else [e.condition.environment.title(e.condition.reference_name)]
+        )
         return ", ".join([*motion, e.condition.scenario])
 
     return [
@@ -193,9 +216,11 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
 
 
 def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | None:
-    """The policy with the lowest score among those with the smallest share of failures; None where nobody has a score.
+    """The policy with the lowest score among those with the smallest share of failures; None where
+    nobody has a score.
 
-    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures count first.
+    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures
+    count first.
     """
 
     def rank(title: str) -> tuple[float, float]:
@@ -223,7 +248,10 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
             policies=tuple(table.policies),
             families=tuple(table.members),
             cells=tuple(
-                tuple(_cell(pairings, cells[row, place], column) for place in range(len(config.x.values)))
+                tuple(
+                    _cell(pairings, cells[row, place], column)
+                    for place in range(len(config.x.values))
+                )
                 for row in range(len(config.y.values))
             ),
         )
@@ -234,19 +262,29 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
 def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
     table = pairings.table
-    played = {title: table.of(title, cell) for title in table.policies if (title, cell) in table.conditions}
+    played = {
+        title: table.of(title, cell)
+        for title in table.policies
+        if (title, cell) in table.conditions
+    }
     scores = {title: (score(rows, column), failures(rows)) for title, rows in played.items()}
     tracks = {title: table.conditions[title, cell].track for title in played}
-    analytic = best_of({title: own for title, own in scores.items() if tracks[title] is Track.STANDARD})
+    analytic = best_of(
+        {title: own for title, own in scores.items() if tracks[title] is Track.STANDARD}
+    )
     learned = [title for title in played if title in table.members and analytic is not None]
     scenario = table.conditions[next(iter(played)), cell].scenario
     return MapCell(
         levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},
-        best=best_of({title: own for title, own in scores.items() if tracks[title] is not Track.TRUTH}),
+        best=best_of(
+            {title: own for title, own in scores.items() if tracks[title] is not Track.TRUTH}
+        ),
         best_analytic=analytic,
         learned={
-            title: pairings.of(title, str(analytic)).change(column, [cell], scenario, is_group=False)
+            title: (
+                pairings.of(title, str(analytic)).change(column, [cell], scenario, is_group=False)
+            )
             for title in learned
         },
     )

@@ -24,15 +24,17 @@ class Curves:
 
     Attributes:
         decisions: Decisions at the evaluations that all of them have, (n,).
-        ratios: Metric over the base's, mean over scenarios, (seeds, n), by metric; nan where all episodes of
-            a scenario failed.
+        ratios: Metric over the base's, mean over scenarios, (seeds, n), by metric; nan where all
+            episodes of a scenario failed.
     """
 
     decisions: Array
     ratios: dict[str, Array]
 
 
-def read_progress(folder: Path, metrics: Sequence[str] = (), further: Sequence[str] = ()) -> list[dict[str, Any]]:
+def read_progress(
+    folder: Path, metrics: Sequence[str] = (), further: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     """Evaluations on the way of a training seed, as its `progress.csv` has them.
 
     Args:
@@ -70,7 +72,8 @@ def _evaluation(row: Mapping[str, str], columns: Sequence[str]) -> dict[str, Any
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:
-    """Curves of policies that lie in their training runs, beside a whole `progress.csv`; None where one does not.
+    """Curves of policies that lie in their training runs, beside a whole `progress.csv`; None where
+    one does not.
 
     Args:
         folders: Folders of the policies, such as runs/NAME/seed_0/last.
@@ -85,7 +88,9 @@ def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves
     if not decisions:
         return None
     ratios = {
-        column.metric: np.array([[_ratio(table, at, column.metric) for at in decisions] for table in tables])
+        column.metric: np.array(
+            [[_ratio(table, at, column.metric) for at in decisions] for table in tables]
+        )
         for column in columns
     }
     return Curves(np.array(decisions), ratios)

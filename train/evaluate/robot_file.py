@@ -1,4 +1,5 @@
-"""A robot as a file of YAML: what `--env arm.robot.yaml` names, so that no Python has to be written.
+"""A robot as a file of YAML: what `--env arm.robot.yaml` names, so that no Python has to be
+written.
 
     model: arm.xml
     joints: arm.yaml
@@ -29,12 +30,8 @@ class RobotFile(Model):
     """Site or body whose place and tilt are scored; None for the outermost body."""
     home: dict[str, float] | list[float] | None = None
     """Angles about which the joints follow a reference, by name or in order [rad]."""
-    load_kg: float | None = quantity(
-        "kg",
-        None,
-        gt=0,
-        description="the scenario `payload` adds a fifth of it at the end effector",
-    )
+    load_kg: float | None = quantity("kg", None, gt=0)
+    """The scenario `payload` adds a fifth of it at the end effector [kg]."""
     imu: Locator | None = None
     """Site of the accelerometer."""
 
@@ -43,7 +40,11 @@ class RobotFile(Model):
         given = {name: value for name, value in self.model_dump().items() if value is not None}
         return {
             **given,
-            **{name: str(folder / given[name]) for name in ("model", "joints") if _is_path(given[name])},
+            **{
+                name: str(folder / given[name])
+                for name in ("model", "joints")
+                if _is_path(given[name])
+            },
         }
 
 
@@ -57,7 +58,8 @@ def read_robot_file(name: str) -> dict[str, Any]:
         return load_yaml(name, RobotFile).arguments(Path(name).parent)
     except ConfigurationError as error:
         raise ConfigurationError(
-            f"--env {shown(name)[1:-1]} must be a file of a robot, with the keys model and joints: {error}"
+            f"--env {shown(name)[1:-1]} must be a file of a robot, with the keys model and joints:"
+            f" {error}"
         ) from None
 
 

@@ -1,4 +1,6 @@
-"""Scores over drawn robots: how a policy does on the middle half of them, on the worst tenth, and against its base."""
+"""Scores over drawn robots: how a policy does on the middle half of them, on the worst tenth,
+and against its base.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +22,8 @@ FEWEST_ROBOTS = 4
 
 @dataclass(frozen=True)
 class RobotScores:
-    """A policy in one metric over the drawn robots of a cell; of residuals over training seeds, with intervals.
+    """A policy in one metric over the drawn robots of a cell; of residuals over training seeds,
+    with intervals.
 
     Attributes:
         policy, reference, scenario: Titles of the cell.
@@ -29,8 +32,8 @@ class RobotScores:
         middle: Interquartile mean over the robots [SI].
         worst: Mean of the worst tenth of the robots [SI].
         failed, episodes: Episodes that failed, and all. The figures are of the others.
-        better: Share of the robots for which the policy is better than another one, by its title; ties count half,
-            and to fail is worse than any value.
+        better: Share of the robots for which the policy is better than another one, by its title;
+            ties count half, and to fail is worse than any value.
         failure: What failing is called, in the plural.
     """
 
@@ -59,10 +62,18 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
         for cell in table.cells_of(policy):
             condition = table.conditions[policy, cell]
             rows = table.of(policy, cell)
-            if condition.swept or len(set(rows["seed"])) < FEWEST_ROBOTS or not _draws_robots(condition):
+            if (
+                condition.swept
+                or len(set(rows["seed"])) < FEWEST_ROBOTS
+                or not _draws_robots(condition)
+            ):
                 continue
             failed, episodes = failures(rows)
-            against = {other: table.of(other, cell) for other in others if (other, cell) in table.conditions}
+            against = {
+                other: table.of(other, cell)
+                for other in others
+                if (other, cell) in table.conditions
+            }
             found += [
                 RobotScores(
                     policy=policy,
@@ -71,10 +82,14 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     column=column,
                     mean=score(rows, column),
                     middle=score(rows, column, _middle),
-                    worst=score(rows, column, lambda values: worst_share_mean(values.dropna().to_numpy())),
+                    worst=score(
+                        rows, column, lambda values: worst_share_mean(values.dropna().to_numpy())
+                    ),
                     failed=failed,
                     episodes=episodes,
-                    better={other: _better(rows, theirs, column) for other, theirs in against.items()},
+                    better={
+                        other: _better(rows, theirs, column) for other, theirs in against.items()
+                    },
                     failure=table.environment.failures,
                 )
                 for column in table.environment.judged
@@ -88,16 +103,22 @@ def _middle(values: pd.Series) -> float:
 
 
 def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
-    """Share of the robots for which a policy is better than another one, over its training seeds."""
-    shares = [share_better(own, base, column.metric) for _, own in mine.groupby("member", sort=False)]
+    """Share of the robots for which a policy is better than another one, over its training
+    seeds.
+    """
+    shares = [
+        share_better(own, base, column.metric) for _, own in mine.groupby("member", sort=False)
+    ]
     return estimate(mine, np.array(shares))
 
 
 def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
-    """Share of the episodes of both in which the policy is better (lower) than the base; ties count half.
+    """Share of the episodes of both in which the policy is better (lower) than the base; ties count
+    half.
 
-    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode in common. An
-    episode that reached its end without a figure, such as a ZMP of feet that never carried anything, is left out.
+    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
+    in common. An episode that reached its end without a figure, such as a ZMP of feet that never
+    carried anything, is left out.
 
     Args:
         mine: Episodes of one cell with `seed`, `failed` and the metric.

@@ -1,4 +1,6 @@
-"""The rollout of a policy: how its environment and the policy are made, and one generator of control steps."""
+"""The rollout of a policy: how its environment and the policy are made, and one generator of
+control steps.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -39,7 +41,8 @@ class ControlStep:
         action: Its command.
         observation: Observation after the step.
         info: Info after the step.
-        terminated: Worlds that failed in this step, (num_worlds,); of a scalar environment one truth value.
+        terminated: Worlds that failed in this step, (num_worlds,); of a scalar environment one
+            truth value.
         truncated: Worlds that reached their end.
     """
 
@@ -66,8 +69,9 @@ def control_steps(
 ) -> Iterator[ControlStep]:
     """Play a policy from a reset on, one control step at a time, in one world or in many.
 
-    A scalar environment stops at the end of its episode. The worlds of a vector environment go on, each with the next
-    episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads the steps stops when there are enough.
+    A scalar environment stops at the end of its episode. The worlds of a vector environment go on,
+    each with the next episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads
+    the steps stops when there are enough.
 
     Args:
         env: The environment.
@@ -87,7 +91,9 @@ def control_steps(
     was_over = np.zeros_like(begins)
     for number in count():
         with nullcontext() if condition is None else policy_errors(condition, number):
-            action, memory = policy.predict(observation, state=memory, episode_start=begins, deterministic=True)
+            action, memory = policy.predict(
+                observation, state=memory, episode_start=begins, deterministic=True
+            )
             if watch is not None:
                 watch(number, observation, info, memory)
             after, _, terminated, truncated, info = env.step(action)
@@ -150,7 +156,9 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
         raise _not_a_policy(spec, str(error)) from error
     attribute = spec.name.rpartition(":")[2]
     if not callable(function):
-        raise _not_a_policy(spec, f"{attribute} is no function but of type {type(function).__name__}")
+        raise _not_a_policy(
+            spec, f"{attribute} is no function but of type {type(function).__name__}"
+        )
     try:
         return function(env, **options)
     except ElasticError:
@@ -162,9 +170,9 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
 
 def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
     return ConfigurationError(
-        f"policy {spec.name!r}: {problem}; give a baseline ({', '.join(baselines.policy_names())}) or "
-        '"FILE.py:function" or "module:function", a function that takes the environment and returns an object with '
-        "predict()"
+        f"policy {spec.name!r}: {problem}; give a baseline ({', '.join(baselines.policy_names())})"
+        ' or "FILE.py:function" or "module:function", a function that takes the environment'
+        " and returns an object with predict()"
     )
 
 
@@ -194,7 +202,8 @@ def make_shared_env(
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> Any:
-    """A vector environment with a world of each condition, whose scenarios may differ, see `shared_settings`.
+    """A vector environment with a world of each condition, whose scenarios may differ, see
+    `shared_settings`.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
@@ -216,7 +225,8 @@ def make_shared_env(
 def shared_settings(condition: Condition) -> str:
     """Settings that conditions must share to share a vector environment.
 
-    That is everything but the scenario of a walker, of which a policy knows the friction and the rate of the IMU.
+    That is everything but the scenario of a walker, of which a policy knows the friction and the
+    rate of the IMU.
     """
     scenario = make_scenario(condition.scenario_played)
     walks = condition.environment.walks
@@ -227,7 +237,8 @@ def shared_settings(condition: Condition) -> str:
 def can_share_worlds(condition: Condition) -> bool:
     """True if its policy does the same beside worlds of other scenarios.
 
-    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are of one.
+    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are
+    of one.
     """
     name = condition.policy.name
     if ":" in name and not is_saved(name):
@@ -236,7 +247,9 @@ def can_share_worlds(condition: Condition) -> bool:
 
 
 def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
-    """Conditions, each with an environment of one world, which those that differ by their policy share."""
+    """Conditions, each with an environment of one world, which those that differ by their policy
+    share.
+    """
     made: dict[str, Any] = {}
     for condition in conditions:
         key = repr((condition.env, condition.arguments))
@@ -247,4 +260,7 @@ def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Conditi
 
 def num_steps(conditions: Iterable[Condition]) -> list[int]:
     """Control steps that all episodes of each condition take together, for progress bars."""
-    return [condition.episodes * env.unwrapped.task.num_steps for condition, env in single_world_envs(conditions)]
+    return [
+        condition.episodes * env.unwrapped.task.num_steps
+        for condition, env in single_world_envs(conditions)
+    ]

@@ -1,4 +1,6 @@
-"""The leaderboard of a comparison: scores of policies over groups of scenarios, in tracks by what a policy needs."""
+"""The leaderboard of a comparison: scores of policies over groups of scenarios, in tracks by
+what a policy needs.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -43,16 +45,19 @@ class Standing:
         reference: Label of the motion.
         scope: Scenario, or name of the group.
         is_group: Whether it is a group.
-        is_column: Whether it is a column of the leaderboard; else it stands in the table of single scenarios.
+        is_column: Whether it is a column of the leaderboard; else it stands in the table of single
+            scenarios.
         title: Words for the metric.
         metric: Its name, with its unit in SI.
-        score: Mean over scenarios of means over the episodes that did not fail; of residuals the interquartile mean
-            over training seeds with its interval; nan where a scenario has no such episode.
+        score: Mean over scenarios of means over the episodes that did not fail; of residuals the
+            interquartile mean over training seeds with its interval; nan where a scenario has no
+            such episode.
         failed, episodes: Episodes that failed, and all.
         training_seeds: Of a residual; 0 of another policy.
         base: Of a residual: its change against its base.
-        rival: Of a residual: its change against the best policy without learning and with the standard sensors, in the
-            same scope and metric. It is chosen on the same episodes, which favours it.
+        rival: Of a residual: its change against the best policy without learning and with the
+            standard sensors, in the same scope and metric. It is chosen on the same episodes, which
+            favours it.
         step_us: Median time of the policy alone for a control step of one world [µs].
     """
 
@@ -81,8 +86,8 @@ def standings(
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
-    Columns are, for each motion, the groups whose scenarios are all played with it, and the scenarios that are in none
-    of these groups.
+    Columns are, for each motion, the groups whose scenarios are all played with it, and the
+    scenarios that are in none of these groups.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -109,7 +114,11 @@ def standings(
         rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            rival = _against_the_best(pairings, scope, column, rivals.get(scope.name, [])) if members else None
+            rival = (
+                _against_the_best(pairings, scope, column, rivals.get(scope.name, []))
+                if members
+                else None
+            )
             found.append(
                 Standing(
                     track=condition.track,
@@ -159,24 +168,41 @@ class _Scope:
 
 
 def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
-    """Scenarios and whole groups of every policy and motion, in the order of policies and motions."""
+    """Scenarios and whole groups of every policy and motion, in the order of policies and
+    motions.
+    """
     found = []
     for policy in table.policies:
         for reference in table.references:
-            own = {table.conditions[policy, cell].scenario: cell for cell in table.cells_of(policy, reference)}
-            whole = {name: parts for name, parts in groups.items() if all(part in own for part in parts)}
+            own = {
+                table.conditions[policy, cell].scenario: cell
+                for cell in table.cells_of(policy, reference)
+            }
+            whole = {
+                name: parts for name, parts in groups.items() if all(part in own for part in parts)
+            }
             in_groups = {part for parts in whole.values() for part in parts}
             for name, parts in whole.items():
                 cells = [own[part] for part in parts]
-                found.append(_Scope(policy, reference, name, is_group=True, is_column=True, cells=cells))
+                found.append(
+                    _Scope(policy, reference, name, is_group=True, is_column=True, cells=cells)
+                )
             for name, cell in own.items():
                 is_column = name not in in_groups
-                found.append(_Scope(policy, reference, name, is_group=False, is_column=is_column, cells=[cell]))
+                found.append(
+                    _Scope(
+                        policy, reference, name, is_group=False, is_column=is_column, cells=[cell]
+                    )
+                )
     return found
 
 
-def _against_the_best(pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]) -> Paired | None:
-    """A residual against the best of some policies in this scope and metric; None where none has a score."""
+def _against_the_best(
+    pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]
+) -> Paired | None:
+    """A residual against the best of some policies in this scope and metric; None where none has
+    a score.
+    """
     played = {rival.policy: pairings.table.of(rival.policy, *rival.cells) for rival in rivals}
     best = best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
     if best is None:

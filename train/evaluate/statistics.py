@@ -1,10 +1,13 @@
-"""Statistics over training seeds: paired changes, interquartile means, bootstrap intervals, probability of improvement.
+"""Statistics over training seeds: paired changes, interquartile means, bootstrap intervals,
+probability of improvement.
 
-What is drawn at random in learning is the training seed, so intervals are over training seeds and never over the
-episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its base on the same episodes.
+What is drawn at random in learning is the training seed, so intervals are over training seeds and
+never over the episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its
+base on the same episodes.
 
-[Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS.
-[Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons of Reinforcement Learning Algorithms".
+[Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
+Precipice", NeurIPS. [Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons
+of Reinforcement Learning Algorithms".
 """
 
 from collections.abc import Sequence
@@ -29,7 +32,8 @@ class Estimate:
 
     Attributes:
         value: The figure; nan where there is none.
-        low, high: 95 % interval over training seeds; None where fewer than two of them have the figure.
+        low, high: 95 % interval over training seeds; None where fewer than two of them have the
+            figure.
     """
 
     value: float
@@ -73,11 +77,13 @@ def change(mine: Array, base: Array) -> Array:
     """Relative change of every training seed: mean over scenarios, against the base's, minus one.
 
     Args:
-        mine: Means of a metric over episodes, (seeds, scenarios); nan where there is no pair of episodes.
+        mine: Means of a metric over episodes, (seeds, scenarios); nan where there is no pair of
+            episodes.
         base: The base's means over the same episodes, (seeds, scenarios).
 
     Returns:
-        (seeds,); nan where a scenario has no pair: without it the mean would be one over other scenarios.
+        (seeds,); nan where a scenario has no pair: without it the mean would be one over other
+        scenarios.
     """
     mine = np.mean(mine, axis=-1)
     base = np.mean(base, axis=-1)
@@ -96,10 +102,11 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
 def worst_share_mean(values: Array, share: float = WORST) -> float:
     """Mean of the highest share of some values, their CVaR [Rockafellar2000]; nan of none.
 
-    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of fewer than ten is the
-    highest.
+    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of
+    fewer than ten is the highest.
 
-    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J. Risk 2(3).
+    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J.
+    Risk 2(3).
     """
     if len(values) == 0:
         return float("nan")
@@ -130,18 +137,21 @@ def over_seeds(values: Sequence[float] | Array) -> Estimate:
 
 
 def improvement(won: Array, played: Array) -> Estimate:
-    """Probability that an episode with the policy is better (lower) than the same with the base; ties count half.
+    """Probability that an episode with the policy is better (lower) than the same with the base;
+    ties count half.
 
     Args:
         won: Pairs of episodes in which the policy is better, (seeds, scenarios).
         played: Pairs of episodes, (seeds, scenarios).
 
     Returns:
-        Share of all pairs of training seed and episode, with an interval over training seeds. As in `change`, seeds
-        count that have pairs in every scenario.
+        Share of all pairs of training seed and episode, with an interval over training seeds. As in
+        `change`, seeds count that have pairs in every scenario.
     """
     whole = (played > 0).all(axis=1)
-    both = sorted(zip(won[whole].sum(axis=1).tolist(), played[whole].sum(axis=1).tolist(), strict=True))
+    both = sorted(
+        zip(won[whole].sum(axis=1).tolist(), played[whole].sum(axis=1).tolist(), strict=True)
+    )
     if not both:
         return Estimate(float("nan"))
     samples = np.array(both, dtype=np.float64).T
@@ -152,7 +162,9 @@ def improvement(won: Array, played: Array) -> Estimate:
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Percentile bootstrap over training seeds; the same samples, sorted, give the same interval."""
+    """Percentile bootstrap over training seeds; the same samples, sorted, give the same
+    interval.
+    """
     from scipy import (
         stats,
     )  # here: it takes half a second to load, and most programs need none of it

@@ -1,12 +1,13 @@
 r"""Errors of a policy's local frame where the support foot changes, against the truth.
 
-The local frame of a walking controller stands at the sole of the support foot, where joint angles and IMU put it
-(section II.B of the paper). Where joints give way, it is off by the vector e; for a deflection δ of the hip roll joint
-alone (the paper's θ), with leg length L, that is Eq. 1:
+The local frame of a walking controller stands at the sole of the support foot, where joint angles
+and IMU put it (section II.B of the paper). Where joints give way, it is off by the vector e; for a
+deflection δ of the hip roll joint alone (the paper's θ), with leg length L, that is Eq. 1:
 
 .. math:: e = L \, [0, \; 2 \sin(δ/2) \cos(δ/2), \; 2 \sin²(δ/2)]
 
-Where the support foot changes, the frame is taken anew from the other foot, and the estimated center of mass jumps.
+Where the support foot changes, the frame is taken anew from the other foot, and the estimated
+center of mass jumps.
 
 Axes are level and have the heading of the pelvis, which no sensor of the robot shows.
 """
@@ -35,12 +36,15 @@ def tilt(R: Array) -> Array:
 
 
 def frame_error(estimate: LocalFrame, true: LocalFrame, foot: int) -> Array:
-    """e: where a foot's sole seems to be, relative to the pelvis, minus where it is, (num_worlds, 3) [m]."""
+    """e: where a foot's sole seems to be, relative to the pelvis, minus where it is,
+    (num_worlds, 3) [m].
+    """
     return estimate.soles[:, foot] - true.soles[:, foot]
 
 
 def com_jump(estimate: LocalFrame, footholds: Array, old: int, new: int) -> Array:
-    """Jump of the estimated center of mass where the frame goes from one foot to the other, (num_worlds, 3) [m].
+    """Jump of the estimated center of mass where the frame goes from one foot to the other,
+    (num_worlds, 3) [m].
 
     Args:
         estimate: Local frame by the policy's joint angles.

@@ -18,15 +18,16 @@ from train.evaluate.statistics import Estimate, over_seeds
 class EpisodeTable:
     """All episodes of a comparison.
 
-    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have numbers.
+    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have
+    numbers.
 
     Args:
         evaluations: All cells, one per training seed.
 
     Attributes:
-        rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a policy
-            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the metrics
-            [SI], nan where the episode failed.
+        rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a
+            policy that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the
+            metrics [SI], nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.
@@ -54,11 +55,16 @@ class EpisodeTable:
                 "scenario": condition.scenario,
                 "cell": cell,
             }
-            records += [{**episode, **labels, "failed": bool(episode["termination"])} for episode in e.episodes]
+            records += [
+                {**episode, **labels, "failed": bool(episode["termination"])}
+                for episode in e.episodes
+            ]
         self.rows = pd.DataFrame(records)
         for metric in self._metrics:
             values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
-            self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(~self.rows["failed"])
+            self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(
+                ~self.rows["failed"]
+            )
 
     @property
     def _metrics(self) -> set[str]:
@@ -96,12 +102,18 @@ class EpisodeTable:
         """The first condition of a policy."""
         return next(c for (title, _), c in self.conditions.items() if title == policy)
 
-    def cells_of(self, policy: str, reference: str | None = None, scenario: str | None = None) -> list[int]:
-        """Numbers of the cells that a policy plays, with a motion and in a scenario where these are given."""
+    def cells_of(
+        self, policy: str, reference: str | None = None, scenario: str | None = None
+    ) -> list[int]:
+        """Numbers of the cells that a policy plays, with a motion and in a scenario where these
+        are given.
+        """
         return [
             cell
             for (title, cell), c in self.conditions.items()
-            if title == policy and reference in (None, c.reference_name) and scenario in (None, c.scenario)
+            if title == policy
+            and reference in (None, c.reference_name)
+            and scenario in (None, c.scenario)
         ]
 
     def of(self, policy: str, *cells: int) -> pd.DataFrame:
@@ -121,8 +133,12 @@ def means(values: pd.Series) -> float:
     return float(known.mean()) if len(known) else float("nan")
 
 
-def per_seed(rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], float] = means) -> Array:
-    """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of the rows."""
+def per_seed(
+    rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], float] = means
+) -> Array:
+    """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of
+    the rows.
+    """
     parts: Any = rows.groupby(["member", "cell"])[metric]
     found = {key: statistic(own) for key, own in parts}
     members = rows["member"].unique()
@@ -130,8 +146,11 @@ def per_seed(rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], f
     return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
 
 
-def score(rows: pd.DataFrame, column: Column, statistic: Callable[[pd.Series], float] = means) -> Estimate:
-    """Mean over cells of a metric of one policy [SI]; of several training seeds the interquartile mean.
+def score(
+    rows: pd.DataFrame, column: Column, statistic: Callable[[pd.Series], float] = means
+) -> Estimate:
+    """Mean over cells of a metric of one policy [SI]; of several training seeds the interquartile
+    mean.
 
     Args:
         rows: Rows of one policy in one or several cells.
@@ -142,7 +161,9 @@ def score(rows: pd.DataFrame, column: Column, statistic: Callable[[pd.Series], f
 
 
 def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
-    """An estimate from one value per training seed; of a policy that was not trained it is the value."""
+    """An estimate from one value per training seed; of a policy that was not trained it is the
+    value.
+    """
     return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
 
 

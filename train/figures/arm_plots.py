@@ -1,4 +1,6 @@
-"""Figure of an arm's identification: measured and predicted deflections, joint by joint, and the residuals."""
+"""Figure of an arm's identification: measured and predicted deflections, joint by joint, and the
+residuals.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ _LINE = "#888888"
 
 
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
-    """A panel per joint with measured against predicted deflection, and one with the residual of every pose.
+    """A panel per joint with measured against predicted deflection, and one with the residual of
+    every pose.
 
-    Measured is the predicted deflection and the part of the residual that a deflection of this joint alone explains.
+    Measured is the predicted deflection and the part of the residual that a deflection of this
+    joint alone explains.
     """
     plt = require_matplotlib()
     rows = -(-(len(result.joints) + 1) // _COLUMNS)
@@ -42,7 +46,9 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
 
 
 def deflections(fit: ArmFit) -> tuple[Array, Array]:
-    """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose does not show one."""
+    """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose
+    does not show one.
+    """
     model = fit.model
     elastic = fit.model.unknowns.elastic
     compliance, _ = fit.estimate("compliance")
@@ -69,7 +75,9 @@ def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
         )
         return
     axis.axline((0.0, 0.0), slope=1.0, color=_LINE, lw=0.9)
-    axis.scatter(MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3)
+    axis.scatter(
+        MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3
+    )
 
 
 def _draw_residuals(axis: Any, fit: ArmFit) -> None:
@@ -79,7 +87,9 @@ def _draw_residuals(axis: Any, fit: ArmFit) -> None:
     for column, name in zip(fit.residual.T, _names(fit), strict=True):
         axis.plot(poses, factor * column, ".", ms=4, label=name)
     axis.axhline(0.0, color=_LINE, lw=0.8)
-    axis.set_title(f"residual [{shown}] by pose\nspread {factor * fit.spread:.3g} {shown}", fontsize=9)
+    axis.set_title(
+        f"residual [{shown}] by pose\nspread {factor * fit.spread:.3g} {shown}", fontsize=9
+    )
     if len(_names(fit)) <= _MOST_NAMED:
         axis.legend(fontsize=7, ncols=3, handletextpad=0.1, columnspacing=0.6, loc="upper right")
     else:

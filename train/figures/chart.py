@@ -1,4 +1,7 @@
-"""A chart as data: panels of curves over one axis. Pictures and the page of a report draw the same charts."""
+"""A chart as data: panels of curves over one axis.
+
+Pictures and the page of a report draw the same charts.
+"""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -109,7 +112,8 @@ def time_chart(
     colours: Mapping[str, str],
     most_points: int | None = None,
 ) -> Chart:
-    """Signals of the first episodes over time; of several training seeds the median and the band around all.
+    """Signals of the first episodes over time; of several training seeds the median and the band
+    around all.
 
     The scale is that of the walks that go on: what happens shortly before a fall leaves the chart.
 
@@ -130,7 +134,9 @@ def time_chart(
             curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
         if signal.reference is not None:
             reference = signal.scale * longest[signal.reference][::stride]
-            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, dash="dash", width=1.1))
+            curves.append(
+                Curve("reference", REFERENCE, time_s[::stride], reference, dash="dash", width=1.1)
+            )
         limits = _limits([e for own in policies.values() for e in own], signal)
         panels.append(Panel(signal.label, curves, limits))
     shaded = intervals(longest["single_support"], time_s) if "single_support" in longest else []
@@ -198,7 +204,8 @@ def sweep_chart(
     colours: Mapping[str, str],
     statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
 ) -> Chart:
-    """Scores over what is swept, a curve per policy with its interval, or a level; on top, who fails where.
+    """Scores over what is swept, a curve per policy with its interval, or a level; on top, who
+    fails where.
 
     Args:
         cells: Evaluations by policy and value.
@@ -213,8 +220,13 @@ def sweep_chart(
         curves = []
         for title, own in cells.items():
             is_level = None in own
-            x = np.array([values[0], values[-1]] if is_level else [value for value in values if value in own])
-            found = [statistic(own[None if is_level else value], column).times(column.scale) for value in x.tolist()]
+            x = np.array(
+                [values[0], values[-1]] if is_level else [value for value in values if value in own]
+            )
+            found = [
+                statistic(own[None if is_level else value], column).times(column.scale)
+                for value in x.tolist()
+            ]
             ends = np.array([estimate.ends for estimate in found]).T
             curve = Curve(
                 title,
@@ -263,8 +275,12 @@ def _failing(
     return Failing(title, colour, list(shares), list(shares.values()))
 
 
-def learning_chart(learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]) -> Chart:
-    """Share of the base's score on the way of a training: median over training seeds, band from least to most."""
+def learning_chart(
+    learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]
+) -> Chart:
+    """Share of the base's score on the way of a training: median over training seeds, band from
+    least to most.
+    """
     panels = []
     for column in columns:
         curves = []
@@ -272,16 +288,24 @@ def learning_chart(learning: Mapping[str, Curves], columns: Sequence[Column], co
             low, middle, high = spread(found.ratios[column.metric])
             x = found.decisions
             band = (low, high) if len(found.ratios[column.metric]) > 1 else None
-            curves.append(Curve(title, colours[title], x, middle, band=band, width=2.0, has_points=True))
+            curves.append(
+                Curve(title, colours[title], x, middle, band=band, width=2.0, has_points=True)
+            )
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
-        top = max(float(np.nanmax(found.ratios[column.metric], initial=1.0)) for found in learning.values())
+        top = max(
+            float(np.nanmax(found.ratios[column.metric], initial=1.0))
+            for found in learning.values()
+        )
         curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
-        panels.append(Panel(f"{column.title}, share of the base's", curves, (0.0, 1.08 * min(top, 2.0))))
+        panels.append(
+            Panel(f"{column.title}, share of the base's", curves, (0.0, 1.08 * min(top, 2.0)))
+        )
     return Chart("", "decisions of all worlds", panels, panel_height=260)
 
 
 def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
-    """Metrics over the trials of a policy that learns on the robot: a thin line per robot, and their mean.
+    """Metrics over the trials of a policy that learns on the robot: a thin line per robot, and
+    their mean.
 
     Args:
         trials: `baselines.adaptation.iterative.Trial`, in order, the first without offsets.
@@ -292,11 +316,15 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
     failed = np.array([trial.failed for trial in trials])
     panels = []
     for column in columns:
-        values = column.scale * np.array([[own[column.metric] for own in trial.metrics] for trial in trials])
+        values = column.scale * np.array(
+            [[own[column.metric] for own in trial.metrics] for trial in trials]
+        )
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
         means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
         curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
-        panels.append(Panel(column.label, curves, (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))))
+        panels.append(
+            Panel(column.label, curves, (0.0, 1.05 * float(np.nanmax(values, initial=1e-9))))
+        )
     return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))

@@ -1,4 +1,6 @@
-"""The pictures of a comparison: which are drawn, what they show, and what their files are called."""
+"""The pictures of a comparison: which are drawn, what they show, and what their files are
+called.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -56,7 +58,10 @@ def draw_figures(
     """
     cells = cells_together(evaluations)
     if swept is not None:
-        return [draw_sweep(own, by_option(own), swept, folder / f"sweep_{_stem(own[0])}.png") for own in cells]
+        return [
+            draw_sweep(own, by_option(own), swept, folder / f"sweep_{_stem(own[0])}.png")
+            for own in cells
+        ]
     known = evaluations[0].condition.environment
     files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
     for scenario in swept_scenarios(evaluations):
@@ -72,7 +77,10 @@ def draw_figures(
 
 def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    return [draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png") for found in maps]
+    return [
+        draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png")
+        for found in maps
+    ]
 
 
 def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
@@ -102,11 +110,15 @@ def paper_figure(name: str, condition: Condition) -> int | None:
 
 def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    return list(group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values())
+    return list(
+        group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values()
+    )
 
 
 def by_option(evaluations: Sequence[Evaluation]) -> Cells:
-    """Evaluations of every policy by the value of the swept option; None for a policy that was not swept."""
+    """Evaluations of every policy by the value of the swept option; None for a policy that was
+    not swept.
+    """
     return {
         title: group_by(own, lambda e: next(iter(e.condition.swept.values()), None))
         for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()
@@ -129,7 +141,9 @@ def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
-    """True if the references are points of one axis: enough of them have a number, and each one of its own."""
+    """True if the references are points of one axis: enough of them have a number, and each one
+    of its own.
+    """
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
@@ -158,7 +172,9 @@ def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 
 def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Roll and pitch of the pelvis, which should be level, one line per policy, as Figs. 7 and 8 of the paper."""
+    """Roll and pitch of the pelvis, which should be level, one line per policy, as Figs. 7 and 8
+    of the paper.
+    """
     chart = _over_time(evaluations, _PELVIS, _walk_title(evaluations, "pelvis", "Pelvis error"))
     if paper_figure("pelvis", evaluations[0].condition) is None:
         return draw_chart(chart, path)
@@ -180,10 +196,14 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
-    return draw_chart(_over_time(evaluations, _ZMP, _walk_title(evaluations, "zmp", "Zero moment point")), path)
+    return draw_chart(
+        _over_time(evaluations, _ZMP, _walk_title(evaluations, "zmp", "Zero moment point")), path
+    )
 
 
-def _over_time(evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = "") -> Chart:
+def _over_time(
+    evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = ""
+) -> Chart:
     policies = {e.condition.policy.title: [e] for e in evaluations}
     return replace(time_chart(policies, signals, policy_colours(list(policies))), title=title)
 

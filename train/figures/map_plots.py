@@ -1,4 +1,6 @@
-"""Heat maps as panels of coloured squares with text: the same for the report's page and for pictures."""
+"""Heat maps as panels of coloured squares with text: the same for the report's page and for
+pictures.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -71,10 +73,14 @@ class Panel:
 
 
 def panels(heat_map: HeatMap) -> list[Panel]:
-    """Who is best, every residual against the best policy without learning, and the score of every policy."""
+    """Who is best, every residual against the best policy without learning, and the score of
+    every policy.
+    """
     column = heat_map.column
     shades = policy_colours(heat_map.policies)
-    letters = dict(zip(heat_map.policies, ascii_uppercase, strict=False))  # a map with more would not be readable
+    letters = dict(
+        zip(heat_map.policies, ascii_uppercase, strict=False)
+    )  # a map with more would not be readable
     key = tuple((letters.get(title, "?"), title, shades[title]) for title in heat_map.policies)
     many = len({cell.best_analytic for cell in heat_map.flat} - {None}) > 1
     found = [
@@ -94,7 +100,12 @@ def panels(heat_map: HeatMap) -> list[Panel]:
                 lambda c, t=title: _change_square(c.learned.get(t), letters if many else {}),
             )
         )
-    levels = [e.value for cell in heat_map.flat for e in cell.levels.values() if np.isfinite(e.value) and e.value > 0.0]
+    levels = [
+        e.value
+        for cell in heat_map.flat
+        for e in cell.levels.values()
+        if np.isfinite(e.value) and e.value > 0.0
+    ]
     ends = (min(levels), max(levels)) if levels else (1.0, 1.0)
     for title in heat_map.policies:
         found.append(
@@ -122,7 +133,9 @@ def draw_map(heat_map: HeatMap, path: Path) -> Path:
     return save(figure, path)
 
 
-def _panel(heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
+def _panel(
+    heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], **more: Any
+) -> Panel:
     return Panel(
         title=title,
         x_label=heat_map.x.title,
@@ -134,7 +147,9 @@ def _panel(heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], *
     )
 
 
-def _best_square(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]) -> Square:
+def _best_square(
+    cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]
+) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
     value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
@@ -184,7 +199,9 @@ def _decimals(column: Column) -> int:
 
 def blend(colour: str, share: float) -> str:
     """A colour on white, of which it covers a share."""
-    return "#" + "".join(f"{round(share * part + (1.0 - share) * 255):02x}" for part in _rgb(colour))
+    return "#" + "".join(
+        f"{round(share * part + (1.0 - share) * 255):02x}" for part in _rgb(colour)
+    )
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
@@ -192,13 +209,19 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 def _draw_panel(axis: Any, panel: Panel) -> None:
-    pixels = np.array([[_rgb(square.colour) for square in row] for row in panel.squares], dtype=np.uint8)
+    pixels = np.array(
+        [[_rgb(square.colour) for square in row] for row in panel.squares], dtype=np.uint8
+    )
     axis.imshow(pixels, origin="lower", aspect="auto")
     for y, row in enumerate(panel.squares):
         for x, square in enumerate(row):
             lift = 0.16 if square.small else 0.0
-            axis.text(x, y + lift, square.text, ha="center", va="center", color=square.ink, fontsize=10)
-            axis.text(x, y - 0.24, square.small, ha="center", va="center", color=square.ink, fontsize=7.5)
+            axis.text(
+                x, y + lift, square.text, ha="center", va="center", color=square.ink, fontsize=10
+            )
+            axis.text(
+                x, y - 0.24, square.small, ha="center", va="center", color=square.ink, fontsize=7.5
+            )
     axis.set_xticks(range(len(panel.x_ticks)), panel.x_ticks)
     axis.set_yticks(range(len(panel.y_ticks)), panel.y_ticks)
     axis.set_xlabel(_wrap(panel.x_label))
@@ -233,6 +256,10 @@ def _wrap(text: str, width: int = 52) -> str:
 
 def panel_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
     """Head and rows of a panel as a table, the greatest y first."""
-    rows: Sequence[tuple[str, Sequence[Square]]] = list(zip(panel.y_ticks, panel.squares, strict=True))[::-1]
+    rows: Sequence[tuple[str, Sequence[Square]]] = list(
+        zip(panel.y_ticks, panel.squares, strict=True)
+    )[::-1]
     head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]
-    return head, [[tick, *(" ".join(filter(None, (s.text, s.small))) for s in row)] for tick, row in rows]
+    return head, [
+        [tick, *(" ".join(filter(None, (s.text, s.small))) for s in row)] for tick, row in rows
+    ]

@@ -1,4 +1,6 @@
-"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a whole comparison."""
+"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a whole
+comparison.
+"""
 
 import io
 from collections.abc import Sequence
@@ -113,7 +115,9 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)
-    figure.legend(once.values(), once.keys(), ncols=columns_of(len(once)), loc="outside lower center")
+    figure.legend(
+        once.values(), once.keys(), ncols=columns_of(len(once)), loc="outside lower center"
+    )
     return save(figure, path)
 
 
@@ -143,8 +147,12 @@ def _draw_failing(axis: Any, chart: Chart) -> None:
     for row, policy in enumerate(reversed(chart.failing)):
         faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
         places = np.full(len(policy.x), row)
-        axis.scatter(policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0)
-    axis.set_yticks(range(len(chart.failing)), [policy.name for policy in reversed(chart.failing)], fontsize=8)
+        axis.scatter(
+            policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0
+        )
+    axis.set_yticks(
+        range(len(chart.failing)), [policy.name for policy in reversed(chart.failing)], fontsize=8
+    )
     axis.set_ylim(-0.7, len(chart.failing) - 0.3)
     axis.set_ylabel(chart.failure)
     axis.tick_params(axis="x", length=0)
@@ -161,9 +169,11 @@ def _show_numbers(axis: Any) -> None:
 
 
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
-    """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel with all references.
+    """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel
+    with all references.
 
-    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
+    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
+    failed.
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
@@ -174,7 +184,9 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
         reference = evaluation.condition.reference_name
         scenario = evaluation.condition.scenario
         outer, inner = (
-            (f"scenario {scenario}", reference) if len(scenarios) == 1 else (known.title(reference), scenario)
+            (f"scenario {scenario}", reference)
+            if len(scenarios) == 1
+            else (known.title(reference), scenario)
         )
         panels.setdefault(outer, {}).setdefault(inner, []).append(evaluation)
     width = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * max(map(len, panels.values())))
@@ -206,11 +218,15 @@ _ROOMY = 7
 """From so many bars in a group on, the name of the group has room below it."""
 
 
-def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]) -> None:
+def _draw_bars(
+    axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]
+) -> None:
     """A bar per policy in every group."""
     width = 0.84 / len(policies)
     shades = policy_colours(policies)
-    for place, evaluation in ((place, e) for place, group in enumerate(groups.values()) for e in group):
+    for place, evaluation in (
+        (place, e) for place, group in enumerate(groups.values()) for e in group
+    ):
         policy = evaluation.condition.policy.title
         index = policies.index(policy)
         x = place + (index - (len(policies) - 1) / 2) * width
@@ -218,7 +234,9 @@ def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, p
         shade = shades[policy]
         axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
         if len(evaluation.episodes) > 1:
-            axis.scatter(np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3)
+            axis.scatter(
+                np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3
+            )
         if evaluation.num_failed:
             shown = {
                 "color": shade if len(values) == 0 else FAILED,
@@ -233,10 +251,17 @@ def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, p
     axis.grid(axis="x", visible=False)
 
 
-def _legend(figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int) -> None:
+def _legend(
+    figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int
+) -> None:
     """Policies, and the mark of failures if there are any."""
-    handles = [axis.bar(np.nan, 0.0, color=shade, label=policy) for policy, shade in policy_colours(policies).items()]
+    handles = [
+        axis.bar(np.nan, 0.0, color=shade, label=policy)
+        for policy, shade in policy_colours(policies).items()
+    ]
     if any(evaluation.num_failed for evaluation in evaluations):
         failure = evaluations[0].condition.environment.failure
         handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
-    figure.legend(handles=handles, ncols=columns_of(len(handles), per_row), loc="outside lower center")
+    figure.legend(
+        handles=handles, ncols=columns_of(len(handles), per_row), loc="outside lower center"
+    )

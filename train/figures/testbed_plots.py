@@ -1,4 +1,7 @@
-"""Figures of the testbed. Angles are drawn in mrad; every function writes one file and returns its path."""
+"""Figures of the testbed.
+
+Angles are drawn in mrad; every function writes one file and returns its path.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,12 +21,20 @@ _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
 
 
-def draw_identification(result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path) -> Path:
-    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the residuals."""
+def draw_identification(
+    result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path
+) -> Path:
+    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the
+    residuals.
+    """
     plt = require_matplotlib()
-    torque = link_torque(points, [make_gravity(model) for model in models], result.link_angles(points))
+    torque = link_torque(
+        points, [make_gravity(model) for model in models], result.link_angles(points)
+    )
     deflection = points.theta - points.q
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(3, 1.2))
+    figure, (top, bottom) = plt.subplots(
+        2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(3, 1.2)
+    )
     line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
     for direction, marker, face, label in (
         (1, "^", "#2a6f97", "approached from below"),
@@ -44,7 +55,9 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
         if result.imu_sine_error_rad is not None:
             residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
         bottom.scatter(torque[chosen], MRAD * residual, zorder=3, **style)
-    plain = line / result.line_stiffness_nm_per_rad + np.mean(deflection - torque / result.line_stiffness_nm_per_rad)
+    plain = line / result.line_stiffness_nm_per_rad + np.mean(
+        deflection - torque / result.line_stiffness_nm_per_rad
+    )
     top.plot(
         line,
         MRAD * plain,
@@ -53,7 +66,9 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
         ls=":",
         label=f"plain line, K = {result.line_stiffness_nm_per_rad:.1f}",
     )
-    top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
+    top.set_title(
+        f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}"
+    )
     top.text(
         0.03,
         0.95,
@@ -110,7 +125,9 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
 
 
 def static_errors(evaluation: Evaluation) -> Array:
-    """Link error by the IMU, averaged over each window at rest of the first episode, (visits,) [rad]."""
+    """Link error by the IMU, averaged over each window at rest of the first episode, (visits,)
+    [rad].
+    """
     points = evaluation.points
     assert points is not None
     references = evaluation.rest_references
@@ -119,7 +136,11 @@ def static_errors(evaluation: Evaluation) -> Array:
 
 def _fit_line(result: Identification, torque: Array, direction: int) -> Array:
     load = torque + direction * result.friction_nm
-    return load / result.stiffness_nm_per_rad + np.sign(load) * result.dead_band_rad / 2.0 + result.offset_rad
+    return (
+        load / result.stiffness_nm_per_rad
+        + np.sign(load) * result.dead_band_rad / 2.0
+        + result.offset_rad
+    )
 
 
 def _interval(result: Identification) -> str:

@@ -1,6 +1,7 @@
 """Options of the learning algorithms: which there are, their bounds and meanings.
 
-A number beyond its bound would become nan, or fill the memory, in the midst of a training; it is refused before one.
+A number beyond its bound would become nan, or fill the memory, in the midst of a training; it is
+refused before one.
 """
 
 import re
@@ -38,8 +39,9 @@ def _network(*parts: str) -> Any:
         named = given if isinstance(given, dict) else dict.fromkeys(parts, given)
         if named.keys() != set(parts) or not all(_are_widths(widths) for widths in named.values()):
             raise ValueError(
-                f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <= {_WIDEST}, or a mapping "
-                f"of such lists by {' and '.join(parts)}, got {shown(given)}"
+                f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <="
+                f" {_WIDEST}, or a mapping of such lists by {' and '.join(parts)}, got"
+                f" {shown(given)}"
             )
         return given
 
@@ -55,13 +57,15 @@ def _entropy_weight(given: Any) -> Any:
     """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
     if isinstance(given, str):
         prefix, _, first = given.partition("_")
-        is_right = prefix == "auto" and re.fullmatch(r"|[0-9]{1,3}(\.[0-9]{1,9})?", first) is not None
+        is_right = (
+            prefix == "auto" and re.fullmatch(r"|[0-9]{1,3}(\.[0-9]{1,9})?", first) is not None
+        )
     else:
         is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
     if not is_right:
         raise ValueError(
-            f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn it, "
-            f"or such as auto_0.1 to begin with it, got {shown(given)}"
+            f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn"
+            f" it, or such as auto_0.1 to begin with it, got {shown(given)}"
         )
     return given
 
@@ -107,7 +111,10 @@ class _ActorCriticNetwork(_NetworkOptions):
 class _SACNetwork(_NetworkOptions):
     """Parameters of the networks of SAC."""
 
-    net_arch: _network("pi", "qf") = {"pi": [64, 64], "qf": [256, 256]}  # pyright: ignore[reportInvalidTypeForm]
+    net_arch: _network("pi", "qf") = {  # pyright: ignore[reportInvalidTypeForm]
+        "pi": [64, 64],
+        "qf": [256, 256],
+    }
     """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
     clip_mean: float = quantity("1", 2.0, ge=0, le=100)
     """Bound of the mean before tanh."""

@@ -1,7 +1,9 @@
-"""A checkpoint: a folder of files that is written whole or not at all, and read only if it is what was written.
+"""A checkpoint: a folder of files that is written whole or not at all, and read only if it is what
+was written.
 
-Its files are listed with their SHA-256 digests, which are checked before anything is loaded. A digest tells damage from
-a full disk or a failing one; it is no seal against somebody who writes both.
+Its files are listed with their SHA-256 digests, which are checked before anything is loaded. A
+digest tells damage from a full disk or a failing one; it is no seal against somebody who writes
+both.
 """
 
 import hashlib
@@ -20,9 +22,11 @@ _DIGESTS = "sha256.json"
 
 @contextmanager
 def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
-    """A fresh folder to write files to, which takes the checkpoint's place when all of them are on the disk.
+    """A fresh folder to write files to, which takes the checkpoint's place when all of them are on
+    the disk.
 
-    A kill between its steps loses nothing, once `recover_checkpoint` was called; a failure leaves the old one.
+    A kill between its steps loses nothing, once `recover_checkpoint` was called; a failure leaves
+    the old one.
     """
     fresh = _beside(checkpoint, "new")
     old = _beside(checkpoint, "old")
@@ -43,7 +47,9 @@ def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
 
 
 def recover_checkpoint(checkpoint: Path) -> bool:
-    """True if there is a checkpoint, after a kill between the moves of `write_checkpoint` as well."""
+    """True if there is a checkpoint, after a kill between the moves of `write_checkpoint` as
+    well.
+    """
     old = _beside(checkpoint, "old")
     if not checkpoint.exists() and old.exists():
         old.rename(checkpoint)
@@ -75,7 +81,8 @@ def require_whole(checkpoint: Path) -> None:
 def damage_error(checkpoint: Path, why: object) -> ElasticError:
     """The error of a checkpoint that cannot be gone on with."""
     return ElasticError(
-        f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to begin this seed anew"
+        f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to"
+        " begin this seed anew"
     )
 
 

@@ -1,7 +1,8 @@
-"""The cheap rival of a learned policy: constant residuals, found by CMA-ES on the same budget of decisions.
+"""The cheap rival of a learned policy: constant residuals, found by CMA-ES on the same budget of
+decisions.
 
-Constants know nothing of the phase of the walk nor of any measurement, but there is nothing to explore wrongly. What a
-policy gains over them is what it makes of what it sees.
+Constants know nothing of the phase of the walk nor of any measurement, but there is nothing to
+explore wrongly. What a policy gains over them is what it makes of what it sees.
 """
 
 import json
@@ -15,23 +16,33 @@ from baselines.residual.residual import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.learn.finite import require_finite
-from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
+from train.learn.train_config import (
+    FIRST_TRAINING_SEED,
+    TRAINING_SEED_STRIDE,
+    TrainConfig,
+    joints_of,
+    training_worlds,
+)
 from train.learn.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
 _TOLD = "told.json"
 _FALL_COST = 1e6
-"""Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its penalties."""
+"""Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its
+penalties.
+"""
 
 
 class ConstantSearch(Trainer):
     """One training seed of a search, in a folder of its own.
 
-    All candidates of a generation play the same episodes, as many in every scenario as the worlds allow, and are told
-    the mean sum of rewards; who falls comes behind all who do not. The policy is the mean of the distribution.
+    All candidates of a generation play the same episodes, as many in every scenario as the worlds
+    allow, and are told the mean sum of rewards; who falls comes behind all who do not. The policy
+    is the mean of the distribution.
 
     Args:
-        config: What is searched for; its algorithm_options may be population_size and sigma, in residuals.
+        config: What is searched for; its algorithm_options may be population_size and sigma, in
+            residuals.
         seed: Training seed.
         folder: Where its files go; one with a checkpoint is gone on with.
         threads: Threads of the physics, 0 for all cores; the result does not depend on it.
@@ -48,8 +59,8 @@ class ConstantSearch(Trainer):
         if episodes == 0:
             needed = len(config.scenarios) * self._population
             raise ConfigurationError(
-                f"CMA-ES needs a world for each of {self._population} candidates in each scenario, {needed}, "
-                f"got worlds: {config.worlds}"
+                f"CMA-ES needs a world for each of {self._population} candidates in each scenario,"
+                f" {needed}, got worlds: {config.worlds}"
             )
         self._episodes = episodes
         self._first = FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
@@ -100,7 +111,9 @@ class ConstantSearch(Trainer):
         self._told.append(costs.tolist())
 
     def _play(self, candidates: Array) -> Array:
-        """Cost of each candidate: minus its mean sum of rewards over an episode, and falls, (population,)."""
+        """Cost of each candidate: minus its mean sum of rewards over an episode, and falls,
+        (population,).
+        """
         n = self._worlds.num_envs
         scenarios = len(self.config.scenarios)
         generation = len(self._told)

@@ -8,14 +8,16 @@ from train.learn.sb3_env import SB3VecEnv
 
 _REWARD = "rollout/reward_per_decision"
 _MISLEADING = "rollout/ep_rew_mean"
-"""Sum of rewards of an episode: each is a penalty, so that an episode which ends early would look better."""
+"""Sum of rewards of an episode: each is a penalty, so that an episode which ends early would
+look better.
+"""
 
 
 class Curves(Logger):
     """SB3's logger with the reward per decision in the place of that per episode.
 
-    It is the mean over the last whole episodes. Those that were cut short to spread the worlds over the motion do not
-    count, since their decisions are of its beginning alone.
+    It is the mean over the last whole episodes. Those that were cut short to spread the worlds over
+    the motion do not count, since their decisions are of its beginning alone.
 
     Args:
         folder: Of TensorBoard's files.
@@ -39,7 +41,9 @@ class Curves(Logger):
         super().dump(step)
 
     def finish(self, step: int) -> None:
-        """Write the reward per decision of the present episodes, where no whole one came to its end."""
+        """Write the reward per decision of the present episodes, where no whole one came to its
+        end.
+        """
         reward = self._worlds.reward_per_decision
         if not self._model.ep_info_buffer and reward is not None:
             self.record(_REWARD, reward)

@@ -1,4 +1,6 @@
-"""Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without torch."""
+"""Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without
+torch.
+"""
 
 import pickle
 from pathlib import Path
@@ -19,7 +21,9 @@ from train.runs.folders import provenance
 Tensors = dict[str, npt.NDArray[Any]]
 
 
-def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, str, Literal["clip", "tanh"]]:
+def network_of(
+    model: BaseAlgorithm, normaliser: Any | None
+) -> tuple[Tensors, str, Literal["clip", "tanh"]]:
     """Weights, activation and output of the network that a model acts by deterministically.
 
     Args:
@@ -37,12 +41,16 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
         layers = [*policy.actor.latent_pi, policy.actor.mu]
         output = "tanh"
     else:
-        raise ConfigurationError(f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC")
+        raise ConfigurationError(
+            f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC"
+        )
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     activations = {type(layer) for layer in layers if not isinstance(layer, nn.Linear)}
     names = {nn.Tanh: "tanh", nn.ReLU: "relu"}
     if len(activations) != 1 or not activations <= set(names):
-        raise ConfigurationError(f"activations must be all Tanh or all ReLU, got {sorted(map(str, activations))}")
+        raise ConfigurationError(
+            f"activations must be all Tanh or all ReLU, got {sorted(map(str, activations))}"
+        )
     tensors: Tensors = {}
     for i, layer in enumerate(linear):
         tensors[f"weight{i}"] = layer.weight.detach().cpu().numpy().astype(np.float32)
@@ -56,7 +64,9 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
-    """The joints of the configuration's robot, once the widths of a network are what its residual sees and does."""
+    """The joints of the configuration's robot, once the widths of a network are what its
+    residual sees and does.
+    """
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
     sees = flatdim(worlds.single_observation_space)
     does = flatdim(worlds.single_action_space)
@@ -66,14 +76,18 @@ def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
     if given != (sees, does):
         raise ConfigurationError(
-            f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on {config.base} of the "
-            f"{config.env} with these settings sees {sees} and gives {does}"
+            f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on"
+            f" {config.base} of the {config.env} with these settings sees {sees} and gives {does}"
         )
     return joints
 
 
 def export_zip(
-    path: Path, config: TrainConfig, output: Path, normaliser: Path | None = None, trust_pickle: bool = False
+    path: Path,
+    config: TrainConfig,
+    output: Path,
+    normaliser: Path | None = None,
+    trust_pickle: bool = False,
 ) -> Path:
     """Turn a model that SB3 saved into a residual folder.
 
@@ -85,11 +99,13 @@ def export_zip(
         trust_pickle: Both are pickles, and loading a pickle runs code from it.
 
     Raises:
-        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the configuration.
+        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the
+            configuration.
     """
     if not trust_pickle:
         raise ConfigurationError(
-            f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if you trust its origin"
+            f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if"
+            " you trust its origin"
         )
     for file in (path, normaliser):
         if file is not None and not file.is_file():
@@ -102,9 +118,15 @@ def export_zip(
         raise
     except Exception as error:  # whatever a pickle of something else leads to
         files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
-        raise ConfigurationError(f"{files} is no model that SB3's {config.algorithm} saved: {error}") from error
+        raise ConfigurationError(
+            f"{files} is no model that SB3's {config.algorithm} saved: {error}"
+        ) from error
     joints = _joints_that_fit(tensors, config)
-    training = {"config": config.model_dump(mode="json"), **provenance(None), "exported_from": path.name}
+    training = {
+        "config": config.model_dump(mode="json"),
+        **provenance(None),
+        "exported_from": path.name,
+    }
     description = config.description(joints, activation=activation, output=kind, training=training)
     save_residual(output, description, tensors)
     return output

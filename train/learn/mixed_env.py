@@ -1,4 +1,6 @@
-"""Several vector environments as one: worlds of scenarios that cannot share one, under one policy."""
+"""Several vector environments as one: worlds of scenarios that cannot share one, under one
+policy.
+"""
 
 import os
 from collections.abc import Callable, Sequence
@@ -23,20 +25,21 @@ from train.evaluate.rollout import make_shared_env, shared_settings
 class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The worlds of several vector environments, one environment's after the other's.
 
-    A policy costs hardly more for all of them than for those of one. The environments step side by side on threads,
-    while the physics of one runs without Python: give each one thread of physics, and more to those for which no other
-    is left to step beside. The results do not depend on it.
+    A policy costs hardly more for all of them than for those of one. The environments step side by
+    side on threads, while the physics of one runs without Python: give each one thread of physics,
+    and more to those for which no other is left to step beside. The results do not depend on it.
 
     Worlds that end are begun anew by who wraps this, with options["reset_mask"].
 
     Args:
-        envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in different scenarios.
+        envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in
+            different scenarios.
         num_threads: Environments that step at a time, 0 for as many as there are cores.
         weights: Factor of every world's rewards; None for equal ones.
 
     Raises:
-        ConfigurationError: None, different observations, tasks, motions or assumed joints, another autoreset mode, or
-            not one weight per world.
+        ConfigurationError: None, different observations, tasks, motions or assumed joints, another
+            autoreset mode, or not one weight per world.
     """
 
     def __init__(
@@ -51,15 +54,22 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         for env in self.envs:
             if env.autoreset_mode is not AutoresetMode.DISABLED:
                 mode = env.autoreset_mode.value
-                raise ConfigurationError(f"all environments of a mixture must have autoreset_mode Disabled, got {mode}")
+                raise ConfigurationError(
+                    f"all environments of a mixture must have autoreset_mode Disabled, got {mode}"
+                )
             if env.single_observation_space != self.envs[0].single_observation_space:
-                raise ConfigurationError("all environments of a mixture must have the same observation")
+                raise ConfigurationError(
+                    "all environments of a mixture must have the same observation"
+                )
             if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
-                raise ConfigurationError("all environments of a mixture must have the same task and motion")
+                raise ConfigurationError(
+                    "all environments of a mixture must have the same task and motion"
+                )
             if env.assumed_model.joints != self.assumed_model.joints:
                 raise ConfigurationError(
-                    "all environments of a mixture must let a policy assume the same joints: give them the same "
-                    'stiffness, and keep scenarios with "ideal", where no friction is assumed, apart from the others'
+                    "all environments of a mixture must let a policy assume the same joints: give"
+                    ' them the same stiffness, and keep scenarios with "ideal", where no friction'
+                    " is assumed, apart from the others"
                 )
         self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
         sizes = [env.num_envs for env in envs]
@@ -68,7 +78,9 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.num_envs = ends[-1]
         self._weights = np.ones(self.num_envs) if weights is None else np.array(weights)
         if self._weights.shape != (self.num_envs,):
-            raise ConfigurationError(f"weights must be one per world, {self.num_envs}, got {len(self._weights)}")
+            raise ConfigurationError(
+                f"weights must be one per world, {self.num_envs}, got {len(self._weights)}"
+            )
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space
@@ -88,12 +100,18 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         task: Task = self.envs[0].task
         return task
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world, or in those of options["reset_mask"].
 
         World i gets seed + i, or the i-th of a list of seeds.
         """
-        seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        seeds: Any = (
+            [int(seed) + i for i in range(self.num_envs)]
+            if isinstance(seed, int | np.integer)
+            else seed
+        )
         mask = reset_mask(options, self.num_envs)
 
         def begun(env: Any, worlds: slice) -> Array:
@@ -105,7 +123,9 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return np.concatenate(self._side_by_side(begun)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step in every world; the info is that of worlds that end: `termination` and `episode_metrics`."""
+        """One step in every world; the info is that of worlds that end: `termination` and
+        `episode_metrics`.
+        """
         results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
         observation, reward, terminated, truncated = (
             np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
@@ -137,7 +157,10 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
 
 def mixed_env(
-    conditions: Sequence[Condition], sizes: Sequence[int], num_threads: int = 0, weights: Sequence[float] | None = None
+    conditions: Sequence[Condition],
+    sizes: Sequence[int],
+    num_threads: int = 0,
+    weights: Sequence[float] | None = None,
 ) -> MixedVectorEnv:
     """Worlds of several conditions; neighbours that can have an environment in common have one.
 
@@ -154,10 +177,16 @@ def mixed_env(
     shares = [list(share) for _, share in groupby(pairs, lambda own: shared_settings(own[0]))]
     threads = threads_of_each(_cores(num_threads), len(shares))
     envs = [
-        make_shared_env([condition for condition, size in share for _ in range(size)], own, AutoresetMode.DISABLED)
+        make_shared_env(
+            [condition for condition, size in share for _ in range(size)],
+            own,
+            AutoresetMode.DISABLED,
+        )
         for share, own in zip(shares, threads, strict=True)
     ]
-    return MixedVectorEnv(envs, num_threads, None if weights is None else np.repeat(weights, sizes).tolist())
+    return MixedVectorEnv(
+        envs, num_threads, None if weights is None else np.repeat(weights, sizes).tolist()
+    )
 
 
 def _cores(num_threads: int) -> int:
@@ -165,6 +194,8 @@ def _cores(num_threads: int) -> int:
 
 
 def threads_of_each(cores: int, count: int) -> list[int]:
-    """Threads of environments that step side by side: one each, and the last ones share what they leave idle."""
+    """Threads of environments that step side by side: one each, and the last ones share what
+    they leave idle.
+    """
     last = count % cores
     return [1] * (count - last) + [cores // max(last, 1)] * last

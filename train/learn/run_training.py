@@ -1,4 +1,6 @@
-"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable at any moment."""
+"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable at
+any moment.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -38,19 +40,24 @@ class Run:
 
     def lacks(self) -> list[int]:
         """Training seeds that have not come to their end."""
-        return [seed for seed in self.config.seeds if not _is_complete(self.folder / f"seed_{seed}")]
+        return [
+            seed for seed in self.config.seeds if not _is_complete(self.folder / f"seed_{seed}")
+        ]
 
 
 def start(
-    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, executors: Executors = ONE_BY_ONE
+    configs: Sequence[TrainConfig],
+    console: Console,
+    output: Path | None = None,
+    executors: Executors = ONE_BY_ONE,
 ) -> list[Path]:
     """Train all seeds of some configurations, each in a new run.
 
     Args:
         configs: What is trained.
         console: Where progress and results go.
-        output: Folder, new or empty; of several configurations each has a folder in it by its name. Default
-            runs/<name>, numbered if taken.
+        output: Folder, new or empty; of several configurations each has a folder in it by its name.
+            Default runs/<name>, numbered if taken.
         executors: Where seeds are trained, and how many at a time; the weights do not depend on it.
 
     Returns:
@@ -63,7 +70,11 @@ def start(
     runs = list[Run]()
     with ExitStack() as held:
         for config in configs:
-            own = output if output is None or len(configs) == 1 else output / require_name(config.name)
+            own = (
+                output
+                if output is None or len(configs) == 1
+                else output / require_name(config.name)
+            )
             made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
             held.enter_context(lock_run(runs[-1].folder))
@@ -72,7 +83,10 @@ def start(
 
 
 def resume(
-    folders: Sequence[Path], console: Console, executors: Executors = ONE_BY_ONE, trust_code: bool = False
+    folders: Sequence[Path],
+    console: Console,
+    executors: Executors = ONE_BY_ONE,
+    trust_code: bool = False,
 ) -> list[Path]:
     """Go on with runs that were interrupted or killed; seeds that are complete stay as they are.
 
@@ -80,10 +94,12 @@ def resume(
         folders: Of the runs.
         console: Where progress and results go.
         executors: Where seeds are trained, and how many at a time.
-        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in a folder.
+        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may
+            lie in a folder.
 
     Raises:
-        ConfigurationError: A folder is no training run, another program works on it, or its algorithm is not trusted.
+        ConfigurationError: A folder is no training run, another program works on it, or its
+            algorithm is not trusted.
     """
     runs = [Run(_recorded_config(folder, trust_code), folder) for folder in folders]
     with ExitStack() as held:
@@ -107,9 +123,14 @@ def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
 def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
         if run.lacks():
-            console.print(f"training in {run.folder}; if it stops: elastic train --resume {run.folder}", soft_wrap=True)
+            console.print(
+                f"training in {run.folder}; if it stops: elastic train --resume {run.folder}",
+                soft_wrap=True,
+            )
         else:
-            said = f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
+            said = (
+                f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
+            )
             console.print(said, soft_wrap=True)
     calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
     totals = {call.name: call.run.config.decisions for call in calls}
@@ -134,10 +155,16 @@ class _Call:
     @property
     def name(self) -> str:
         """Name of the seed in the progress."""
-        return f"{self.run.folder.name}, seed {self.seed}" if self.is_one_of_several else f"seed {self.seed}"
+        return (
+            f"{self.run.folder.name}, seed {self.seed}"
+            if self.is_one_of_several
+            else f"seed {self.seed}"
+        )
 
 
-def _train_beside(calls: Sequence[_Call], console: Console, executors: Executors, show: Show) -> None:
+def _train_beside(
+    calls: Sequence[_Call], console: Console, executors: Executors, show: Show
+) -> None:
     """Train seeds beside each other: they share the cores among them.
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
@@ -154,7 +181,9 @@ def _train_beside(calls: Sequence[_Call], console: Console, executors: Executors
         note = tally.in_words("seeds")
 
     def moved(number: int) -> None:
-        console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
+        console.print(
+            f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True
+        )
 
     threads = executors.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
@@ -172,10 +201,13 @@ def _raise_first(calls: Sequence[_Call], outcomes: Sequence[Outcome | None]) -> 
             raise outcome.error
 
 
-def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]) -> None:
+def _train_seed(
+    config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]
+) -> None:
     """Train a seed, or go on with it.
 
-    A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed over, waits for it.
+    A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed
+    over, waits for it.
     """
     own = folder / f"seed_{seed}"
     report(0)
@@ -203,16 +235,25 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
 
 
 def _table(config: TrainConfig, folder: Path) -> Table:
-    """Scores of the last policies against their base, on the episodes of the evaluation on the way."""
+    """Scores of the last policies against their base, on the episodes of the evaluation on the
+    way.
+    """
     columns = environment(config.env).judged
     head = ["seed", "scenario", *(column.label for column in columns), "failed"]
     table = []
     for seed in config.seeds:
-        rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns], ["failed"])
+        rows = read_progress(
+            folder / f"seed_{seed}", [column.metric for column in columns], ["failed"]
+        )
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
-            scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
+            scores = [
+                _change(row[f"base_{column.metric}"], row[column.metric], column.scale)
+                for column in columns
+            ]
             table.append([str(seed), row["scenario"], *scores, f"{row['failed']:.0f}"])
-    return make_table(f"last policies on {config.base}, on episodes that training never sees", head, table, left=2)
+    return make_table(
+        f"last policies on {config.base}, on episodes that training never sees", head, table, left=2
+    )
 
 
 def _change(base: float, mine: float, scale: float) -> str:

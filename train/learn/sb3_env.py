@@ -1,4 +1,6 @@
-"""Our vector environments for Stable-Baselines3: arrays in, arrays out, no Python loop over worlds."""
+"""Our vector environments for Stable-Baselines3: arrays in, arrays out, no Python loop over
+worlds.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,21 +19,24 @@ _NOTHING: dict[str, Any] = {}
 class SB3VecEnv(VecEnv):
     """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
 
-    Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`: reward r, length l in
-    steps of this environment, and the metrics of the task) are in the infos of the worlds that end, as SB3 reads them.
-    A first episode that is cut short has no statistics: it would count for less reward than a whole one.
+    Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`:
+    reward r, length l in steps of this environment, and the metrics of the task) are in the infos
+    of the worlds that end, as SB3 reads them. A first episode that is cut short has no statistics:
+    it would count for less reward than a whole one.
 
     Args:
         env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
-        stagger: Generator for an order in which first episodes end early, see `ResidualVectorWrapper.stagger`; None to
-            let all worlds go on in step.
+        stagger: Generator for an order in which first episodes end early, see
+            `ResidualVectorWrapper.stagger`; None to let all worlds go on in step.
 
     Raises:
         ConfigurationError: Another autoreset mode.
     """
 
     def __init__(
-        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], stagger: np.random.Generator | None = None
+        self,
+        env: gymnasium.vector.VectorEnv[Any, Any, Any],
+        stagger: np.random.Generator | None = None,
     ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
@@ -58,7 +63,9 @@ class SB3VecEnv(VecEnv):
         return observation
 
     def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
-        """Seed the next `reset`, world i with seed + i, and the order in which it lets first episodes end early."""
+        """Seed the next `reset`, world i with seed + i, and the order in which it lets first
+        episodes end early.
+        """
         self.seed(seed)
         self._stagger = stagger
 
@@ -85,7 +92,9 @@ class SB3VecEnv(VecEnv):
             metrics = final.get("episode_metrics", {})
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
-                own = {name: values[world].item() for name, values in metrics.items() if scored[world]}
+                own = {
+                    name: values[world].item() for name, values in metrics.items() if scored[world]
+                }
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
                     "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
@@ -116,15 +125,21 @@ class SB3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Worlds have no attributes of their own."""
-        raise NotImplementedError("the worlds of a vector environment have no attributes of their own")
+        raise NotImplementedError(
+            "the worlds of a vector environment have no attributes of their own"
+        )
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         """Call a method of the vector environment once, and return its result for every world."""
         result = getattr(self.env, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Worlds are not wrapped one by one; this environment keeps episode statistics, as a Monitor does."""
+        """Worlds are not wrapped one by one; this environment keeps episode statistics, as a
+        Monitor does.
+        """
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]

@@ -1,4 +1,6 @@
-"""A training on its way: scores against the base on episodes that it never learns from, best and last policy."""
+"""A training on its way: scores against the base on episodes that it never learns from, best and
+last policy.
+"""
 
 import csv
 import io
@@ -45,15 +47,18 @@ class Scores:
         self.best = np.inf
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
-    def evaluate(self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> dict[str, float]:
+    def evaluate(
+        self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
+    ) -> dict[str, float]:
         """Score a policy after some decisions, and keep it where it is the best so far.
 
-        A residual begins as its base, within a hundredth of its range: before the first decision the base's score
-        is its own.
+        A residual begins as its base, within a hundredth of its range: before the first decision
+        the base's score is its own.
 
         Returns:
-            METRIC_change of every judged metric: relative to the base's, [1], mean over the scenarios; negative is
-            better. One is left out where all episodes of a scenario failed. And `failed`: how many did.
+            METRIC_change of every judged metric: relative to the base's, [1], mean over the
+            scenarios; negative is better. One is left out where all episodes of a scenario failed.
+            And `failed`: how many did.
         """
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
@@ -67,7 +72,14 @@ class Scores:
         ):
             table.append([decisions, scenario, *mine, *base, falls, base_falls])
             ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
-        header = ["decisions", "scenario", *columns, *(f"base_{name}" for name in columns), "failed", "base_failed"]
+        header = [
+            "decisions",
+            "scenario",
+            *columns,
+            *(f"base_{name}" for name in columns),
+            "failed",
+            "base_failed",
+        ]
         _append(self._folder / PROGRESS, header, table)
         score = float(np.mean(ratios))
         if score < self.best:
@@ -78,10 +90,16 @@ class Scores:
         known = {f"{name}_change": change for name, change in found.items() if np.isfinite(change)}
         return {**known, "failed": float(sum(failed for _, failed in scores))}
 
-    def keep(self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> Path:
+    def keep(
+        self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
+    ) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
         tensors, description = policy
-        training = {"config": self._config.model_dump(mode="json"), "decisions": decisions, **self._provenance}
+        training = {
+            "config": self._config.model_dump(mode="json"),
+            "decisions": decisions,
+            **self._provenance,
+        }
         fresh = self._folder / f"{name}.new"
         shutil.rmtree(fresh, ignore_errors=True)
         save_residual(fresh, description.replace(training=training), tensors)
@@ -89,24 +107,39 @@ class Scores:
         return fresh.rename(self._folder / name)
 
     def forget_after(self, decisions: int) -> None:
-        """Drop evaluations that were made after the checkpoint that is gone on with; they will be made again."""
+        """Drop evaluations that were made after the checkpoint that is gone on with; they will
+        be made again.
+        """
         path = self._folder / PROGRESS
         lines = _text_of(path).splitlines(keepends=True)
         try:
-            kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= decisions]
+            kept = [
+                line
+                for line in lines[1:]
+                if line.endswith("\n") and int(line.split(",")[0]) <= decisions
+            ]
         except ValueError as error:
-            raise ConfigurationError(f"{path} is no table of evaluations ({error}); remove it") from None
+            raise ConfigurationError(
+                f"{path} is no table of evaluations ({error}); remove it"
+            ) from None
         if decisions == 0 or not lines:
             path.unlink(missing_ok=True)
             return
         write_whole(path, "".join([lines[0], *kept]))
 
     def _play(self, policy: str, metrics: list[str]) -> list[_Scored]:
-        """For each scenario means of metrics over the episodes that did not fail, and how many did."""
-        conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
+        """For each scenario means of metrics over the episodes that did not fail, and how many
+        did.
+        """
+        conditions = [
+            self._config.condition(scenario, policy) for scenario in self._config.scenarios
+        ]
         results = played_together(conditions, metrics, self._threads)
         return [
-            ([float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T], int(failed.sum()))
+            (
+                [float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T],
+                int(failed.sum()),
+            )
             for result, failed in results
         ]
 
@@ -138,13 +171,16 @@ def _text_of(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{path} is no table of evaluations ({error}); remove it") from None
+        raise ConfigurationError(
+            f"{path} is no table of evaluations ({error}); remove it"
+        ) from None
 
 
 def played_together(
     conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
 ) -> list[tuple[Array, BoolArray]]:
-    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time series.
+    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time
+    series.
 
     Args:
         conditions: Cells of one environment, motion and policy.
@@ -157,7 +193,11 @@ def played_together(
     sizes = [condition.episodes for condition in conditions]
     with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
         policy = make_policy(conditions[0].policy, worlds)
-        seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
+        seeds = [
+            condition.seed + episode
+            for condition in conditions
+            for episode in range(condition.episodes)
+        ]
         values = np.full((len(seeds), len(metrics)), np.nan)
         failed = np.zeros(len(seeds), dtype=np.bool_)
         playing = np.ones_like(failed)

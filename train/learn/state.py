@@ -35,7 +35,9 @@ def read_state(folder: Path, name: str) -> Any:
         def whole(value: Any) -> Any:
             if isinstance(value, dict):
                 return (
-                    arrays[value[_ARRAY]] if set(value) == {_ARRAY} else {k: whole(part) for k, part in value.items()}
+                    arrays[value[_ARRAY]]
+                    if set(value) == {_ARRAY}
+                    else {k: whole(part) for k, part in value.items()}
                 )
             return [whole(part) for part in value] if isinstance(value, list) else value
 

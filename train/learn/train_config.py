@@ -12,7 +12,14 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.registration import require_memory
-from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
+from train.evaluate.conditions import (
+    MOST_EPISODES,
+    Condition,
+    GivenRanges,
+    GivenReference,
+    PolicySpec,
+    require_drawn,
+)
 from train.evaluate.environments import environment
 from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
@@ -20,7 +27,9 @@ from train.runs.kinds import is_a
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
-"""Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
+"""Episodes of evaluation begin at the second, those of training at the first: no seed serves
+both.
+"""
 TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
 
@@ -44,13 +53,15 @@ class TrainConfig(Model):
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
     base: Title = "input_output"
-    """Policy that is corrected: a baseline by name, since an exported residual plays without code of its own."""
+    """Policy that is corrected: a baseline by name, since an exported residual plays without
+    code of its own.
+    """
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""
     algorithm: Locator = "PPO"
-    """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a search over
-    residuals that never change."""
+    """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a
+    search over residuals that never change."""
     algorithm_options: dict[str, Any] = {}
     """Its keyword arguments, over the defaults."""
     anneal: bool = False
@@ -61,14 +72,19 @@ class TrainConfig(Model):
     """Worlds, shared out to the scenarios."""
     decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
     """Decisions of all worlds together."""
-    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1, max_length=MOST_ENTRIES)
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(
+        default=[0], min_length=1, max_length=MOST_ENTRIES
+    )
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
     evaluation_episodes: int = quantity("1", 4, ge=1, le=MOST_EPISODES)
     """Episodes per scenario in an evaluation."""
     checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS)
-    """Decisions between checkpoints. A checkpoint ends all episodes: leave several of every world between two."""
+    """Decisions between checkpoints.
+
+    A checkpoint ends all episodes: leave several of every world between two.
+    """
 
     _kind = model_validator(mode="before")(is_a("training"))
     _checked = field_validator("base")(require_plain_base)
@@ -78,7 +94,8 @@ class TrainConfig(Model):
         for name in self.weights:
             if name not in self.scenarios:
                 raise ValueError(
-                    f"weights must be of scenarios that are learned from, {shown(self.scenarios)}, got {shown(name)}"
+                    f"weights must be of scenarios that are learned from, {shown(self.scenarios)},"
+                    f" got {shown(name)}"
                 )
         return self
 
@@ -89,14 +106,19 @@ class TrainConfig(Model):
 
     @field_validator("algorithm_options")
     @classmethod
-    def _options_are_within_their_bounds(cls, options: dict[str, Any], others: ValidationInfo) -> dict[str, Any]:
+    def _options_are_within_their_bounds(
+        cls, options: dict[str, Any], others: ValidationInfo
+    ) -> dict[str, Any]:
         return checked_options(str(others.data.get("algorithm")), options)
 
     @field_validator("seeds")
     @classmethod
     def _each_seed_once(cls, seeds: list[int]) -> list[int]:
         if len(set(seeds)) < len(seeds):
-            raise ValueError(f"every training seed has a folder of its own and can stand but once, got {shown(seeds)}")
+            raise ValueError(
+                "every training seed has a folder of its own and can stand but once, got"
+                f" {shown(seeds)}"
+            )
         return seeds
 
     @property
@@ -105,11 +127,15 @@ class TrainConfig(Model):
         return environment(self.env).default_reference if self.reference is None else self.reference
 
     def condition(self, scenario: str, policy: str) -> Condition:
-        """A cell in which a policy is evaluated on the way; where nothing is drawn, one episode is all there is."""
+        """A cell in which a policy is evaluated on the way; where nothing is drawn, one episode
+        is all there is.
+        """
         is_one = environment(self.env).is_deterministic(scenario, self.motion)
         return Condition(
             env=self.env,
-            policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
+            policy=PolicySpec(
+                name=policy, options=self.base_options if policy == self.base else {}
+            ),
             scenario=scenario,
             reference=self.motion,
             ranges=self.ranges,
@@ -131,7 +157,9 @@ class TrainConfig(Model):
         )
 
     def is_due(self, every: int, before: int, now: int) -> bool:
-        """True if work that is done every so many decisions, and at the end, is due between two counts."""
+        """True if work that is done every so many decisions, and at the end, is due between two
+        counts.
+        """
         return now // every > before // every or now >= self.decisions
 
     @property
@@ -143,13 +171,17 @@ class TrainConfig(Model):
         """
         count = len(self.scenarios)
         if self.worlds < 2 * count:
-            raise ConfigurationError(f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}")
+            raise ConfigurationError(
+                f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
+            )
         whole, rest = divmod(self.worlds, count)
         return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
 
 
 _WORLD_BYTES = 100_000
-"""Memory of a world: measured on the walker with its policy, and on the testbed with a motion of its own."""
+"""Memory of a world: measured on the walker with its policy, and on the testbed with a motion of
+its own.
+"""
 
 
 def joints_of(worlds: Any) -> list[str]:
@@ -158,7 +190,9 @@ def joints_of(worlds: Any) -> list[str]:
     return names
 
 
-def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:
+def training_worlds(
+    config: TrainConfig, shares: list[tuple[str, int]], threads: int
+) -> ResidualVectorWrapper:
     """Worlds under residuals of the configuration's base.
 
     Args:
@@ -179,4 +213,6 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
         [config.weights.get(scenario, 1.0) for scenario, _ in shares],
     )
     base = baselines.make(config.base, worlds, **config.base_options)
-    return ResidualVectorWrapper(worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump())
+    return ResidualVectorWrapper(
+        worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump()
+    )

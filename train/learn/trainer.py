@@ -1,4 +1,6 @@
-"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints on the way."""
+"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints on the
+way.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -78,19 +80,30 @@ class Trainer(ABC):
             require_whole(path)
             try:
                 self._read(path)
-            except (KeyError, IndexError, TypeError, ValueError, RecursionError, RuntimeError) as error:
+            except (
+                KeyError,
+                IndexError,
+                TypeError,
+                ValueError,
+                RecursionError,
+                RuntimeError,
+            ) as error:
                 raise damage_error(path, f"{type(error).__name__}: {error}") from error
             self._kept = self.done
         self._scores.forget_after(self.done)
 
     def _divergence_text(self, quantity: str) -> str:
         """The sentence for a quantity that is no longer finite."""
-        kept = f"the checkpoint of decision {self._kept} is kept in {shortened(self.folder / CHECKPOINT)}"
+        kept = (
+            f"the checkpoint of decision {self._kept} is kept in"
+            f" {shortened(self.folder / CHECKPOINT)}"
+        )
         if self._kept is None:
             kept = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
         return (
-            f"{quantity} is not a finite number at decision {self.done} of training seed {self._seed}; {kept}; "
-            f"begin anew with a smaller learning_rate or log_std_init, or smaller weights of the reward"
+            f"{quantity} is not a finite number at decision {self.done} of training seed"
+            f" {self._seed}; {kept}; begin anew with a smaller learning_rate or log_std_init, or"
+            " smaller weights of the reward"
         )
 
     @abstractmethod
@@ -114,4 +127,6 @@ class Trainer(ABC):
         self._show(self._scores.evaluate(self.done, self._policy()))
 
     def _show(self, changes: Mapping[str, float]) -> None:  # noqa: B027  who has curves shows them
-        """Show the scores of an evaluation beside the curves of the training, see `Scores.evaluate`."""
+        """Show the scores of an evaluation beside the curves of the training, see
+        `Scores.evaluate`.
+        """

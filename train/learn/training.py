@@ -1,8 +1,9 @@
 """Training of residuals with Stable-Baselines3, and checkpoints of all that it depends on.
 
-A run is a folder per training seed: `checkpoint/` to go on from, `best/` and `last/` as policies that need no torch,
-`progress.csv`, and TensorBoard's files. Training is deterministic on one thread; a run that is interrupted or killed
-and resumed ends with the same weights, bit for bit, as one that was not.
+A run is a folder per training seed: `checkpoint/` to go on from, `best/` and `last/` as policies
+that need no torch, `progress.csv`, and TensorBoard's files. Training is deterministic on one
+thread; a run that is interrupted or killed and resumed ends with the same weights, bit for bit, as
+one that was not.
 """
 
 import io
@@ -28,11 +29,21 @@ from train.learn.export import network_of
 from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.state import read_state, write_state
-from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
+from train.learn.train_config import (
+    FIRST_TRAINING_SEED,
+    TRAINING_SEED_STRIDE,
+    TrainConfig,
+    joints_of,
+    training_worlds,
+)
 from train.learn.trainer import Trainer
 
 _COMMON = {"gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512}
-_PPO = {"n_steps": 32, "n_epochs": 10, "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0}}
+_PPO = {
+    "n_steps": 32,
+    "n_epochs": 10,
+    "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
+}
 _SAC_NETWORKS = {"net_arch": {"pi": [64, 64], "qf": [256, 256]}}
 _SAC = {"buffer_size": 200_000, "learning_starts": 2_000, "train_freq": 4, "gradient_steps": 8}
 _DEFAULTS: dict[str, dict[str, Any]] = {
@@ -67,7 +78,9 @@ class Training(Trainer):
         self._seed = seed
         options = _merge(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
-        self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
+        self._normaliser = VecNormalize(
+            self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma
+        )
         set_random_seed(seed)
         self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
         algorithm = algorithm_class(config.algorithm)
@@ -84,13 +97,18 @@ class Training(Trainer):
         self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Learn to the end; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
+        """Learn to the end; what TensorBoard's thread could not write, such as to a full disk,
+        is raised here.
+        """
         with _thread_raises_here(), self._curves():
             super().run(progress)
 
     @contextmanager
     def _curves(self) -> Iterator[None]:
-        """Write TensorBoard's files of the work within. Its thread ends with it, whatever ended that."""
+        """Write TensorBoard's files of the work within.
+
+        Its thread ends with it, whatever ended that.
+        """
         curves = Curves(str(self.folder / "tensorboard"), self.model, self._worlds)
         self.model.set_logger(curves)
         try:
@@ -122,7 +140,10 @@ class Training(Trainer):
     def _require_finite_weights(self) -> None:
         for name, tensor in self.model.policy.state_dict().items():
             require_finite(f"{name} of the network", tensor.numpy())
-        for name, rms in {"observations": self._normaliser.obs_rms, "returns": self._normaliser.ret_rms}.items():
+        for name, rms in {
+            "observations": self._normaliser.obs_rms,
+            "returns": self._normaliser.ret_rms,
+        }.items():
             require_finite(f"the variance of the {name}", rms.var)  # type: ignore[union-attr]
 
     def _write(self, checkpoint: Path) -> None:
@@ -168,14 +189,16 @@ class Training(Trainer):
             "model": {name: getattr(model, name) for name in _OF_MODEL},
             "statistics": [[rms.mean, rms.var, float(rms.count)] for rms in self._statistics],
             "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
-            "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002  the generator that SB3 shuffles with
+            "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002
             "python": _to_lists(random.getstate()),
             "actions": model.action_space.np_random.bit_generator.state,
         }
         if isinstance(model, OffPolicyAlgorithm):
             buffer: Any = model.replay_buffer
             size = buffer.buffer_size if buffer.full else buffer.pos
-            state["replay"] = {name: getattr(buffer, name)[:size] for name in _REPLAY if hasattr(buffer, name)}
+            state["replay"] = {
+                name: getattr(buffer, name)[:size] for name in _REPLAY if hasattr(buffer, name)
+            }
             state["replay_at"] = [buffer.pos, bool(buffer.full)]
         return state
 
@@ -207,14 +230,22 @@ class Training(Trainer):
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
-        """End all episodes and begin others, with seeds that follow from the training seed and the decisions done."""
+        """End all episodes and begin others, with seeds that follow from the training seed and
+        the decisions done.
+        """
         model = self.model
-        if isinstance(model, OffPolicyAlgorithm):  # the last transitions are of episodes that are cut
+        if isinstance(
+            model, OffPolicyAlgorithm
+        ):  # the last transitions are of episodes that are cut
             buffer: Any = model.replay_buffer
             last = buffer.pos - 1
-            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], np.logical_not(buffer.dones[last]))
+            buffer.timeouts[last] = np.logical_or(
+                buffer.timeouts[last], np.logical_not(buffer.dones[last])
+            )
         entropy = np.random.SeedSequence((self._seed, self.done))
-        self._worlds.begin_with(FIRST_TRAINING_SEED + int(entropy.generate_state(1)[0]), np.random.default_rng(entropy))
+        self._worlds.begin_with(
+            FIRST_TRAINING_SEED + int(entropy.generate_state(1)[0]), np.random.default_rng(entropy)
+        )
         model._last_obs = self._normaliser.reset()
         model._last_original_obs = self._normaliser.get_original_obs()
         model._last_episode_starts = np.ones(self.config.worlds, dtype=np.bool_)
@@ -225,8 +256,12 @@ class Training(Trainer):
         return self._normaliser.obs_rms, self._normaliser.ret_rms
 
     def _portion(self) -> int:
-        """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on to its next update."""
-        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)  # whose n_steps are those of its returns
+        """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on
+        to its next update.
+        """
+        is_off_policy = isinstance(
+            self.model, OffPolicyAlgorithm
+        )  # whose n_steps are those of its returns
         return self.config.worlds * (1 if is_off_policy else self.model.n_steps)
 
     def _shrink_last_layer(self) -> None:

@@ -1,4 +1,6 @@
-"""Paired changes as tables: a line per cell for the terminal, every figure for the report, and as CSV."""
+"""Paired changes as tables: a line per cell for the terminal, every figure for the report, and
+as CSV.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,15 +28,20 @@ _SIGNS = {HELD_OUT: "°", PARTLY: "(°)", CEILING: "†", SAME_ROBOT: "‡"}
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; first against bases, then against rivals."""
+    """Print the changes of the residuals, a line per cell; first against bases, then against
+    rivals.
+    """
     for is_rival in (False, True):
-        shown = [row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival]
+        shown = [
+            row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival
+        ]
         if shown:
             print_table(cells_table(shown), console, "statistics.csv")
 
 
 def cells_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against their bases, or against their rivals, a line per cell with all metrics.
+    """Changes of residuals against their bases, or against their rivals, a line per cell with all
+    metrics.
 
     Args:
         rows: Changes of families, of one environment, all against bases or all against rivals.
@@ -43,8 +50,14 @@ def cells_table(rows: Sequence[Change]) -> Table:
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     policies = list(dict.fromkeys(row.policy for row in rows))
     marks = {mark for row in rows for mark in row.marks}
-    signs = [f"{sign} {words}" for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
-    names = ["reference", "scenario"] if len(policies) == 1 else ["residual", "reference", "scenario"]
+    signs = [
+        f"{sign} {words}"
+        for words, sign in _SIGNS.items()
+        if any(mark.startswith(words) for mark in marks)
+    ]
+    names = (
+        ["reference", "scenario"] if len(policies) == 1 else ["residual", "reference", "scenario"]
+    )
     heads = [Head(name, is_number=False, wraps=True, titles=name == "reference") for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head(column.title, leaves=1) for column in columns]
@@ -53,7 +66,11 @@ def cells_table(rows: Sequence[Change]) -> Table:
     for line in by_line(rows):
         first = line[0]
         scope = first.scope + _signs(first)
-        own = [first.reference, scope] if len(policies) == 1 else [first.policy, first.reference, scope]
+        own = (
+            [first.reference, scope]
+            if len(policies) == 1
+            else [first.policy, first.reference, scope]
+        )
         figures = {row.column: signed_interval(row.relative, row.verdict) for row in line}
         cells = [
             *own,
@@ -74,7 +91,8 @@ def cells_table(rows: Sequence[Change]) -> Table:
 
 
 def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
-    """All figures of paired changes, a row per cell and metric, under a heading per policy and base.
+    """All figures of paired changes, a row per cell and metric, under a heading per policy and
+    base.
 
     Args:
         rows: Changes of residuals, or of policies without training seeds.
@@ -85,14 +103,19 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     heads = [Head(name, is_number=False) for name in ("reference", "scenario")]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head("metric", is_number=False)]
-    heads += [Head(name) for name in ("base → policy", "change", "better than base", f"{rows[0].failure} (base)")]
+    heads += [
+        Head(name)
+        for name in ("base → policy", "change", "better than base", f"{rows[0].failure} (base)")
+    ]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
     previous = ("", "")
     for row in (row for line in by_line(rows) for row in line):
         if (row.policy, row.base) != previous:
             previous = (row.policy, row.base)
-            seeds = f", {row.num_seeds} training seed{'s' * (row.num_seeds != 1)}" if is_family else ""
+            seeds = (
+                f", {row.num_seeds} training seed{'s' * (row.num_seeds != 1)}" if is_family else ""
+            )
             heading = f"{row.policy} against {row.base}{seeds}"
             lines.append(Row((heading,), kind="heading", dot=colours[row.policy]))
         failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
@@ -109,7 +132,9 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
 def _scope(row: Change) -> tuple[Part, ...]:
     """Scenario or group, with its marks."""
     pooled = [Part("pooled", "pooled", before=" ")] if row.is_group else []
-    marks = (Part(mark, "ceiling" if mark == CEILING else "badge", before=" ") for mark in row.marks)
+    marks = (
+        Part(mark, "ceiling" if mark == CEILING else "badge", before=" ") for mark in row.marks
+    )
     return (Part(row.scope), *pooled, *marks)
 
 
@@ -118,10 +143,14 @@ def _swept(row: Change, names: Sequence[str]) -> list[str]:
 
 
 def _means(row: Change) -> str:
-    """Means of base and policy in the unit in which they are shown; - where there is nothing to compare."""
+    """Means of base and policy in the unit in which they are shown; - where there is nothing to
+    compare.
+    """
     if not np.isfinite(row.mine):
         return "-"
-    before, after = (f"{row.column.scale * value:.{row.column.decimals}f}" for value in (row.theirs, row.mine))
+    before, after = (
+        f"{row.column.scale * value:.{row.column.decimals}f}" for value in (row.theirs, row.mine)
+    )
     return f"{before} → {after} {row.column.unit}"
 
 
@@ -141,13 +170,20 @@ def _opponent(rows: Sequence[Change]) -> str:
 
 def _signs(row: Change) -> str:
     """Marks of a row as signs, where there is little room."""
-    found = [sign for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in row.marks)]
+    found = [
+        sign for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in row.marks)
+    ]
     return f" {''.join(found)}" if found else ""
 
 
 def failed_and_base(row: Change) -> str:
-    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are more."""
-    return f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
+    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are
+    more.
+    """
+    return (
+        f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes}"
+        f" ({row.base_falls}/{row.base_episodes})"
+    )
 
 
 _HEAD = ("policy", "base", "base_is", "kind", "reference", "scope", "pooled", "marks")
@@ -200,7 +236,13 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
 
 
 def _record(row: Change, swept: Sequence[str]) -> list[object]:
-    role = BEST_ANALYTIC if row.is_rival else "base of the residual" if row.is_family else "policy to compare with"
+    role = (
+        BEST_ANALYTIC
+        if row.is_rival
+        else "base of the residual"
+        if row.is_family
+        else "policy to compare with"
+    )
     kind = "residual" if row.is_family else "baseline"
     found = [
         row.policy,
@@ -226,7 +268,9 @@ def _record(row: Change, swept: Sequence[str]) -> list[object]:
 
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
-    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as they are shown."""
+    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as
+    they are shown.
+    """
     return write_table(_MAP_HEAD, (row for found in maps for row in _map_records(found)), path)
 
 

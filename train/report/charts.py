@@ -1,4 +1,6 @@
-"""Charts of scores and of their changes on a page: the ladder of policies, and every residual against its base."""
+"""Charts of scores and of their changes on a page: the ladder of policies, and every residual
+against its base.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -38,17 +40,25 @@ class _Rung:
 
 
 def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> PageChart:
-    """Every policy in every scenario: its mean over the episodes that did not fail; of families with interval."""
+    """Every policy in every scenario: its mean over the episodes that did not fail; of families
+    with interval.
+    """
     rungs, headings, bottom = _rungs(table, reference)
     columns = table.environment.judged
-    layout = base_layout(left=8 * min(max(map(len, table.policies)), LONGEST_NAME) + 24, top=34, bottom=10)
+    layout = base_layout(
+        left=8 * min(max(map(len, table.policies)), LONGEST_NAME) + 24, top=34, bottom=10
+    )
     data: list[Spec] = []
     for number, column in enumerate(columns):
         axis = nth(number)
         levels = [score(rung.rows, column) for rung in rungs]
         edge = _edges([level.times(column.scale) for level in levels if level.is_known])
         for policy in table.policies:
-            own = [(rung, level) for rung, level in zip(rungs, levels, strict=True) if rung.policy == policy]
+            own = [
+                (rung, level)
+                for rung, level in zip(rungs, levels, strict=True)
+                if rung.policy == policy
+            ]
             symbol = "diamond" if policy in table.members else "circle"
             data.append(_points(own, column, colours[policy], symbol, axis))
             data.append(_figures(own, column, edge[0], axis, table.environment.failure))
@@ -102,7 +112,9 @@ def _edges(levels: Sequence[Estimate]) -> list[float]:
     return [math.log10(low) - 0.04 * room - 0.02, math.log10(max(high, low)) + 0.34 * room + 0.1]
 
 
-def _points(own: Sequence[tuple[_Rung, Estimate]], column: Column, colour: str, symbol: str, axis: str) -> Spec:
+def _points(
+    own: Sequence[tuple[_Rung, Estimate]], column: Column, colour: str, symbol: str, axis: str
+) -> Spec:
     """Points of a policy with their intervals."""
     known = [(rung, level.times(column.scale)) for rung, level in own if level.is_known]
     return {
@@ -118,13 +130,19 @@ def _points(own: Sequence[tuple[_Rung, Estimate]], column: Column, colour: str, 
     }
 
 
-def _figures(own: Sequence[tuple[_Rung, Estimate]], column: Column, left: float, axis: str, failure: str) -> Spec:
+def _figures(
+    own: Sequence[tuple[_Rung, Estimate]], column: Column, left: float, axis: str, failure: str
+) -> Spec:
     """Figures beside the points, with failures."""
     x = []
     texts = []
     for rung, level in own:
         failed, played = failures(rung.rows)
-        cross = f'  <b style="color:{VERDICTS["higher"]}">✕ {failure} {failed}/{played}</b>' if failed else ""
+        cross = (
+            f'  <b style="color:{VERDICTS["higher"]}">✕ {failure} {failed}/{played}</b>'
+            if failed
+            else ""
+        )
         x.append(digits(column.scale * level.ends[1]) if level.is_known else 10 ** (left + 1e-3))
         texts.append(f"  {number_interval(level, column)}{cross}" if level.is_known else cross)
     places = [rung.place for rung, _ in own]
@@ -172,7 +190,9 @@ def forest(rows: Sequence[Change]) -> PageChart:
     lines = by_line(rows)
     columns = list(dict.fromkeys(row.column for row in rows))
     several = len({row.reference for row in rows}) > 1
-    scopes = [f"{line[0].reference} · {line[0].scope}" if several else line[0].scope for line in lines]
+    scopes = [
+        f"{line[0].reference} · {line[0].scope}" if several else line[0].scope for line in lines
+    ]
     layout = base_layout(left=7.4 * min(max(map(len, scopes)), 46) + 26, top=40, bottom=10)
     layout["showlegend"] = False
     data: list[Spec] = []
@@ -187,9 +207,12 @@ def forest(rows: Sequence[Change]) -> PageChart:
         for verdict, colour in VERDICTS.items():
             own = [(place, row) for place, row in known if row.verdict == verdict]
             data.append(_changes(own, colour, axis))
-        x = [digits(100.0 * row.relative.ends[1]) if row.relative.is_known else 0.0 for row in shown]
+        x = [
+            digits(100.0 * row.relative.ends[1]) if row.relative.is_known else 0.0 for row in shown
+        ]
         texts = [
-            f"  {percent_interval(row.relative) if row.relative.is_known else 'nothing to compare'}" for row in shown
+            f"  {percent_interval(row.relative) if row.relative.is_known else 'nothing to compare'}"
+            for row in shown
         ]
         data.append(_texts(x, range(len(shown)), texts, axis))
         layout[f"xaxis{axis}"] = base_axis(

@@ -70,7 +70,9 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
         if not policies:
             continue
         rows.append(Row((str(track),), kind="heading"))
-        places = {(s.policy, s.scope, s.reference, s.metric): s for own in policies.values() for s in own}
+        places = {
+            (s.policy, s.scope, s.reference, s.metric): s for own in policies.values() for s in own
+        }
         best = {
             (scope, reference, metric): best_of(
                 {
@@ -82,7 +84,9 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
             for scope, reference in columns
             for metric in metrics
         }
-        order = {policy: _order(places.get((policy, *columns[0], metrics[0]))) for policy in policies}
+        order = {
+            policy: _order(places.get((policy, *columns[0], metrics[0]))) for policy in policies
+        }
         for policy in sorted(policies, key=lambda policy: order[policy]):
             entries = [
                 _entry(
@@ -105,7 +109,9 @@ def _meaning(shown: Sequence[Standing]) -> str:
 
 
 def _order(standing: Standing | None) -> float:
-    return math.inf if standing is None or math.isnan(standing.score.value) else standing.score.value
+    return (
+        math.inf if standing is None or math.isnan(standing.score.value) else standing.score.value
+    )
 
 
 def _totals(policy: str, everything: Sequence[Standing]) -> list[str]:
@@ -132,7 +138,9 @@ def _entry(standings: Sequence[Standing | None], is_best: Sequence[bool]) -> tup
     if found[0].failed:
         parts.append(Part(f"✕{found[0].failed}/{found[0].episodes}", "failure", before=" "))
     intervals = [score.ends for score in scores if score.has_interval]
-    parts += [Part(f"[{three_digits(low)}, {three_digits(high)}]", "small") for low, high in intervals]
+    parts += [
+        Part(f"[{three_digits(low)}, {three_digits(high)}]", "small") for low, high in intervals
+    ]
     return tuple(parts)
 
 
@@ -153,7 +161,9 @@ def claims_table(found: Sequence[Standing]) -> Table:
     learned = [s for s in found if s.is_column and s.training_seeds]
     titles = dict.fromkeys(s.title for s in learned)
     rows = []
-    for (policy, scope, reference), own in group_by(learned, lambda s: (s.policy, s.scope, s.reference)).items():
+    for (policy, scope, reference), own in group_by(
+        learned, lambda s: (s.policy, s.scope, s.reference)
+    ).items():
         changes = [text for s in own for text in (_change(s.base), _beside_base(s.rival, s.base))]
         rows.append([policy, f"{scope}, {reference}", *changes])
     others = ("its base", f"the {BEST_ANALYTIC}")
@@ -163,25 +173,33 @@ def claims_table(found: Sequence[Standing]) -> Table:
 
 def _beside_base(rival: Paired | None, base: Paired | None) -> str:
     """A change against a rival, once where that is the base."""
-    return "the same" if rival is not None and base is not None and rival.to == base.to else _change(rival)
+    return (
+        "the same"
+        if rival is not None and base is not None and rival.to == base.to
+        else _change(rival)
+    )
 
 
 def _change(paired: Paired | None) -> str:
-    """A paired change: its value, its interval, a sign where nothing is shown, and whom it compares with."""
-    return "-" if paired is None else f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
+    """A paired change: its value, its interval, a sign where nothing is shown, and whom it
+    compares with.
+    """
+    return (
+        "-" if paired is None else f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
+    )
 
 
 LEGEND = (
-    "Lower is better. Each cell is a mean over scenarios of means over the episodes that did not fail. Bold is the "
-    "best of its track. A residual has the interquartile mean over training seeds, with the 95 % interval below. ✕ "
-    "counts episodes that failed, such as by a fall. A policy that fails less often ranks first. The column µs is the "
-    "processor time of the policy alone for a control step of one world on one thread. It is a median of one "
-    "interleaved run."
+    "Lower is better. Each cell is a mean over scenarios of means over the episodes that did not"
+    " fail. Bold is the best of its track. A residual has the interquartile mean over training"
+    " seeds, with the 95 % interval below. ✕ counts episodes that failed, such as by a fall. A"
+    " policy that fails less often ranks first. The column µs is the processor time of the policy"
+    " alone for a control step of one world on one thread. It is a median of one interleaved run."
 )
 PAIRED = (
-    "Paired changes on the same episodes: interquartile mean over training seeds with its 95 % interval. Below zero, "
-    f"learning is ahead. {SIGNS_ARE} The best policy without learning is "
-    "the best of the first track in that column and metric, on the same episodes, which favours it."
+    "Paired changes on the same episodes: interquartile mean over training seeds with its 95 %"
+    f" interval. Below zero, learning is ahead. {SIGNS_ARE} The best policy without learning is the"
+    " best of the first track in that column and metric, on the same episodes, which favours it."
 )
 
 
@@ -190,7 +208,10 @@ def legend(found: Sequence[Standing]) -> str:
     meaning = _meaning([s for s in found if s.is_column])
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in found if not s.is_group})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
-    return f"{meaning[:1].upper()}{meaning[1:]}; episodes of a scenario, per training seed: {span}. {LEGEND}"
+    return (
+        f"{meaning[:1].upper()}{meaning[1:]}; episodes of a scenario, per training seed: {span}."
+        f" {LEGEND}"
+    )
 
 
 def leaderboard_markdown(found: Sequence[Standing]) -> str:
@@ -215,7 +236,9 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
-    """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
+    """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they
+    agree.
+    """
     table = folder / "leaderboard.csv"
     text = folder / "leaderboard.md"
     write_table(_HEAD, map(_record, found), table)
@@ -244,7 +267,10 @@ def _record(s: Standing) -> list[Any]:
 
 
 def _cells(estimate: Estimate) -> list[str]:
-    return ["" if value is None else f"{value:.6g}" for value in (estimate.value, estimate.low, estimate.high)]
+    return [
+        "" if value is None else f"{value:.6g}"
+        for value in (estimate.value, estimate.low, estimate.high)
+    ]
 
 
 def _paired_cells(paired: Paired | None) -> list[str]:
@@ -260,7 +286,9 @@ def read_leaderboard(path: Path) -> list[Standing]:
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != _HEAD:
-            raise ConfigurationError(f"{shortened(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}")
+            raise ConfigurationError(
+                f"{shortened(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}"
+            )
         found = [_standing(row) for row in reader]
     if not found:
         raise ConfigurationError(f"{shortened(path)} has no rows")

@@ -24,16 +24,21 @@ class Page:
         """Begin a section, with a paragraph under its title."""
         self.sections.append({"title": title, "text": text, "parts": []})
 
-    def add(self, kind: Kind, content: Any, folded: str | None = None, is_open: bool = False) -> None:
+    def add(
+        self, kind: Kind, content: Any, folded: str | None = None, is_open: bool = False
+    ) -> None:
         """Add to the section.
 
         Args:
             kind: What it is.
             content: A text, texts, pairs of texts, a `Table`, a `Chart`, or the panels of a map.
-            folded: Title under which it is folded away; None if it is not. A chart is drawn when it is unfolded.
+            folded: Title under which it is folded away; None if it is not. A chart is drawn when it
+                is unfolded.
             is_open: Whether it is unfolded at first.
         """
-        self.sections[-1]["parts"].append({"kind": kind, "content": content, "folded": folded, "is_open": is_open})
+        self.sections[-1]["parts"].append(
+            {"kind": kind, "content": content, "folded": folded, "is_open": is_open}
+        )
 
     def html(self, plotly_js: str) -> str:
         """The whole page, with the source of plotly.js in it."""

@@ -54,7 +54,8 @@ class Part:
 
     Attributes:
         text: Plain text.
-        style: Look of it: bold; small, on a line below; a failure; a badge; or the colour of a verdict.
+        style: Look of it: bold; small, on a line below; a failure; a badge; or the colour of a
+            verdict.
         before: Plain text between it and the part before.
     """
 
@@ -77,8 +78,8 @@ class Head:
         second: Second part of the title, on a line of its own where there is room for lines.
         is_number: Whether it holds figures, to the right, or words.
         wraps: Whether its words may stand on several lines of a terminal, but for the longest.
-        leaves: Turn in which it is left out where a terminal has no room: 1 before 2; 0 for never. The last one of
-            those that may leave stays.
+        leaves: Turn in which it is left out where a terminal has no room: 1 before 2; 0 for never.
+            The last one of those that may leave stays.
         titles: Whether the title of the table may name its value, if it has but one.
     """
 
@@ -128,7 +129,8 @@ class Table:
     Attributes:
         heads: Its columns.
         rows: Its rows.
-        keys: Columns that name a row. Where a terminal or a page repeats them, they stand once, but for the last one.
+        keys: Columns that name a row. Where a terminal or a page repeats them, they stand once, but
+            for the last one.
         title: Above it on a terminal.
         subjects: Names before the title.
         caption: Below it on a terminal.
@@ -144,7 +146,9 @@ class Table:
     kind: str = ""
 
     @classmethod
-    def plain(cls, head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1, **more: Any) -> "Table":
+    def plain(
+        cls, head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1, **more: Any
+    ) -> "Table":
         """A table of texts whose first columns hold words and the others figures."""
         heads = tuple(Head(title, is_number=number >= words) for number, title in enumerate(head))
         return cls(heads, tuple(Row(tuple(row)) for row in rows), keys=words, **more)
@@ -156,7 +160,11 @@ class Table:
     def without(self, place: int) -> "Table":
         """The same without a column."""
         rows = (
-            row if row.kind == "heading" else replace(row, cells=row.cells[:place] + row.cells[place + 1 :])
+            (
+                row
+                if row.kind == "heading"
+                else replace(row, cells=row.cells[:place] + row.cells[place + 1 :])
+            )
             for row in self.rows
         )
         heads = self.heads[:place] + self.heads[place + 1 :]
@@ -170,7 +178,11 @@ class Table:
         for row in self.rows:
             is_heading = row.kind == "heading"
             said = 0
-            while not is_heading and said < self.keys - 1 and row.cells[: said + 1] == before[: said + 1]:
+            while (
+                not is_heading
+                and said < self.keys - 1
+                and row.cells[: said + 1] == before[: said + 1]
+            ):
                 said += 1
             found.append(replace(row, cells=("",) * said + row.cells[said:]))
             before = () if is_heading else row.cells
@@ -207,7 +219,8 @@ def write_table(head: Iterable[str], rows: Iterable[Iterable[object]], path: Pat
 
 
 def print_table(table: Table, console: Console, file: str) -> None:
-    """Print a table without the columns that the terminal has no room for, and name those and who has them.
+    """Print a table without the columns that the terminal has no room for, and name those and who
+    has them.
 
     Args:
         table: The table.
@@ -227,7 +240,9 @@ def print_table(table: Table, console: Console, file: str) -> None:
         shown = shown.without(place)
     console.print(fitting)
     if left_out:
-        console.print(f"no room for {'; '.join(left_out)}; {file} has them", style="dim", markup=False)
+        console.print(
+            f"no room for {'; '.join(left_out)}; {file} has them", style="dim", markup=False
+        )
 
 
 def _fit(table: Table, console: Console) -> RichTable | None:
@@ -275,7 +290,9 @@ def _terminal(table: Table, breaks_words: bool = False) -> RichTable:
     is_first = True
     for row in table.sparse:
         is_heading = row.kind == "heading"
-        if not is_first and (is_heading or ("" not in row.cells[: table.keys - 1][:1] and table.keys > 1)):
+        if not is_first and (
+            is_heading or ("" not in row.cells[: table.keys - 1][:1] and table.keys > 1)
+        ):
             found.add_section()
         is_first = False
         cells = [_terminal_cell(cell) for cell in row.cells]
@@ -316,7 +333,9 @@ def _markdown_cell(cell: Cell) -> str:
         "ceiling": "({})",
         "pooled": "({})",
     }
-    return "".join(part.before + looks.get(part.style, "{}").format(markdown_text(part.text)) for part in cell)
+    return "".join(
+        part.before + looks.get(part.style, "{}").format(markdown_text(part.text)) for part in cell
+    )
 
 
 def _csv(table: Table) -> str:

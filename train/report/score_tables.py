@@ -15,14 +15,15 @@ from train.evaluate.table import EpisodeTable, score
 from train.report.render import Head, Row, Table, number_interval, print_table, write_table
 
 SCORES = (
-    "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "
-    "95 % interval."
+    "Mean over the episodes that reached the end; of residuals the interquartile mean over training"
+    " seeds, with its 95 % interval."
 )
 """Meaning of the tables of scores."""
 ROBOTS = (
-    "Over the robots of each cell that did not fail: mean, interquartile mean, and mean of the worst tenth. Better "
-    "than: share of the robots for which the policy is better, ties as one half; to fail is worse than any value. Of "
-    "residuals interquartile means over training seeds with 95 % intervals."
+    "Over the robots of each cell that did not fail: mean, interquartile mean, and mean of the"
+    " worst tenth. Better than: share of the robots for which the policy is better, ties as one"
+    " half; to fail is worse than any value. Of residuals interquartile means over training seeds"
+    " with 95 % intervals."
 )
 """Meaning of the tables of drawn robots."""
 
@@ -50,27 +51,41 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
         for column in columns:
             for at, ratio in zip(curves.decisions, curves.ratios[column.metric].T, strict=True):
                 known = ratio[np.isfinite(ratio)]
-                values = (np.median(known), known.min(), known.max()) if len(known) else (np.nan,) * 3
-                rows.append([title, column.title, f"{at:.0f}", *(f"{value:.2f}" for value in values)])
-    return Table.plain(["residual", "metric", "decisions", "median", "best", "worst"], rows, words=2)
+                values = (
+                    (np.median(known), known.min(), known.max()) if len(known) else (np.nan,) * 3
+                )
+                rows.append(
+                    [title, column.title, f"{at:.0f}", *(f"{value:.2f}" for value in values)]
+                )
+    return Table.plain(
+        ["residual", "metric", "decisions", "median", "best", "worst"], rows, words=2
+    )
 
 
 def robots_table(found: Sequence[RobotScores]) -> Table:
     """All scores over drawn robots, a row per cell and metric."""
     heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy", "metric")]
-    heads += [Head(name) for name in ("mean", "interquartile mean", "worst tenth", found[0].failure)]
+    heads += [
+        Head(name) for name in ("mean", "interquartile mean", "worst tenth", found[0].failure)
+    ]
     heads += [Head("better than", is_number=False)]
     rows = []
     for row in found:
-        figures = [number_interval(estimate, row.column) for estimate in (row.mean, row.middle, row.worst)]
-        better = "; ".join(f"{title}: {percent_interval(e, signed=False)}" for title, e in row.better.items())
+        figures = [
+            number_interval(estimate, row.column) for estimate in (row.mean, row.middle, row.worst)
+        ]
+        better = "; ".join(
+            f"{title}: {percent_interval(e, signed=False)}" for title, e in row.better.items()
+        )
         names = [row.reference, row.scenario, row.policy, row.column.label]
         rows.append(Row((*names, *figures, f"{row.failed}/{row.episodes}", better or "-")))
     return Table(tuple(heads), tuple(rows), keys=4)
 
 
 def print_robots(found: Sequence[RobotScores], console: Console) -> None:
-    """Print a line per policy with all metrics, under the motion and the scenario, where there is anything to print."""
+    """Print a line per policy with all metrics, under the motion and the scenario, where there
+    is anything to print.
+    """
     if not found:
         return
     columns = list(dict.fromkeys(row.column for row in found))
@@ -82,14 +97,21 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
             figures = {row.column: _three(row) for row in own}
             failed = f"{own[0].failed}/{own[0].episodes}"
             rows.append(Row((policy, *(figures[column] for column in columns), failed)))
-    title = "over the drawn robots that did not fail: mean / interquartile mean / mean of the worst tenth"
-    print_table(Table((*heads, Head(found[0].failure)), tuple(rows), title=title), console, "robots.csv")
+    title = (
+        "over the drawn robots that did not fail: mean / interquartile mean / mean of the worst"
+        " tenth"
+    )
+    print_table(
+        Table((*heads, Head(found[0].failure)), tuple(rows), title=title), console, "robots.csv"
+    )
 
 
 def _three(row: RobotScores) -> str:
     """Mean, interquartile mean and worst tenth in the unit in which they are shown."""
     values = (row.column.scale * estimate.value for estimate in (row.mean, row.middle, row.worst))
-    return " / ".join("-" if np.isnan(value) else f"{value:.{row.column.decimals}f}" for value in values)
+    return " / ".join(
+        "-" if np.isnan(value) else f"{value:.{row.column.decimals}f}" for value in values
+    )
 
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:

@@ -37,11 +37,15 @@ class PageChart:
 def page_chart(chart: Chart) -> PageChart:
     """The panels of a chart one below the other, with a legend on top."""
     count = len(chart.panels)
-    names = dict.fromkeys(curve.name for panel in chart.panels for curve in panel.curves if curve.name)
+    names = dict.fromkeys(
+        curve.name for panel in chart.panels for curve in panel.curves if curve.name
+    )
     strip = 24 * len(chart.failing) + 12 if chart.failing else 0
     height = 130 + chart.panel_height * count + strip
     top = 1.0 - strip / height if strip else 1.0
-    layout = base_layout(left=76, top=28 + 20 * -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW), bottom=50)
+    layout = base_layout(
+        left=76, top=28 + 20 * -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW), bottom=50
+    )
     data: list[Spec] = []
     for number, panel in enumerate(chart.panels):
         axis = nth(number)
@@ -121,7 +125,9 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
 
 
 def _abscissa(x: Array) -> Spec:
-    """Points of the axis; of many that are evenly spaced the first one and the distance, which is shorter."""
+    """Points of the axis; of many that are evenly spaced the first one and the distance, which
+    is shorter.
+    """
     if len(x) < 20:
         return {"x": x.tolist()}
     return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}

@@ -1,4 +1,5 @@
-"""The summary of a comparison: medians over the episodes of every cell, on the terminal and as Markdown.
+"""The summary of a comparison: medians over the episodes of every cell, on the terminal and as
+Markdown.
 
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
@@ -18,7 +19,9 @@ from train.runs.escaping import markdown_text, write_records
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print the summary with as many columns as the terminal has room for; what policies are judged by stays."""
+    """Print the summary with as many columns as the terminal has room for; what policies are
+    judged by stays.
+    """
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
     print_table(summary_table(evaluations, columns), console, "summary.md")
@@ -26,13 +29,16 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
         console.print(note, markup=False)
 
 
-def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False) -> Table:
+def summary_table(
+    evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False
+) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
 
     Args:
         evaluations: The cells, of one environment.
         columns: Metrics to show.
-        worst: Whether the episode that is farthest from zero stands in brackets, where there are several.
+        worst: Whether the episode that is farthest from zero stands in brackets, where there are
+            several.
     """
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
@@ -45,7 +51,9 @@ def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], 
     for e in evaluations:
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
-        values = [f"{condition.swept[name]:g}" if name in condition.swept else "-" for name in swept]
+        values = [
+            f"{condition.swept[name]:g}" if name in condition.swept else "-" for name in swept
+        ]
         figures = [_median(e, column, worst) for column in columns]
         rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
     title = f"{known.subject}, median over episodes"
@@ -64,7 +72,9 @@ def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
-    """How and, on the walker, when the episodes of a cell ended, median [s], for the cells in which all failed."""
+    """How and, on the walker, when the episodes of a cell ended, median [s], for the cells in
+    which all failed.
+    """
     cells = {(e.condition.reference_name, e.condition.scenario) for e in evaluations}
     notes = []
     for e in evaluations:
@@ -82,11 +92,15 @@ def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
 
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
-    return write_records([episode for evaluation in evaluations for episode in evaluation.episodes], path)
+    return write_records(
+        [episode for evaluation in evaluations for episode in evaluation.episodes], path
+    )
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """The summary table and its splits as Markdown: medians, and the worst episode in brackets; by environment."""
+    """The summary table and its splits as Markdown: medians, and the worst episode in brackets;
+    by environment.
+    """
     groups = groupby(evaluations, key=lambda evaluation: evaluation.condition.env)
     parts = [part for _, group in groups for part in _parts(list(group))]
     write_whole(path, "\n\n".join(parts) + "\n")
@@ -97,7 +111,9 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     """The parts of a summary of one environment."""
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
-    statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
+    statistic = "Median over the episodes that did not fail" + (
+        " (the worst of them in brackets)" if several else ""
+    )
     parts = [
         f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside.",
         _legend(known, known.columns),

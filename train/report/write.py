@@ -1,4 +1,6 @@
-"""The report of a comparison: `report.html`, which works without a network, and its tables as Markdown."""
+"""The report of a comparison: `report.html`, which works without a network, and its tables as
+Markdown.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +35,9 @@ _LONG = 40
 _POINTS = 600
 _LEAST_POINTS = 250
 _ALL_POINTS = 6000
-"""Points of a curve, at most and at least, and of all cells together, so that a large comparison stays small."""
+"""Points of a curve, at most and at least, and of all cells together, so that a large comparison
+stays small.
+"""
 
 
 def require_plotly() -> str:
@@ -81,8 +85,8 @@ def _page(results: Results) -> Page:
     if results.learning:
         page.section(
             "Learning curves",
-            "Score over that of the base (dotted) on episodes that training never sees, mean over the trained "
-            "scenarios: median over training seeds, band from the best to the worst.",
+            "Score over that of the base (dotted) on episodes that training never sees, mean over"
+            " the trained scenarios: median over training seeds, band from the best to the worst.",
         )
         chart = learning_chart(results.learning, known.judged, results.colours)
         page.add("chart", page_chart(chart))
@@ -109,19 +113,24 @@ def _add_leaderboard(page: Page, results: Results) -> None:
 
 
 def _add_maps(page: Page, results: Results) -> None:
-    """Heat maps: who is best, learning against the best policy without it, and folded away every policy's score."""
+    """Heat maps: who is best, learning against the best policy without it, and folded away every
+    policy's score.
+    """
     if not results.maps:
         return
     page.section(
         "Maps",
-        "Who is best where, and what learning changes against the best policy without it, in per cent: green and below "
-        f"zero, learning is ahead; red and above zero, it is behind. {SIGNS_ARE} A cross counts failed episodes.",
+        "Who is best where, and what learning changes against the best policy without it, in per"
+        " cent: green and below zero, learning is ahead; red and above zero, it is behind."
+        f" {SIGNS_ARE} A cross counts failed episodes.",
     )
     for heat_map in results.maps:
         found = panels(heat_map)
         page.add("heading", capital(f"{heat_map.column.title}, {heat_map.title}"))
         page.add("map", [panel for panel in found if panel.is_main])
-        page.add("map", [panel for panel in found if not panel.is_main], folded="Scores of every policy")
+        page.add(
+            "map", [panel for panel in found if not panel.is_main], folded="Scores of every policy"
+        )
 
 
 def _add_ladder(page: Page, results: Results) -> None:
@@ -132,7 +141,8 @@ def _add_ladder(page: Page, results: Results) -> None:
     )
     page.section(
         "Ladder of policies",
-        f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}",
+        "Mean over the episodes that reached the end; lower is better, and the axis is"
+        f" logarithmic.{seeds}",
     )
     references = results.table.references
     for number, reference in enumerate(references):
@@ -153,11 +163,16 @@ def _add_changes(page: Page, results: Results) -> None:
         if not rows:
             continue
         drawn = results.has_conditions
-        marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
+        marks = (
+            " Open circles are held out, stars are ceilings on the training condition."
+            if drawn
+            else ""
+        )
         page.section(
             name,
-            "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
-            f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}",
+            "Change on the same episodes, with 95 % intervals over training seeds. Green: the"
+            " interval lies below zero; red: above; grey: it includes zero, or there are too few"
+            f" training seeds.{marks}",
         )
         for title in dict.fromkeys(row.policy for row in rows if drawn):
             own = [row for row in rows if row.policy == title and row.is_judged]
@@ -167,13 +182,16 @@ def _add_changes(page: Page, results: Results) -> None:
     if others:
         page.section(
             name_of_others,
-            "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
+            "Paired differences of means. Baselines are not trained: there are no training seeds to"
+            " draw from.",
         )
         _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
 def _add_robots(page: Page, results: Results) -> None:
-    """Scores over drawn robots: the middle half, the worst tenth, and how many robots are better off."""
+    """Scores over drawn robots: the middle half, the worst tenth, and how many robots are better
+    off.
+    """
     if not results.robots:
         return
     page.section("Drawn robots", ROBOTS)
@@ -200,7 +218,9 @@ def _add_curves(page: Page, results: Results) -> None:
     shade = " Single support is shaded." if table.environment.splits else ""
     text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
     page.section("Curves over time", text)
-    most = min(_POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(table.references) * len(table.scenarios))))
+    most = min(
+        _POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(table.references) * len(table.scenarios)))
+    )
     traced = [e for e in results.evaluations if e.trace]
     cells = group_by(traced, lambda e: (e.condition.reference_name, e.condition.scenario))
     for number, ((reference, scenario), own) in enumerate(cells.items()):
@@ -226,8 +246,9 @@ def _add_sweeps(page: Page, results: Results) -> None:
         return
     page.section(
         "Sweeps",
-        "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
-        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
+        "Means over the episodes that reached the end. A cross on top: all episodes of a policy"
+        " failed there; an open one: some did."
+        + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
     )
     for number, (title, cells, label) in enumerate(charts):
         chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)

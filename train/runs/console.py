@@ -17,8 +17,9 @@ from train.runs.escaping import visible
 class PlainConsole(Console):
     """Rich's console that shows the commands of a terminal within texts, in place of obeying them.
 
-    Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that was received. A
-    text that is printed is no markup of Rich's either, unless `markup=True` asks for it.
+    Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that
+    was received. A text that is printed is no markup of Rich's either, unless `markup=True` asks
+    for it.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -28,18 +29,26 @@ class PlainConsole(Console):
         """Print texts as they are, without markup."""
         highlight = options.get("highlight")
         parts = [
-            self.render_str(part, markup=markup is True, highlight=highlight) if isinstance(part, str) else part
+            (
+                self.render_str(part, markup=markup is True, highlight=highlight)
+                if isinstance(part, str)
+                else part
+            )
             for part in objects
         ]
         super().print(*parts, **options)
 
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
         """Render with visible texts, and what Rich itself asks of the terminal stays."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
 
 
-def make_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any) -> Table:
+def make_table(
+    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
+) -> Table:
     """A table of plain texts.
 
     Args:

@@ -1,7 +1,8 @@
-"""Text of a user, such as the label of a policy, in the formats of results: each has signs that mean something.
+"""Text of a user, such as the label of a policy, in the formats of results: each has signs that
+mean something.
 
-All outlets go through `visible`: the console, tables of CSV, Markdown and the page of a report. What a terminal would
-obey, and what turns the order of letters around, is shown as �.
+All outlets go through `visible`: the console, tables of CSV, Markdown and the page of a report.
+What a terminal would obey, and what turns the order of letters around, is shown as �.
 """
 
 import csv
@@ -24,7 +25,9 @@ _COMMANDS = re.compile(
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of writing
     "\ud800-\udfff]"  # halves of characters, which no stream takes
 )
-_LINK = re.compile(r"\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\.", re.IGNORECASE)
+_LINK = re.compile(
+    r"\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\.", re.IGNORECASE
+)
 """Signs of Markdown without which a text is no link and no image."""
 _BACKSLASH = re.compile(r"\\(?=[!-/:-@[-`{-~])")
 """A backslash that Markdown would take away, with what is behind it."""
@@ -32,12 +35,16 @@ _IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
 
 
 def visible(text: str) -> str:
-    """Text without anything that a terminal obeys or that turns letters around; tabs and newlines stay."""
+    """Text without anything that a terminal obeys or that turns letters around; tabs and
+    newlines stay.
+    """
     return _COMMANDS.sub("�", text)
 
 
 def csv_cell(value: Any) -> Any:
-    """A cell of a CSV file; text that a spreadsheet would take for a formula gets an apostrophe in front."""
+    """A cell of a CSV file; text that a spreadsheet would take for a formula gets an apostrophe
+    in front.
+    """
     if not isinstance(value, str):
         return value
     text = visible(value)
@@ -87,8 +94,12 @@ def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Seq
 
 
 def script_json(value: Any) -> str:
-    """JSON that can stand in a script element: nothing in it ends the element or begins a comment."""
-    text = json.dumps(_visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    """JSON that can stand in a script element: nothing in it ends the element or begins a
+    comment.
+    """
+    text = json.dumps(
+        _visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False
+    )
     return text.translate(_IN_SCRIPT)
 
 
@@ -102,7 +113,9 @@ def _visible_data(value: Any) -> Any:
 
 
 def template_value(value: Any) -> Any:
-    """A value for a page: plain text is made visible; HTML that a template made is a type of its own."""
+    """A value for a page: plain text is made visible; HTML that a template made is a type of its
+    own.
+    """
     return visible(value) if type(value) is str else value
 
 

@@ -39,11 +39,15 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class EndedError(KeyboardInterrupt):
-    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
+    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off,
+    and saying so.
+    """
 
 
 def explain(error: BaseException) -> tuple[str, int] | None:
-    """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
+    """Sentence and exit code of a failure; None for a defect, of which the traceback is worth
+    having.
+    """
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
     from elastic_env.core.errors import ElasticError, missing_extra, shortened
@@ -65,12 +69,18 @@ def explain(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """True if it is Ctrl-C, which a module that is being loaded or a call of C may turn into an error of its own."""
-    return any(isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error))
+    """True if it is Ctrl-C, which a module that is being loaded or a call of C may turn into an
+    error of its own.
+    """
+    return any(
+        isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error)
+    )
 
 
 def _quotes_interrupt(error: BaseException) -> bool:
-    """True if `ctypes` met Ctrl-C while it converted an argument: its error only quotes the exception."""
+    """True if `ctypes` met Ctrl-C while it converted an argument: its error only quotes the
+    exception.
+    """
     names = (KeyboardInterrupt.__name__, EndedError.__name__)
     return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
 

@@ -1,4 +1,6 @@
-"""Result folders: never overwritten, each with the configuration, seed, versions and commit that made it."""
+"""Result folders: never overwritten, each with the configuration, seed, versions and commit that
+made it.
+"""
 
 import contextlib
 import errno
@@ -12,12 +14,17 @@ import subprocess
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
-from elastic_env.core.errors import ConfigurationError, ResultsExistError, SystemFailedError, shortened
+from elastic_env.core.errors import (
+    ConfigurationError,
+    ResultsExistError,
+    SystemFailedError,
+    shortened,
+)
 from elastic_env.core.files import leads_out, write_whole
 from elastic_env.core.yaml_text import yaml_of
 
@@ -30,10 +37,21 @@ _LOCK = ".lock"
 _RETRY_S = 0.2
 _LONGEST_HOLDER = 200
 """Characters of a lock that say who holds it."""
-_PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
+_PACKAGES = (
+    "elastic-env",
+    "mujoco",
+    "gymnasium",
+    "pin",
+    "numpy",
+    "scipy",
+    "stable-baselines3",
+    "torch",
+)
 
 
-def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None) -> Path:
+def new_run(
+    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
+) -> Path:
     """Create a result folder and write down what its results depend on.
 
     Args:
@@ -60,7 +78,9 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
-    """Write down anew what the results of a run depend on, when it is gone on with; arguments as `new_run`."""
+    """Write down anew what the results of a run depend on, when it is gone on with; arguments as
+    `new_run`.
+    """
     for file, text in _description(configuration, seed).items():
         write_whole(folder / file, text)
 
@@ -82,27 +102,33 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
         writer: Who made such a folder, in words.
 
     Raises:
-        ConfigurationError: The folder has no configuration, or something in it is a link that leads out of it, or
-            neither a file nor a folder.
+        ConfigurationError: The folder has no configuration, or something in it is a link that leads
+            out of it, or neither a file nor a folder.
     """
     file = folder / CONFIG
     if not file.is_file():
-        raise ConfigurationError(f"{folder} is no {what}: it has no {CONFIG}; name the folder that {writer}")
+        raise ConfigurationError(
+            f"{folder} is no {what}: it has no {CONFIG}; name the folder that {writer}"
+        )
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(place, name)
             kind = path.lstat().st_mode
             if stat.S_ISLNK(kind) and leads_out(path, folder):
                 raise ConfigurationError(
-                    f"{path} is a link that leads out of {folder}, where nothing is to be changed; remove it"
+                    f"{path} is a link that leads out of {folder}, where nothing is to be changed;"
+                    " remove it"
                 )
             if not (stat.S_ISLNK(kind) or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-                raise ConfigurationError(f"{path} is neither a file nor a folder, as all of a run are; remove it")
+                raise ConfigurationError(
+                    f"{path} is neither a file nor a folder, as all of a run are; remove it"
+                )
     return file
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:
-    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if taken.
+    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if
+    taken.
 
     It is made in one step, so that of several programs each gets another one.
 
@@ -117,7 +143,8 @@ def free_folder(name: str, output: Path | None = None) -> Path:
         place = RUNS if output is None else output
         what = f"{shortened(error.filename or place)}: {error.strerror or error}"
         raise SystemFailedError(
-            f"no folder for results can be made at {shortened(place)} ({what}); name one by --output"
+            f"no folder for results can be made at {shortened(place)} ({what}); name one by"
+            " --output"
         ) from None
 
 
@@ -129,8 +156,8 @@ def require_name(name: str) -> str:
     """
     if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
         raise ConfigurationError(
-            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r}; to write "
-            "elsewhere, name a folder by --output"
+            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r};"
+            " to write elsewhere, name a folder by --output"
         )
     return name
 
@@ -152,7 +179,8 @@ def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
             if time.monotonic() >= last:
                 holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
                 raise ConfigurationError(
-                    f"another program, process {holder}, works on {folder}; wait until it has ended, or end it"
+                    f"another program, process {holder}, works on {folder}; wait until it has"
+                    " ended, or end it"
                 )
             time.sleep(_RETRY_S)
         file.truncate(0)
@@ -168,7 +196,9 @@ def _open_lock(path: Path) -> TextIO:
         ConfigurationError: It is one of these.
     """
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(
+            path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666
+        )
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise _no_lock(path) from None
@@ -181,7 +211,9 @@ def _open_lock(path: Path) -> TextIO:
 
 
 def _no_lock(path: Path) -> ConfigurationError:
-    return ConfigurationError(f"{path} must be a plain file with one name, it is a link or something else; remove it")
+    return ConfigurationError(
+        f"{path} must be a plain file with one name, it is a link or something else; remove it"
+    )
 
 
 def _take_lock(lock: TextIO) -> bool:
@@ -195,7 +227,9 @@ def _take_lock(lock: TextIO) -> bool:
 
 @contextmanager
 def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
-    """`lock_run` for a part of a run, whose folder is made; it goes again if the work fails without a result."""
+    """`lock_run` for a part of a run, whose folder is made; it goes again if the work fails
+    without a result.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with lock_run(folder, patience_s):
         try:
@@ -208,7 +242,9 @@ def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
 
 @contextmanager
 def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
-    """`free_folder` for the work within; it goes again if that fails without having written anything."""
+    """`free_folder` for the work within; it goes again if that fails without having written
+    anything.
+    """
     folder = free_folder(name, output)
     try:
         yield folder
@@ -223,7 +259,8 @@ def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
 def run_folder(
     name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:
-    """A new run for the work within; it goes again if the work is interrupted or fails without a result.
+    """A new run for the work within; it goes again if the work is interrupted or fails without a
+    result.
 
     Arguments and errors as `new_run`.
     """
@@ -246,7 +283,9 @@ def _remove(folder: Path, files: Iterable[str]) -> None:
 
 
 def _next_free(name: str) -> Path:
-    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one program alone."""
+    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one
+    program alone.
+    """
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
@@ -258,11 +297,14 @@ def _next_free(name: str) -> Path:
 
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
-        raise ResultsExistError(f"{shortened(folder)} is a file; name a folder that is new or empty")
+        raise ResultsExistError(
+            f"{shortened(folder)} is a file; name a folder that is new or empty"
+        )
     if folder.exists() and any(folder.iterdir()):
         raise ResultsExistError(
-            f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), "
-            "which are never overwritten; name another folder, or leave --output out"
+            f"{folder} already holds results"
+            f" ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), which are never"
+            " overwritten; name another folder, or leave --output out"
         )
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -271,7 +313,7 @@ def _empty(folder: Path) -> Path:
 def provenance(seed: int | None) -> dict[str, Any]:
     """When, from which commit and with which versions something is made."""
     return {
-        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),  # noqa: UP017  Python 3.11 has both
+        "created": (datetime.now(UTC).isoformat(timespec="seconds")),
         "seed": seed,
         "commit": _commit(),
         "python": platform.python_version(),
@@ -289,7 +331,9 @@ def installed_version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the source tree, with a + where it has uncommitted changes; None outside a repository."""
+    """Commit of the source tree, with a + where it has uncommitted changes; None outside a
+    repository.
+    """
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str:
@@ -298,6 +342,8 @@ def _commit() -> str | None:
         ).stdout.strip()
 
     try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+        return git("rev-parse", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
     except (OSError, subprocess.SubprocessError):
         return None

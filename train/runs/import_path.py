@@ -1,7 +1,8 @@
 """The path of imports: what is installed comes first, in the working folder last.
 
-Python puts the working folder, or a script's own, first: a user's `train.py` would then stand before our package, and a
-`multiprocessing.py` before the standard library, also in each process that is started.
+Python puts the working folder, or a script's own, first: a user's `train.py` would then stand
+before our package, and a `multiprocessing.py` before the standard library, also in each process
+that is started.
 """
 
 import importlib.util
@@ -43,14 +44,16 @@ def _require_ours() -> None:
         found = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
         if found != own:
             raise ShadowedError(
-                f"{found or name} stands in the place of the package {name} of elastic-env, {own.parent}; rename it, "
-                "or take its folder out of PYTHONPATH"
+                f"{found or name} stands in the place of the package {name} of elastic-env,"
+                f" {own.parent}; rename it, or take its folder out of PYTHONPATH"
             )
 
 
 @contextmanager
 def safe_children() -> Iterator[None]:
-    """Processes of Python that are started within do not look for modules in the working folder first."""
+    """Processes of Python that are started within do not look for modules in the working folder
+    first.
+    """
     before = os.environ.get(_SAFE)
     os.environ[_SAFE] = "1"
     try:

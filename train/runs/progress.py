@@ -8,7 +8,14 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
@@ -41,16 +48,20 @@ class Say(Protocol):
 
 
 def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -> Say:
-    """A function that takes the share of the work that is done, and says each tenth of it in a line.
+    """A function that takes the share of the work that is done, and says each tenth of it in a
+    line.
 
-    Long work is announced early, with the time that it will take. A line with a note ends with the time to go.
+    Long work is announced early, with the time that it will take. A line with a note ends with the
+    time to go.
 
-    For work beside a control loop and work that is timed, from which the thread of a bar would take time, and for logs.
+    For work beside a control loop and work that is timed, from which the thread of a bar would take
+    time, and for logs.
 
     Args:
         console: Where it says so.
         least_s: Shortest time between two lines, and before the first one [s].
-        unit: What is counted, such as control steps; a line with a note names it, since the note counts others.
+        unit: What is counted, such as control steps; a line with a note names it, since the note
+            counts others.
     """
     said = 0
     when = time.monotonic()
@@ -90,7 +101,8 @@ def duration(seconds: float) -> str:
 def show_progress(
     console: Console, totals: Mapping[str, int], transient: bool = False, unit: str = "work"
 ) -> Iterator[Show]:
-    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there is none.
+    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there
+    is none.
 
     Args:
         console: Where it is shown.
@@ -104,10 +116,17 @@ def show_progress(
     if not console.is_terminal:
         yield _lines(console, totals, unit)
         return
-    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
     with Progress(*columns, *noted, console=console, transient=transient) as bar:
-        tasks = [bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()]
+        tasks = [
+            bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()
+        ]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])
@@ -129,7 +148,8 @@ def _lines(console: Console, totals: Mapping[str, int], unit: str) -> Callable[.
 
 @contextmanager
 def say_what_is_compiled(console: Console) -> Iterator[None]:
-    """Say in one line that functions are compiled, when the first one is within; nothing where all are loaded.
+    """Say in one line that functions are compiled, when the first one is within; nothing where all
+    are loaded.
 
     Args:
         console: Where it is said.

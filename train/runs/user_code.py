@@ -1,8 +1,9 @@
 """Code of the user that a name stands for: "module:function", or "FILE.py:function".
 
-Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual folder runs code. A
-configuration that was found in the folder of a run, rather than named by the user, is read within `code_refused`: all
-imports go through `named_object`, which then imports nothing.
+Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual
+folder runs code. A configuration that was found in the folder of a run, rather than named by the
+user, is read within `code_refused`: all imports go through `named_object`, which then imports
+nothing.
 """
 
 import importlib
@@ -49,8 +50,8 @@ def require_no_code(file: Path, names: Iterable[str]) -> None:
 
 def _trust_error(file: Path, name: str) -> ConfigurationError:
     return ConfigurationError(
-        f"{file} names {shown(name)}, whose code would run; look at it, then say --trust-code, or name a "
-        "configuration of yours"
+        f"{file} names {shown(name)}, whose code would run; look at it, then say --trust-code, or"
+        " name a configuration of yours"
     )
 
 
@@ -58,11 +59,12 @@ def named_object(name: str) -> Any:
     """The object that a name stands for.
 
     Args:
-        name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be on the module path.
+        name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be
+            on the module path.
 
     Raises:
-        ConfigurationError: There is no such module, file or attribute, or it fails while it is imported; or code is
-            refused here, and nothing was imported.
+        ConfigurationError: There is no such module, file or attribute, or it fails while it is
+            imported; or code is refused here, and nothing was imported.
     """
     if (file := _REFUSED_IN.get()) is not None:
         raise _trust_error(file, name)
@@ -70,23 +72,33 @@ def named_object(name: str) -> Any:
     try:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{shortened(place)} cannot be imported: {type(error).__name__}: {error}") from error
+        raise ConfigurationError(
+            f"{shortened(place)} cannot be imported: {type(error).__name__}: {error}"
+        ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
-        own = [f.__name__ for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
+        own = [
+            f.__name__
+            for f in vars(module).values()
+            if inspect.isfunction(f) and f.__module__ == module.__name__
+        ]
         raise ConfigurationError(
-            f"{shortened(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
+            f"{shortened(place)} has no {attribute!r}; its functions are:"
+            f" {', '.join(own) or 'none'}"
         )
     return getattr(module, attribute)
 
 
 def _require_unshadowed(module: ModuleType, attribute: str) -> None:
-    """Refuse a module that was meant to be a file of the working folder, which is looked at last."""
+    """Refuse a module that was meant to be a file of the working folder, which is looked at
+    last.
+    """
     file = Path(f"{module.__name__.replace('.', '/')}.py")
     found = getattr(module, "__file__", None)
     if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):
         raise ConfigurationError(
-            f"{found or 'a built-in module'} stands before your {file}; name the file itself: {file}:{attribute}"
+            f"{found or 'a built-in module'} stands before your {file}; name the file itself:"
+            f" {file}:{attribute}"
         )
 
 

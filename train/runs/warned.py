@@ -1,4 +1,6 @@
-"""Warnings of long work: each text once, whatever the number of environments and processes that give it."""
+"""Warnings of long work: each text once, whatever the number of environments and processes that
+give it.
+"""
 
 import warnings
 from collections.abc import Iterable, Iterator
@@ -10,7 +12,9 @@ _SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
 
 
 def said_so_far() -> frozenset[str]:
-    """Texts that were shown within `each_once`; processes are told them, so that they do not show them again."""
+    """Texts that were shown within `each_once`; processes are told them, so that they do not
+    show them again.
+    """
     return frozenset(_SAID.get() or ())
 
 

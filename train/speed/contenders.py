@@ -1,4 +1,6 @@
-"""Contenders of `elastic speed`: each plays control steps of one environment and says how long it took."""
+"""Contenders of `elastic speed`: each plays control steps of one environment and says how long
+it took.
+"""
 
 import itertools
 import threading
@@ -41,7 +43,9 @@ class Contender(ABC):
 
     @abstractmethod
     def run(self, steps: int) -> float:
-        """Play about so many control steps in every world; control steps per second of all worlds together."""
+        """Play about so many control steps in every world; control steps per second of all
+        worlds together.
+        """
 
     def close(self) -> None:
         """End what it has started."""
@@ -49,10 +53,17 @@ class Contender(ABC):
 
 
 class VectorLoop(Contender):
-    """Our vector environment, with zero offsets or a policy in its loop; keeps the servo inputs of its last run."""
+    """Our vector environment, with zero offsets or a policy in its loop; keeps the servo inputs
+    of its last run.
+    """
 
     def __init__(
-        self, env: str, num_envs: int, threads: int, policy: str | None = None, residual: bool = False
+        self,
+        env: str,
+        num_envs: int,
+        threads: int,
+        policy: str | None = None,
+        residual: bool = False,
     ) -> None:
         self.title = f"vector env{_with(policy, residual)}"
         self.num_envs = num_envs
@@ -69,7 +80,9 @@ class VectorLoop(Contender):
         self.controls = np.empty((0, *self.env.unwrapped.simulation.ctrl.shape))
 
     def run(self, steps: int) -> float:
-        """Play about so many control steps in every world; control steps per second of all worlds."""
+        """Play about so many control steps in every world; control steps per second of all
+        worlds.
+        """
         ctrl = self.env.unwrapped.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
@@ -82,7 +95,9 @@ class VectorLoop(Contender):
     def step(self) -> None:
         """One control period in every world."""
         if self._policy is not None:
-            self._action, self._state = self._policy.predict(self._observation, self._state, self._start, True)
+            self._action, self._state = self._policy.predict(
+                self._observation, self._state, self._start, True
+            )
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
         # a world that ends begins a step later
         self._start = self._done
@@ -90,7 +105,9 @@ class VectorLoop(Contender):
 
 
 class ScalarLoop(Contender):
-    """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo inputs of its last run."""
+    """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo
+    inputs of its last run.
+    """
 
     title = "scalar env"
     num_envs = 1
@@ -102,7 +119,9 @@ class ScalarLoop(Contender):
         self.controls = np.empty((0, *self.env.simulation.ctrl.shape))
 
     def run(self, steps: int) -> float:
-        """Play about so many control steps in every world; control steps per second of all worlds."""
+        """Play about so many control steps in every world; control steps per second of all
+        worlds.
+        """
         ctrl = self.env.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
@@ -115,10 +134,12 @@ class ScalarLoop(Contender):
 
 
 class RawWorlds(Contender):
-    """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm in its cache.
+    """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm
+    in its cache.
 
-    It starts from the states of an environment and plays the servo inputs of its last run: on a thread nothing
-    but writing `ctrl` and one call of `mj_step` with all sub-steps of a control period.
+    It starts from the states of an environment and plays the servo inputs of its last run: on a
+    thread nothing but writing `ctrl` and one call of `mj_step` with all sub-steps of a control
+    period.
     """
 
     title = "raw mj_step"
@@ -131,7 +152,9 @@ class RawWorlds(Contender):
         self._model = task.model
         self._substeps = task.num_substeps
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self.states = np.stack([self._state_of(simulation, world) for world in range(self.num_envs)])
+        self.states = np.stack(
+            [self._state_of(simulation, world) for world in range(self.num_envs)]
+        )
 
     def run(self, steps: int) -> float:
         """Play as many steps as the environment played last."""
@@ -139,7 +162,9 @@ class RawWorlds(Contender):
 
     def play(self, controls: Array) -> float:
         """Time to play servo inputs, (steps, num_worlds, nu), in every world [s]."""
-        workers = [threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))]
+        workers = [
+            threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))
+        ]
         begin = time.perf_counter()
         for worker in workers:
             worker.start()
@@ -148,7 +173,9 @@ class RawWorlds(Contender):
         return time.perf_counter() - begin
 
     def close(self) -> None:
-        """Play about so many control steps in every world; control steps per second of all worlds."""
+        """Play about so many control steps in every world; control steps per second of all
+        worlds.
+        """
 
     def _play(self, thread: int, controls: Array) -> None:
         model = self._model
@@ -182,7 +209,9 @@ class _ForeignLoop(Contender):
     _action: Array
 
     def run(self, steps: int) -> float:
-        """Play about so many control steps in every world; control steps per second of all worlds."""
+        """Play about so many control steps in every world; control steps per second of all
+        worlds.
+        """
         begin = time.perf_counter()
         for _ in range(steps):
             self.env.step(self._action)
@@ -190,7 +219,9 @@ class _ForeignLoop(Contender):
 
 
 class GymnasiumLoop(_ForeignLoop):
-    """Scalar environments of ours under Gymnasium's SyncVectorEnv or AsyncVectorEnv, one process each in the latter."""
+    """Scalar environments of ours under Gymnasium's SyncVectorEnv or AsyncVectorEnv, one process
+    each in the latter.
+    """
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
         self.title = f"Gymnasium {kind.capitalize()}VectorEnv"
@@ -203,7 +234,9 @@ class GymnasiumLoop(_ForeignLoop):
 
 
 class SB3Loop(_ForeignLoop):
-    """Scalar environments of ours under SB3's DummyVecEnv or SubprocVecEnv, one process each in the latter."""
+    """Scalar environments of ours under SB3's DummyVecEnv or SubprocVecEnv, one process each in
+    the latter.
+    """
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -211,15 +244,23 @@ class SB3Loop(_ForeignLoop):
         self.title = f"SB3 {kind}"
         self.num_envs = num_envs
         makers = [_Maker(env)] * num_envs
-        self.env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
+        self.env = (
+            DummyVecEnv(makers)
+            if kind == "DummyVecEnv"
+            else SubprocVecEnv(makers, start_method="spawn")
+        )
         self.env.reset()
         self._action = np.zeros((num_envs, *(self.env.action_space.shape or ())), dtype=np.float32)
 
 
 class PPOLoop(Contender):
-    """PPO end to end, collecting and learning, of a residual on a base policy: our vector environment, or processes."""
+    """PPO end to end, collecting and learning, of a residual on a base policy: our vector
+    environment, or processes.
+    """
 
-    def __init__(self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False) -> None:
+    def __init__(
+        self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False
+    ) -> None:
         import torch
         from stable_baselines3 import PPO
         from stable_baselines3.common.logger import Logger
@@ -231,11 +272,17 @@ class PPOLoop(Contender):
         where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
         self.title = f"PPO with {policy}, {where}"
         self.num_envs = num_envs
-        acts_on = COMMAND if policy in ("zero", "uncompensated", "uncompensated_open") else DEFLECTION
+        acts_on = (
+            COMMAND if policy in ("zero", "uncompensated", "uncompensated_open") else DEFLECTION
+        )
         if processes:
-            venv: Any = SubprocVecEnv([_Maker(env, policy, acts_on)] * num_envs, start_method="spawn")
+            venv: Any = SubprocVecEnv(
+                [_Maker(env, policy, acts_on)] * num_envs, start_method="spawn"
+            )
         else:
-            inner = make_vector_env(_condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP)
+            inner = make_vector_env(
+                _condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP
+            )
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, {acts_on: None}))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
@@ -250,7 +297,9 @@ class PPOLoop(Contender):
             device="cpu",
             policy_kwargs={"net_arch": [64, 64]},
         )
-        self._model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
+        self._model.set_logger(
+            Logger(folder=None, output_formats=[])
+        )  # SB3's own makes a folder in /tmp
         self.env = self._model.get_env()
 
     def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
@@ -262,21 +311,32 @@ class PPOLoop(Contender):
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
-    """A residual with a network of 64×64 as it is before training, small random weights, around a base policy."""
+    """A residual with a network of 64×64 as it is before training, small random weights, around
+    a base policy.
+    """
     acts_on = DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND
-    corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(acts_on={acts_on: None}))
+    corrected = Corrected(
+        base, env.unwrapped.assumed_model, ResidualSettings(acts_on={acts_on: None})
+    )
     features = Features(corrected).width
     generator = np.random.default_rng(0)
     widths = [features, 64, 64, corrected.num_residuals]
     tensors = {"mean": np.zeros(features), "std": np.ones(features)}
     for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-        tensors |= {f"weight{i}": 0.01 * generator.normal(size=(outputs, inputs)), f"bias{i}": np.zeros(outputs)}
-    description = ResidualDescription(robot=env.unwrapped.task.name, base="", settings=corrected.settings)
+        tensors |= {
+            f"weight{i}": 0.01 * generator.normal(size=(outputs, inputs)),
+            f"bias{i}": np.zeros(outputs),
+        }
+    description = ResidualDescription(
+        robot=env.unwrapped.task.name, base="", settings=corrected.settings
+    )
     return ResidualPolicy(corrected, Network(description, tensors))
 
 
 class _Maker:
-    """Makes a scalar environment in a process of its own, with the residual of a base policy around it or without."""
+    """Makes a scalar environment in a process of its own, with the residual of a base policy
+    around it or without.
+    """
 
     def __init__(self, env: str, policy: str | None = None, acts_on: str = DEFLECTION) -> None:
         self._env = env
@@ -294,7 +354,11 @@ class _Maker:
 
 
 def _condition(env: str, policy: str | None) -> Condition:
-    return Condition(env=env, policy=PolicySpec(name=policy or "zero"), reference=environment(env).default_reference)
+    return Condition(
+        env=env,
+        policy=PolicySpec(name=policy or "zero"),
+        reference=environment(env).default_reference,
+    )
 
 
 def _arguments(env: str) -> dict[str, Any]:
@@ -308,5 +372,7 @@ def _make(env: str) -> gymnasium.Env[Any, Any]:
 
 
 def _with(policy: str | None, residual: bool) -> str:
-    parts = [part for part in (policy, "residual network" if residual else None) if part is not None]
+    parts = [
+        part for part in (policy, "residual network" if residual else None) if part is not None
+    ]
     return f" with {' and '.join(parts)}" if parts else ""

@@ -1,4 +1,6 @@
-"""A policy against the clock: whether its command is ready within the control period, as on a robot."""
+"""A policy against the clock: whether its command is ready within the control period, as on a
+robot.
+"""
 
 import json
 import time
@@ -27,8 +29,9 @@ _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
 class RealTimeResult:
     """Latencies of a policy against the clock.
 
-    The latency of a cycle is the time from the moment at which it is due to the moment at which its command is ready.
-    So it has the delay with which the system wakes the program. The time in the policy is without that.
+    The latency of a cycle is the time from the moment at which it is due to the moment at which its
+    command is ready. So it has the delay with which the system wakes the program. The time in the
+    policy is without that.
 
     Attributes:
         env: Environment.
@@ -65,16 +68,22 @@ class RealTimeResult:
     policy_max_us: float
 
 
-def play_against_the_clock(env_name: str, policy_name: str | None, seconds: float) -> RealTimeResult:
-    """Record what the policy observes in an episode, then call it with that once in every control period.
+def play_against_the_clock(
+    env_name: str, policy_name: str | None, seconds: float
+) -> RealTimeResult:
+    """Record what the policy observes in an episode, then call it with that once in every control
+    period.
 
-    The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells whether it has it.
+    The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells
+    whether it has it.
 
-    The episode begins again, with a policy that remembers nothing, where it is shorter than what is to be played.
+    The episode begins again, with a policy that remembers nothing, where it is shorter than what is
+    to be played.
 
     Args:
         env_name: Environment.
-        policy_name: Policy that is timed; None for adaptive_posture on the walker, input on the testbed.
+        policy_name: Policy that is timed; None for adaptive_posture on the walker, input on the
+            testbed.
         seconds: How long it is played against the clock [s].
 
     Raises:
@@ -83,7 +92,9 @@ def play_against_the_clock(env_name: str, policy_name: str | None, seconds: floa
     """
     known = environment(env_name)
     name = policy_name or known.live_policy or known.looped_policy
-    condition = Condition(env=env_name, policy=PolicySpec(name=name), reference=known.default_reference)
+    condition = Condition(
+        env=env_name, policy=PolicySpec(name=name), reference=known.default_reference
+    )
     env = gymnasium.make(condition.environment.id, **condition.arguments)
     try:
         policy = make_policy(condition.policy, env)
@@ -107,7 +118,9 @@ def _record(env: Any, policy: Any, most: int) -> list[Any]:
     return [steps[0].seen, *(step.observation for step in steps)][:most]
 
 
-def _time(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
+def _time(
+    policy: Any, observations: list[Any], cycles: int, period_s: float
+) -> tuple[Array, Array]:
     """Latency and time in the policy, (cycles,) [s]; a cycle that begins late is not left out."""
     latency_s = np.empty(cycles)
     policy_s = np.empty(cycles)
@@ -121,7 +134,9 @@ def _time(policy: Any, observations: list[Any], cycles: int, period_s: float) ->
         if remaining > 0.0:
             time.sleep(remaining)
         called = time.perf_counter()
-        _, state = policy.predict(observation, state=memory, episode_start=start, deterministic=True)
+        _, state = policy.predict(
+            observation, state=memory, episode_start=start, deterministic=True
+        )
         ready = time.perf_counter()
         latency_s[number] = ready - due
         policy_s[number] = ready - called
@@ -179,15 +194,22 @@ def measure_real_time(
         PolicyFailedError: The policy failed.
         ResultsExistError: The output folder holds results.
     """
-    with run_folder("speed", {"env": env, "policy": policy, "seconds": seconds}, 0, output) as folder:
+    with run_folder(
+        "speed", {"env": env, "policy": policy, "seconds": seconds}, 0, output
+    ) as folder:
         console.print(f"recording an episode, then {seconds:g} s against the clock")
         result = play_against_the_clock(env, policy, seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(asdict(result), indent=2) + "\n")
     console.print(_table(result))
-    console.print(f"late: {result.late} of {result.cycles} cycles, {100.0 * result.late_share:.3f} %", highlight=False)
+    console.print(
+        f"late: {result.late} of {result.cycles} cycles, {100.0 * result.late_share:.3f} %",
+        highlight=False,
+    )
     if not result.is_real_time:
-        console.print("without real-time scheduling, to which this user has no right", highlight=False)
+        console.print(
+            "without real-time scheduling, to which this user has no right", highlight=False
+        )
     return path
 
 

@@ -1,4 +1,6 @@
-"""How much processor time policies take for a control step of one world, measured in turn on one thread."""
+"""How much processor time policies take for a control step of one world, measured in turn on one
+thread.
+"""
 
 import statistics
 import time
@@ -11,15 +13,20 @@ from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _STEPS = 50
 _ROUNDS = 15
-"""Control steps per round: whole decisions of residuals, which take 25; rounds, of which the median counts."""
+"""Control steps per round: whole decisions of residuals, which take 25; rounds, of which the
+median counts.
+"""
 
 
-def step_times(conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS) -> dict[str, float]:
-    """Median processor time of every policy alone for a control step of one world [µs], by its title.
+def step_times(
+    conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS
+) -> dict[str, float]:
+    """Median processor time of every policy alone for a control step of one world [µs], by its
+    title.
 
-    The policies play in turn, round by round, so that what else the computer does concerns all of them alike. The
-    first round compiles and warms up, and does not count. Of a residual the first training seed plays. Processor time
-    does not count what other programs take meanwhile.
+    The policies play in turn, round by round, so that what else the computer does concerns all of
+    them alike. The first round compiles and warms up, and does not count. Of a residual the first
+    training seed plays. Processor time does not count what other programs take meanwhile.
 
     Args:
         conditions: Cells of a comparison; each policy plays the first of its own.

@@ -1,1 +1,3 @@
-"""Calls that run beside this program: in processes of this machine, on a dask cluster, as jobs of Slurm."""
+"""Calls that run beside this program: in processes of this machine, on a dask cluster, as jobs
+of Slurm.
+"""

@@ -1,6 +1,8 @@
-"""Calls of one function beside each other, by any `concurrent.futures.Executor`: faults, reports and Ctrl-C.
+"""Calls of one function beside each other, by any `concurrent.futures.Executor`: faults, reports
+and Ctrl-C.
 
-A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew elsewhere.
+A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew
+elsewhere.
 """
 
 import os
@@ -30,7 +32,10 @@ Reporter = Callable[[int, Any], None]
 
 
 class WorkerLostError(SystemFailedError):
-    """The worker of a call is gone: killed, preempted, or out of reach. An executor's future raises it."""
+    """The worker of a call is gone: killed, preempted, or out of reach.
+
+    An executor's future raises it.
+    """
 
 
 class WorkerKilledError(SystemFailedError):
@@ -38,8 +43,8 @@ class WorkerKilledError(SystemFailedError):
 
     def __init__(self) -> None:
         super().__init__(
-            "a worker process was killed each time that it was tried, most often for lack of memory; take fewer --jobs "
-            "or more memory"
+            "a worker process was killed each time that it was tried, most often for lack of"
+            " memory; take fewer --jobs or more memory"
         )
 
 
@@ -48,7 +53,10 @@ class ExecutorLostError(SystemFailedError):
 
 
 class UnguardedScriptError(ConfigurationError):
-    """Workers import the script that runs here, and it would start workers again. An executor's future raises it."""
+    """Workers import the script that runs here, and it would start workers again.
+
+    An executor's future raises it.
+    """
 
     def __init__(self) -> None:
         super().__init__(
@@ -144,7 +152,9 @@ class Tally:
 
     def in_words(self, what: str) -> str:
         """Such as: 3 of 8 cells done, 2 running, 0 failed."""
-        return f"{self.done} of {self.total} {what} done, {self.running} running, {self.failed} failed"
+        return (
+            f"{self.done} of {self.total} {what} done, {self.running} running, {self.failed} failed"
+        )
 
 
 def run_calls(
@@ -157,11 +167,13 @@ def run_calls(
     """Call a function with each of some arguments.
 
     Args:
-        function: At the top of a module; it gets the arguments and, behind them, a function that takes its reports.
+        function: At the top of a module; it gets the arguments and, behind them, a function that
+            takes its reports.
         arguments: Of each call.
         pool: Where they run.
         watch: Who is told how they go.
-        finishes: Whether the first Ctrl-C lets running calls end and starts no others; else it ends at once.
+        finishes: Whether the first Ctrl-C lets running calls end and starts no others; else it ends
+            at once.
 
     Returns:
         Outcomes in the order of the arguments; None for calls that Ctrl-C kept from starting.
@@ -185,7 +197,11 @@ class _Run:
     """Calls that are under way."""
 
     def __init__(
-        self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], pool: Pool, watch: Watch
+        self,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        pool: Pool,
+        watch: Watch,
     ) -> None:
         self._function = function
         self._arguments = arguments
@@ -215,7 +231,12 @@ class _Run:
         self._tries[number] += 1
         try:
             future = self._pool.executor.submit(
-                carry_out, self._function, self._arguments[number], number, self._home, self._pool.reporter
+                carry_out,
+                self._function,
+                self._arguments[number],
+                number,
+                self._home,
+                self._pool.reporter,
             )
         except RuntimeError as error:  # it was shut down
             raise ExecutorLostError(f"the workers are gone: {error}") from None
@@ -237,12 +258,16 @@ class _Run:
             if self.outcomes[number] is None:  # a report may come behind the end
                 self._running.add(number)
             self._watch.reported(number, report)
-        self._watch.tallied(Tally(self._done, len(self._running), self._failed, len(self._arguments)))
+        self._watch.tallied(
+            Tally(self._done, len(self._running), self._failed, len(self._arguments))
+        )
 
     def _end(self, number: int, future: Future[Any]) -> None:
         self._running.discard(number)
         outcome = _outcome(future)
-        if isinstance(outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError):
+        if isinstance(
+            outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError
+        ):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             if self._is_ending:
@@ -259,7 +284,11 @@ class _Run:
 
 
 def carry_out(
-    function: Callable[..., Any], given: tuple[Any, ...], number: int, home: Home, reporter: Reporter
+    function: Callable[..., Any],
+    given: tuple[Any, ...],
+    number: int,
+    home: Home,
+    reporter: Reporter,
 ) -> Outcome:
     """In a worker: the outcome of a call, which never raises."""
 
@@ -290,7 +319,9 @@ def _portable(error: Exception) -> Exception:
 
 def _outcome(future: Future[Any]) -> Outcome:
     if future.cancelled():
-        return Outcome(error=ExecutorLostError("the workers are gone: they dropped what was to be done"))
+        return Outcome(
+            error=ExecutorLostError("the workers are gone: they dropped what was to be done")
+        )
     error = future.exception()
     if error is None:
         return future.result()

@@ -21,8 +21,8 @@ _WORKER_S = 60
 def dask_pool(address: str) -> Iterator[Pool]:
     """Workers of the cluster whose scheduler has an address.
 
-    Dask itself moves the calls of a worker that is lost: as often as `MOST_MOVES` says, or less where its scheduler is
-    told so.
+    Dask itself moves the calls of a worker that is lost: as often as `MOST_MOVES` says, or less
+    where its scheduler is told so.
 
     Args:
         address: Of the scheduler, HOST:PORT.
@@ -41,7 +41,8 @@ def dask_pool(address: str) -> Iterator[Pool]:
         client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SystemFailedError(
-            f"no dask scheduler answers at {address} ({error}); start one there with: dask scheduler --host ADDRESS"
+            f"no dask scheduler answers at {address} ({error}); start one there with: dask"
+            " scheduler --host ADDRESS"
         ) from None
     with client:
         _prepare(client, address)
@@ -57,7 +58,8 @@ def dask_pool(address: str) -> Iterator[Pool]:
 
 
 def warn_of_public(address: str) -> None:
-    """Warn where a scheduler, which runs the code of whoever reaches it, has an address of the Internet.
+    """Warn where a scheduler, which runs the code of whoever reaches it, has an address of the
+    Internet.
 
     Args:
         address: HOST:PORT; a name stands for all of its addresses.
@@ -67,11 +69,16 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    public = [str(place[0]) for *_, place in found if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_global]
+    public = [
+        str(place[0])
+        for *_, place in found
+        if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_global
+    ]
     if public:
         warnings.warn(
-            f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever reaches it runs code on "
-            "all of its machines; start it with --host and an address within your network, or 127.0.0.1 behind ssh",
+            f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"
+            " reaches it runs code on all of its machines; start it with --host and an address"
+            " within your network, or 127.0.0.1 behind ssh",
             UserWarning,
             stacklevel=2,
         )
@@ -90,8 +97,8 @@ def _prepare(client: Any, address: str) -> None:
         ) from None
     except ModuleNotFoundError as error:
         raise ConfigurationError(
-            f"the dask cluster at {address} has no module {error.name!r}; install elastic-env on its scheduler and its "
-            "workers"
+            f"the dask cluster at {address} has no module {error.name!r}; install elastic-env on"
+            " its scheduler and its workers"
         ) from None
     for worker, versions in found.items():
         require_same(everything(), versions, worker)

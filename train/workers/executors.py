@@ -38,8 +38,8 @@ class Executors:
         is_dask = self.on.startswith(_DASK) and host and port.isdecimal()
         if not (self.is_local or is_dask or self.on == _SLURM or self.on.startswith(f"{_SLURM}:")):
             raise ConfigurationError(
-                f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or {_SLURM}:FILE.yaml with what a "
-                f"job asks for, got {shown(self.on)}"
+                f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or"
+                f" {_SLURM}:FILE.yaml with what a job asks for, got {shown(self.on)}"
             )
 
     @property
@@ -48,8 +48,12 @@ class Executors:
         return self.on == _LOCAL
 
     def threads_per_call(self, calls: int) -> int:
-        """Threads for each of some calls: an equal share of the cores of this machine; elsewhere one."""
-        return max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls)) if self.is_local else 1
+        """Threads for each of some calls: an equal share of the cores of this machine; elsewhere
+        one.
+        """
+        return (
+            max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls)) if self.is_local else 1
+        )
 
     def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.

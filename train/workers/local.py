@@ -48,9 +48,12 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
         calls: How many calls there will be; there are no more processes than that.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        sys.exit(1)  # this is a worker that imports the script of its parent, which says why it ended
+        sys.exit(
+            1
+        )  # this is a worker that imports the script of its parent, which says why it ended
     with safe_children():
-        resource_tracker.ensure_running()  # its start lets SIGINT through; the threads that start workers block it
+        # its start lets SIGINT through; the threads that start workers block it
+        resource_tracker.ensure_running()
     events: queue.SimpleQueue[Any] = queue.SimpleQueue()
     processes = Processes(num_processes(jobs, calls), events)
     try:
@@ -64,8 +67,8 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
 class Processes(Executor):
     """An executor of processes, in which a process that dies fails its own call alone.
 
-    In a `ProcessPoolExecutor` it fails all calls, and none knows whose process it was. So each process here has a pool
-    of its own, a thread that waits for it, and a pipe for its reports.
+    In a `ProcessPoolExecutor` it fails all calls, and none knows whose process it was. So each
+    process here has a pool of its own, a thread that waits for it, and a pipe for its reports.
     """
 
     def __init__(self, jobs: int, events: "queue.SimpleQueue[Any]") -> None:
@@ -79,8 +82,8 @@ class Processes(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run a call in a process.
 
-        The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where it ended itself
-        before it could begin.
+        The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where
+        it ended itself before it could begin.
         """
         return self._threads.submit(self._in_process, fn, *args, **kwargs)
 
@@ -148,7 +151,11 @@ class _Worker:
         self._reader.join()
         while (code := self.process.exitcode) is None:  # another thread is about to learn it
             time.sleep(0.01)
-        return WorkerLostError("a worker process was killed") if self._has_begun or code < 0 else UnguardedScriptError()
+        return (
+            WorkerLostError("a worker process was killed")
+            if self._has_begun or code < 0
+            else UnguardedScriptError()
+        )
 
     def _read(self, reports: "Connection[Any, Any]", events: "queue.SimpleQueue[Any]") -> None:
         """In a thread: hand on what is reported, as long as the process lives."""
@@ -165,7 +172,8 @@ def _nothing() -> None:
 def _block_ctrl_c() -> None:
     """In a thread that starts processes: they begin with SIGINT blocked, as the thread has it.
 
-    Else it could end one, with a traceback, in the second in which it imports and cannot yet ignore it.
+    Else it could end one, with a traceback, in the second in which it imports and cannot yet ignore
+    it.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
@@ -183,8 +191,8 @@ def _report(number: int, value: Any) -> None:
 def _begin(end: "Connection[Any, Any]") -> None:
     """In a worker, before its first call: the parent decides what happens.
 
-    Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes its workers with
-    it, so that none of them goes on writing beside a run that was resumed.
+    Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes
+    its workers with it, so that none of them goes on writing beside a run that was resumed.
     """
     global _own_end
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,6 @@
-"""Workers as jobs of Slurm, by submitit: an array of jobs, which needs a folder that all machines see."""
+"""Workers as jobs of Slurm, by submitit: an array of jobs, which needs a folder that all
+machines see.
+"""
 
 import os
 import queue
@@ -38,9 +40,17 @@ class SlurmConfig(Model):
 
     def parameters(self) -> dict[str, Any]:
         """As submitit calls them."""
-        own = {"partition": self.partition, "account": self.account, "array_parallelism": self.at_once}
+        own = {
+            "partition": self.partition,
+            "account": self.account,
+            "array_parallelism": self.at_once,
+        }
         named = {f"slurm_{name}": value for name, value in own.items() if value is not None}
-        limits = {"timeout_min": self.time_min, "mem_gb": self.memory_gb, "cpus_per_task": self.cores}
+        limits = {
+            "timeout_min": self.time_min,
+            "mem_gb": self.memory_gb,
+            "cpus_per_task": self.cores,
+        }
         return {"name": "elastic", **limits, **named}
 
 
@@ -60,7 +70,9 @@ def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("submitit", "cluster", "--on slurm") from None
     if config.cluster == "slurm" and shutil.which("sbatch") is None:
-        raise SystemFailedError("there is no Slurm here: the command sbatch was not found; start on a login node")
+        raise SystemFailedError(
+            "there is no Slurm here: the command sbatch was not found; start on a login node"
+        )
     folder = folder.resolve()
     reports = folder / "reports"
     reports.mkdir(parents=True, exist_ok=True)
@@ -129,7 +141,9 @@ class Jobs(Executor):
                 self._submit_waiting()
                 self._read_reports()
                 self._settle_done()
-            except Exception as error:  # Slurm refuses, or the folder is full: that is the end of all calls
+            except (
+                Exception
+            ) as error:  # Slurm refuses, or the folder is full: that is the end of all calls
                 lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
                 for future in [*self._jobs, *(future for future, *_ in self._waiting)]:
                     if not future.cancelled():

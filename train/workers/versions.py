@@ -39,21 +39,30 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
         VersionsDifferError: It has; the message names what differs, with both versions.
     """
     names = dict.fromkeys([*ours, *theirs])
-    different = [f"{n} {theirs.get(n)} there, {ours.get(n)} here" for n in names if ours.get(n) != theirs.get(n)]
+    different = [
+        f"{n} {theirs.get(n)} there, {ours.get(n)} here"
+        for n in names
+        if ours.get(n) != theirs.get(n)
+    ]
     if different:
         raise VersionsDifferError(
-            f"all machines must have the same versions, but on {where} they differ: {'; '.join(different)}; install "
-            "the same commit with the same constraints.txt"
+            f"all machines must have the same versions, but on {where} they differ:"
+            f" {'; '.join(different)}; install the same commit with the same constraints.txt"
         )
 
 
 def _library_versions() -> dict[str, str]:
     """Python and the libraries that calculate."""
-    return {"python": platform.python_version(), **{name: installed_version(name) or "none" for name in _LIBRARIES}}
+    return {
+        "python": platform.python_version(),
+        **{name: installed_version(name) or "none" for name in _LIBRARIES},
+    }
 
 
 def _digest(folders: Sequence[str]) -> str:
-    """SHA-256 digest of modules and tables in some folders, with their paths; its first 16 characters."""
+    """SHA-256 digest of modules and tables in some folders, with their paths; its first 16
+    characters.
+    """
     digest = hashlib.sha256()
     for folder in folders:
         for file in sorted((_ROOT / folder).rglob("*")):

@@ -154,7 +154,9 @@ class BusGroup:
         """States of all servos; waits for at most a time [s]."""
         if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
             return self.buses[0].read_states(timeout_s)
-        return States.join(self._call_all([partial(bus.read_states, timeout_s) for bus in self.buses]))
+        return States.join(
+            self._call_all([partial(bus.read_states, timeout_s) for bus in self.buses])
+        )
 
     def torque_off(self, when_sent: Callable[[], None] = lambda: None) -> HardwareError | None:
         """Switch all torque off, at every bus before any servo is asked whether it is.
@@ -175,13 +177,18 @@ class BusGroup:
         silent = [name for answer in answers if isinstance(answer, list) for name in answer]
         problems = [str(error) for error in errors]
         if silent:
-            problems.append(f"torque off was sent, but not confirmed by {', '.join(silent)}: switch the power off")
+            problems.append(
+                f"torque off was sent, but not confirmed by {', '.join(silent)}: switch the"
+                " power off"
+            )
         if not problems:
             return None
         off = [bus.name for bus, answer in zip(self.buses, answers, strict=True) if answer == []]
         if off:
             problems.append(f"torque is off at {', '.join(off)}")
-        kind = BusGoneError if any(isinstance(error, BusGoneError) for error in errors) else ReplyError
+        kind = (
+            BusGoneError if any(isinstance(error, BusGoneError) for error in errors) else ReplyError
+        )
         return kind("; ".join(problems))
 
     def _call_all(self, calls: Sequence[Callable[[], T]]) -> list[T]:
@@ -189,7 +196,9 @@ class BusGroup:
 
         All of them are done when an error is raised.
         """
-        others = [reader.submit(call) for reader, call in zip(self._readers, calls[1:], strict=True)]
+        others = [
+            reader.submit(call) for reader, call in zip(self._readers, calls[1:], strict=True)
+        ]
         try:
             first = calls[0]()
         finally:

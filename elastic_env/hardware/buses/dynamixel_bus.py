@@ -131,8 +131,12 @@ class DynamixelBus:
         """
         self.models = {servo_id: servo_model(number) for servo_id, number in numbers.items()}
         if len({model.blocks for model in self.models.values()}) > 1:
-            names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
-            raise HardwareError(f"the servos of one bus must have one control table, at {self.name} are {names}")
+            names = ", ".join(
+                f"{servo_id}: {model.name}" for servo_id, model in self.models.items()
+            )
+            raise HardwareError(
+                f"the servos of one bus must have one control table, at {self.name} are {names}"
+            )
 
     def read(self, servo_id: int, name: str) -> int:
         """A register [count].
@@ -141,7 +145,9 @@ class DynamixelBus:
             ReplyError: No answer in three tries, or a refusal.
         """
         register = self.models[servo_id].table[name]
-        data = self._request(servo_id, packets.READ, word(register.address) + word(register.size), register.size)
+        data = self._request(
+            servo_id, packets.READ, word(register.address) + word(register.size), register.size
+        )
         return register.decode(data)
 
     def write(self, servo_id: int, name: str, value: int) -> None:
@@ -151,7 +157,9 @@ class DynamixelBus:
             ReplyError: No answer in three tries, or a refusal, with the servo's reason.
         """
         register = self.models[servo_id].table[name]
-        self._request(servo_id, packets.WRITE, word(register.address) + register.encode(value), length=0)
+        self._request(
+            servo_id, packets.WRITE, word(register.address) + register.encode(value), length=0
+        )
 
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
         """Write a register of several servos, by id [count], in one packet, which nobody confirms.
@@ -163,7 +171,9 @@ class DynamixelBus:
             return
         register = self.models[next(iter(values))].table[name]
         data = word(register.address) + word(register.size)
-        data += b"".join(bytes([servo_id]) + register.encode(value) for servo_id, value in values.items())
+        data += b"".join(
+            bytes([servo_id]) + register.encode(value) for servo_id, value in values.items()
+        )
         self._send(packets.BROADCAST, packets.SYNC_WRITE, data)
         self.port.release()
 
@@ -320,7 +330,9 @@ class DynamixelBus:
                     problem = f"says that {packets.STATUS_ERRORS[error]}"
                     break
                 if error:
-                    reason = packets.STATUS_ERRORS.get(error, f"error {error}, which the protocol does not have")
+                    reason = packets.STATUS_ERRORS.get(
+                        error, f"error {error}, which the protocol does not have"
+                    )
                     raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
                 if len(data) == length:
                     return data

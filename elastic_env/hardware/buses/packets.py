@@ -70,7 +70,9 @@ def require_ids(ids: Sequence[int]) -> None:
         ConfigurationError: None are given, one of them twice, or one that no servo can have.
     """
     if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
-        raise ConfigurationError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {shown(list(ids))}")
+        raise ConfigurationError(
+            f"ids must be different numbers from 0 to {LARGEST_ID}, got {shown(list(ids))}"
+        )
 
 
 def _crc_of_byte(byte: int) -> int:

@@ -77,7 +77,10 @@ class Port(PortHandler):
         """
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
-            raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of {packets.RATES}")
+            raise PortError(
+                f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of"
+                f" {packets.RATES}"
+            )
         self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)
@@ -90,7 +93,9 @@ class Port(PortHandler):
 
     def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
         """Open the device such that a read blocks for a short while instead of not at all."""
-        self.ser = serial.Serial(self.port_name, self.baudrate, timeout=_READ_SLICE_S, write_timeout=0.1)
+        self.ser = serial.Serial(
+            self.port_name, self.baudrate, timeout=_READ_SLICE_S, write_timeout=0.1
+        )
         self.is_open = True
         self.tx_time_per_byte = 1e4 / self.baudrate
         return True
@@ -133,7 +138,11 @@ class Port(PortHandler):
     @property
     def latency_timer(self) -> Path:
         """The file that holds the adapter's latency timer, if it has one."""
-        return Path("/sys/bus/usb-serial/devices") / Path(os.path.realpath(self.port_name)).name / "latency_timer"
+        return (
+            Path("/sys/bus/usb-serial/devices")
+            / Path(os.path.realpath(self.port_name)).name
+            / "latency_timer"
+        )
 
     @property
     def latency_timer_ms(self) -> int | None:

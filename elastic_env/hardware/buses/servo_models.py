@@ -72,7 +72,9 @@ class Register:
         try:
             return value.to_bytes(self.size, "little", signed=self.is_signed)
         except OverflowError:
-            raise HardwareError(f"register {self.name!r} has {self.size} bytes, which {value} does not fit") from None
+            raise HardwareError(
+                f"register {self.name!r} has {self.size} bytes, which {value} does not fit"
+            ) from None
 
     def decode(self, stored: bytes | bytearray) -> int:
         """The value of stored bytes."""
@@ -150,8 +152,13 @@ class ServoModel:
         Nan where it has none.
         """
         units = (self.position_unit, self.velocity_unit, self.current_unit)
-        values = [unit * self._decode(name, block, data) for name, unit in zip(_MOTION, units, strict=True)]
-        degrees = self._decode(_TEMPERATURE, block, data) if self.has_temperature(block) else math.nan
+        values = [
+            unit * self._decode(name, block, data)
+            for name, unit in zip(_MOTION, units, strict=True)
+        ]
+        degrees = (
+            self._decode(_TEMPERATURE, block, data) if self.has_temperature(block) else math.nan
+        )
         return [*values, degrees]
 
     def _decode(self, name: str, block: range, data: bytes) -> int:
@@ -208,11 +215,18 @@ def _read_table(file: str) -> ControlTable:
         )
         for row in _read_rows(file)
     )
-    return ControlTable({register.name: register for register in sorted(registers, key=lambda r: r.address)})
+    return ControlTable(
+        {register.name: register for register in sorted(registers, key=lambda r: r.address)}
+    )
 
 
 def _read_rows(file: str) -> list[dict[str, str]]:
-    lines = resources.files("elastic_env.hardware.buses").joinpath(file).read_text(encoding="utf-8").splitlines()
+    lines = (
+        resources.files("elastic_env.hardware.buses")
+        .joinpath(file)
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 

@@ -1,10 +1,12 @@
 """Faults of an emulated bus, by switch: for trying out what a program does about them."""
 
+from typing import Any
+
 import numpy as np
 
 from elastic_env.core.config import Model, quantity
 
-_SHARE = {"ge": 0, "le": 1}
+_SHARE: dict[str, Any] = {"ge": 0, "le": 1}
 
 
 class Faults(Model):
@@ -13,13 +15,20 @@ class Faults(Model):
     Shares are drawn per reply, or per instruction.
     """
 
-    unheard: float = quantity("1", 0.0, **_SHARE, description="share of instructions that reach no servo")
-    lost: float = quantity("1", 0.0, **_SHARE, description="share of replies that do not come")
-    late: float = quantity("1", 0.0, **_SHARE, description="share of replies that come late")
-    late_s: float = quantity("s", 0.006, ge=0, le=1, description="how late")
-    corrupted: float = quantity("1", 0.0, **_SHARE, description="share of replies with a flipped bit")
-    truncated: float = quantity("1", 0.0, **_SHARE, description="share of replies that end too early")
-    latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
+    unheard: float = quantity("1", 0.0, **_SHARE)
+    """Share of instructions that reach no servo [1]."""
+    lost: float = quantity("1", 0.0, **_SHARE)
+    """Share of replies that do not come [1]."""
+    late: float = quantity("1", 0.0, **_SHARE)
+    """Share of replies that come late [1]."""
+    late_s: float = quantity("s", 0.006, ge=0, le=1)
+    """How late [s]."""
+    corrupted: float = quantity("1", 0.0, **_SHARE)
+    """Share of replies with a flipped bit [1]."""
+    truncated: float = quantity("1", 0.0, **_SHARE)
+    """Share of replies that end too early [1]."""
+    latency_s: float = quantity("s", 0.0, ge=0, le=1)
+    """Delay of every reply: the adapter's latency timer [s]."""
     overload: bool = False
     """The servos report an overload and let go."""
     hot: bool = False
@@ -30,7 +39,8 @@ class Faults(Model):
     """The port is gone."""
     imu_silent: bool = False
     """The IMU sends nothing."""
-    imu_late_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of the IMU's packets")
+    imu_late_s: float = quantity("s", 0.0, ge=0, le=1)
+    """Delay of the IMU's packets [s]."""
     imu_nan: bool = False
     """The IMU sends nan for the roll, as valid."""
     imu_inf: bool = False
@@ -39,7 +49,8 @@ class Faults(Model):
     """The IMU sends a roll that no angle has, as valid."""
     imu_frozen: bool = False
     """The IMU's packets go on, with the angles of the last one before."""
-    imu_corrupted: float = quantity("1", 0.0, **_SHARE, description="share of IMU packets with a flipped bit")
+    imu_corrupted: float = quantity("1", 0.0, **_SHARE)
+    """Share of IMU packets with a flipped bit [1]."""
 
 
 def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tuple[bytes, float]:

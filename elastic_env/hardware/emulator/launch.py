@@ -36,22 +36,21 @@ class EmulatorConfig(Model):
     """Their ids."""
     testbed: TestbedConfig = TestbedConfig()
     """The joints behind them, and through its scenario the quality of the IMU."""
-    imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000, description="packets of the IMU per second")
-    baudrate: int = quantity(
-        "bit/s",
-        3_000_000,
-        ge=LOWEST_RATE,
-        le=HIGHEST_RATE,
-        description="rate of the bus; no other is heard",
-    )
+    imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
+    """Packets of the IMU per second [Hz]."""
+    baudrate: int = quantity("bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    """Rate of the bus; no other is heard [bit/s]."""
     faults: Faults = Faults()
-    seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
+    seed: int = quantity("1", 0, ge=0)
+    """Seed of faults and noise [1]."""
 
     @model_validator(mode="after")
     def _servos_exist(self) -> Self:
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
-            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}")
+            raise ValueError(
+                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}"
+            )
         require_ids(self.ids)
         return self
 
@@ -90,7 +89,10 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         Monotonic time, id, register, value [count]; `present_position` is what a state that was
         asked for is to tell.
         """
-        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._request({"events": True})]
+        return [
+            (float(t), int(i), str(name), int(value))
+            for t, i, name, value in self._request({"events": True})
+        ]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
@@ -107,7 +109,9 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         still_looks = 0
         while still_looks < _STILL_LOOKS:
             if time.monotonic() > deadline:
-                raise HardwareError(f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?")
+                raise HardwareError(
+                    f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?"
+                )
             time.sleep(_LOOK_S)
             now = self.state()
             moved = np.abs(np.subtract(now["theta"], before["theta"])).max()

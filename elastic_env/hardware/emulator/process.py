@@ -105,8 +105,12 @@ class Emulator:
         self._instruction_faults = np.random.default_rng([config.seed, 2])
         self._joints = Joints(config.testbed, len(config.ids), now)
         self._servos = [
-            EmulatedServo(servo_id, model, partial(self._note, index), config.claimed_model_number, motor)
-            for index, (servo_id, motor) in enumerate(zip(config.ids, self._joints.motors, strict=True))
+            EmulatedServo(
+                servo_id, model, partial(self._note, index), config.claimed_model_number, motor
+            )
+            for index, (servo_id, motor) in enumerate(
+                zip(config.ids, self._joints.motors, strict=True)
+            )
         ]
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
@@ -215,7 +219,9 @@ class Emulator:
                 self._queue(reply, now)
             if packet.instruction == packets.SYNC_READ:
                 for servo in self._servos:
-                    self.events.append((now, servo.servo_id, "present_position", servo["present_position"]))
+                    self.events.append(
+                        (now, servo.servo_id, "present_position", servo["present_position"])
+                    )
         return now
 
     def _queue(self, reply: bytes, now: float) -> None:

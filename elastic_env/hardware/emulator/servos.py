@@ -100,7 +100,9 @@ class EmulatedServo:
         """Put what it measures into its registers."""
         self["present_position"] = round(self.motor.position / self.model.position_unit)
         self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        self["present_current"] = round(current_of_torque(self.motor.torque) / self.model.current_unit)
+        self["present_current"] = round(
+            current_of_torque(self.motor.torque) / self.model.current_unit
+        )
 
     def heat(self, is_hot: bool) -> None:
         """Make it hot, which it shows as its temperature alone, or let it cool."""
@@ -191,7 +193,11 @@ class EmulatedServo:
 
     def _refusal(self, register: Register, value: int) -> int:
         """Error number of a value that the servo does not take, 0 if it does."""
-        if register.name.startswith("goal_") and self.model.has_watchdog and self["bus_watchdog"] == _WATCHDOG_FIRED:
+        if (
+            register.name.startswith("goal_")
+            and self.model.has_watchdog
+            and self["bus_watchdog"] == _WATCHDOG_FIRED
+        ):
             return packets.RANGE_ERROR
         match register.name:
             case "goal_position":
@@ -238,7 +244,11 @@ class EmulatedBus:
         for servo in self.servos.values():
             servo.hear(now_s)
         if not packet.is_intact:
-            return [packets.status(packet.servo_id, packets.CRC_ERROR)] if packet.servo_id in self.servos else []
+            return (
+                [packets.status(packet.servo_id, packets.CRC_ERROR)]
+                if packet.servo_id in self.servos
+                else []
+            )
         parameters = packet.parameters
         match packet.instruction:
             case packets.STATUS:
@@ -247,7 +257,10 @@ class EmulatedBus:
                 groups = [(servo_id, *words(parameters)) for servo_id in parameters[4:]]
                 return self._read(groups, packet.instruction == packets.FAST_SYNC_READ)
             case packets.BULK_READ | packets.FAST_BULK_READ:
-                groups = [(parameters[i], *words(parameters[i + 1 :])) for i in range(0, len(parameters) - 4, 5)]
+                groups = [
+                    (parameters[i], *words(parameters[i + 1 :]))
+                    for i in range(0, len(parameters) - 4, 5)
+                ]
                 return self._read(groups, packet.instruction == packets.FAST_BULK_READ)
             case packets.SYNC_WRITE:
                 address, length = words(parameters)
@@ -261,7 +274,11 @@ class EmulatedBus:
                     parameters = parameters[5 + length :]
                 return []
             case packets.PING if packet.servo_id == packets.BROADCAST:
-                return [reply for servo_id in sorted(self.servos) for reply in self._instruct(servo_id, packet)]
+                return [
+                    reply
+                    for servo_id in sorted(self.servos)
+                    for reply in self._instruct(servo_id, packet)
+                ]
             case _ if packet.servo_id == packets.BROADCAST:
                 for servo_id in list(self.servos):
                     self._instruct(servo_id, packet)
@@ -279,7 +296,11 @@ class EmulatedBus:
         return [packets.status(servo_id, error, data)]
 
     def _read(self, groups: Sequence[tuple[int, int, int]], is_fast: bool) -> list[bytes]:
-        replies = [(i, *self.servos[i].read(address, length)) for i, address, length in groups if i in self.servos]
+        replies = [
+            (i, *self.servos[i].read(address, length))
+            for i, address, length in groups
+            if i in self.servos
+        ]
         if not is_fast:
             return [packets.status(servo_id, error, data) for servo_id, error, data in replies]
         return [_join(replies)] if len(replies) == len(groups) else []

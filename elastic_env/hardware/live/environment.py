@@ -33,13 +33,21 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if port is None:
-        raise ConfigurationError(f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
+        raise ConfigurationError(
+            f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT"
+        )
     of_settings = list(HardwareSettings.model_fields)
-    of_testbed = [name for name in inspect.signature(configure_testbed).parameters if name not in _OF_A_SIMULATION]
+    of_testbed = [
+        name
+        for name in inspect.signature(configure_testbed).parameters
+        if name not in _OF_A_SIMULATION
+    ]
     require_known(f"argument of {ID}", arguments, [*of_settings, *of_testbed])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
-        raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {shown(scenario)}")
+        raise HardwareError(
+            f"a scenario is of a simulation; on hardware it is what it is, got {shown(scenario)}"
+        )
     settings = {name: arguments.pop(name) for name in of_settings if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
     return HardwareTestbedTask(config, HardwareSettings(port=port, **settings))
@@ -64,7 +72,9 @@ def make_vector(
         ConfigurationError: More than one world.
     """
     if num_envs != 1:
-        raise ConfigurationError(f"there is one testbed at a port: num_envs must be 1, got {shown(num_envs)}")
+        raise ConfigurationError(
+            f"there is one testbed at a port: num_envs must be 1, got {shown(num_envs)}"
+        )
     task = configure_hardware(**arguments)
     picture = partial(TestbedPicture, task.config.pendulum)
     return ElasticVectorEnv(task, 1, autoreset_mode, task.plant, render_mode, picture)

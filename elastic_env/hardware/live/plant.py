@@ -91,7 +91,9 @@ class ServoPlant:
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError("an environment on hardware cannot be copied or pickled: there is one joint at its port")
+        raise HardwareError(
+            "an environment on hardware cannot be copied or pickled: there is one joint at its port"
+        )
 
     def __del__(self) -> None:
         """A testbed that nobody holds any more gives its ports back."""
@@ -122,7 +124,7 @@ class ServoPlant:
             bus.keep(self._servo_goal(angle))
             self._is_kept = True
 
-    def advance(self, num_substeps: int) -> None:  # noqa: ARG002  one period, whatever the physics would make of it
+    def advance(self, num_substeps: int) -> None:  # noqa: ARG002
         """Command `ctrl`, wait for the end of the control period, read.
 
         Raises:
@@ -130,7 +132,9 @@ class ServoPlant:
                 be.
         """
         if self._bus is None:
-            raise HardwareError(f"no episode is under way at {self.settings.port}: begin one with reset()")
+            raise HardwareError(
+                f"no episode is under way at {self.settings.port}: begin one with reset()"
+            )
         with self._closing_on_error():
             if self._is_kept:  # the first step may come any time after the reset
                 self._bus.stop_keeping()
@@ -202,14 +206,18 @@ class ServoPlant:
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError(f"world {world} of hardware cannot take a model of {model.nbody} bodies")
+        raise HardwareError(
+            f"world {world} of hardware cannot take a model of {model.nbody} bodies"
+        )
 
     def _open_bus(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:
             self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
             if settings.imu_port is not None:
-                self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
+                self._imu = AttitudeStream(
+                    settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s
+                )
             prefer_realtime(Priority.LOOP)
         return self._bus
 
@@ -224,7 +232,9 @@ class ServoPlant:
 
     def _move(self, start: float, end: float) -> None:
         """Move slowly from one angle to another [rad]."""
-        duration_s = max(QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S)
+        duration_s = max(
+            QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S
+        )
         steps = int(np.ceil(duration_s / self._period_s))
         for share in minimum_jerk(np.arange(1, steps + 1) / steps):
             self._cycle(start + (end - start) * float(share))

@@ -1,4 +1,5 @@
-"""The testbed task on hardware: the rules of `elastic_env/Testbed-v0`, with measurements in the place of the truth.
+"""The testbed task on hardware: the rules of `elastic_env/Testbed-v0`, with measurements in the
+place of the truth.
 
 What differs, because a real joint does not tell it:
 
@@ -9,9 +10,9 @@ What differs, because a real joint does not tell it:
 | reward | its term `link_error` is by the IMU; nan without one |
 | `truth()`, and with it the policy `oracle` | an error |
 
-Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies` and `limited`, see
-`elastic_env.hardware.live.plant.CycleTiming`.
-"""
+Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies`
+and `limited`, see `elastic_env.hardware.live.plant.CycleTiming`.
+"""  # noqa: E501
 
 from typing import Any
 
@@ -55,7 +56,9 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
-    world_type = record_type(*((name, _LINK[name]) for name in _LINK.names or ()), ("cycle", _CYCLE))
+    world_type = record_type(
+        *((name, _LINK[name]) for name in _LINK.names or ()), ("cycle", _CYCLE)
+    )
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
@@ -63,13 +66,16 @@ class HardwareTestbedTask(TestbedTask):
         super().__init__(config.replace(scenario=config.scenario.replace(imu=imu)), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
-        self.plant = ServoPlant(self.model, at, settings, config.control_period_s, config.pendulum.gravity_torque)
-        extent, limits = config.reference.extent(), settings.limits
+        self.plant = ServoPlant(
+            self.model, at, settings, config.control_period_s, config.pendulum.gravity_torque
+        )
+        extent = config.reference.extent()
+        limits = settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
             raise HardwareError(
-                f"the reference {config.reference.kind!r} can reach {extent.lowest:.3f} to {extent.highest:.3f} rad, "
-                f"the limits allow {limits.lowest_rad:g} to {limits.highest_rad:g} rad; lower its amplitude or widen "
-                "the limits"
+                f"the reference {config.reference.kind!r} can reach {extent.lowest:.3f} to"
+                f" {extent.highest:.3f} rad, the limits allow {limits.lowest_rad:g} to"
+                f" {limits.highest_rad:g} rad; lower its amplitude or widen the limits"
             )
 
     def truth(self) -> JointTruth:
@@ -78,7 +84,10 @@ class HardwareTestbedTask(TestbedTask):
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError("hardware has no truth: the policy 'oracle' and scores by the true link need a simulation")
+        raise HardwareError(
+            "hardware has no truth: the policy 'oracle' and scores by the true link need a"
+            " simulation"
+        )
 
     def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one
         """Drive the testbed to its start and let it settle under zero offset."""
@@ -99,7 +108,10 @@ class HardwareTestbedTask(TestbedTask):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """See the table of the module."""
         cycle = worlds["cycle"]
-        return {**super()._signals(joints, worlds), **{name: cycle[name].copy() for name in _CYCLE.names or ()}}
+        return {
+            **super()._signals(joints, worlds),
+            **{name: cycle[name].copy() for name in _CYCLE.names or ()},
+        }
 
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -110,5 +122,10 @@ class HardwareTestbedTask(TestbedTask):
         timing = self.plant.timing
         motor_torque: Array = self.plant.motor_torque
         self._worlds[self._row]["cycle"] = (
-            motor_torque[0], timing.jitter_s, timing.period_s, timing.overruns, timing.missed_replies, timing.limited
-        )  # fmt: skip
+            motor_torque[0],
+            timing.jitter_s,
+            timing.period_s,
+            timing.overruns,
+            timing.missed_replies,
+            timing.limited,
+        )

@@ -63,7 +63,10 @@ def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
         *_check_round_trips(bus, ids[0]),
     ]
     for servo_id, model in bus.models.items():
-        checks += [replace(check, what=f"{servo_id}: {check.what}") for check in _check_servo(bus, servo_id, model)]
+        checks += [
+            replace(check, what=f"{servo_id}: {check.what}")
+            for check in _check_servo(bus, servo_id, model)
+        ]
     return checks
 
 
@@ -88,7 +91,10 @@ def _check_round_trips(bus: DynamixelBus, servo_id: int) -> list[Check]:
         "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to "
         "0, and the bus to 1 Mbit/s or more"
     )
-    better = "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer busy"
+    better = (
+        "a bad line: look at plugs, cable, ground and termination, and at what else keeps the"
+        " computer busy"
+    )
     trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"
     return [
         Check("round trip of a ping", trip, _unless(typical < _SLOW_S, faster)),
@@ -130,7 +136,9 @@ def _check_servo(bus: DynamixelBus, servo_id: int, model: ServoModel) -> list[Ch
     left_on = "a program left it on; it is switched off before anything begins"
     watchdog = "yes" if model.has_watchdog else "not in this firmware; the supervisor stands in"
     return [
-        Check("model, firmware", f"{model.number} {model.name}, version {read('firmware_version')}"),
+        Check(
+            "model, firmware", f"{model.number} {model.name}, version {read('firmware_version')}"
+        ),
         Check("hardware error", error or "none", _unless(not error, restart)),
         Check("input voltage", f"{volts:.1f} V", _unless(low < volts < high, supply)),
         Check("temperature", f"{degrees} °C", _unless(degrees < _WARM_SHARE * hottest, cool)),

@@ -108,9 +108,15 @@ class Guard:
         """
         asked = np.asarray(goals, dtype=np.float64)
         if asked.shape != self.goals.shape or not np.isfinite(asked).all():
-            raise FaultError(f"goals must be {len(self.goals)} finite angles [rad], got {np.asarray(goals).tolist()}")
+            raise FaultError(
+                f"goals must be {len(self.goals)} finite angles [rad], got"
+                f" {np.asarray(goals).tolist()}"
+            )
         if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
-            raise FaultError(f"the time since the last command must be at least 0 s and finite, got {elapsed_s} s")
+            raise FaultError(
+                "the time since the last command must be at least 0 s and finite, got"
+                f" {elapsed_s} s"
+            )
         if not self.is_holding:
             reach = self.limits.slew_rad_s * elapsed_s
             within = np.clip(asked, self.limits.lowest_rad, self.limits.highest_rad)
@@ -151,7 +157,9 @@ class Guard:
         if fast.any():
             speeds = self._list(fast, states.velocity)
             return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {speeds} rad/s"
-        behind = is_fresh & exceeds(np.abs(states.position - self.goals), limits.following_error_rad)
+        behind = is_fresh & exceeds(
+            np.abs(states.position - self.goals), limits.following_error_rad
+        )
         if behind.any():
             return (
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, "
@@ -163,7 +171,9 @@ class Guard:
     def _check_load(self, states: States) -> str:
         torque = np.abs(torque_of_current(states.current))
         strained = np.where(exceeds(torque, self.limits.torque_nm), self._strained + 1, 0)
-        self._strained = np.where(states.is_fresh, strained, self._strained)  # a missing reply tells neither way
+        self._strained = np.where(
+            states.is_fresh, strained, self._strained
+        )  # a missing reply tells neither way
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
         if too_long.any():
             torques = self._list(too_long, torque)

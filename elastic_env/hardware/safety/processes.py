@@ -57,7 +57,9 @@ def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Pop
         **options: Further arguments of `subprocess.Popen`: its pipes and descriptors.
     """
     command = child_command(module, *arguments)
-    return subprocess.Popen(command, env=child_environment(), text=True, start_new_session=True, **options)
+    return subprocess.Popen(
+        command, env=child_environment(), text=True, start_new_session=True, **options
+    )
 
 
 def end_child(process: "subprocess.Popen[str]", within_s: float) -> None:
@@ -81,7 +83,9 @@ def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, 
     Args:
         environment: Variables by name, default those of this program.
     """
-    entries = [entry for entry in environment.get(_PATH, "").split(os.pathsep) if not _is_here(entry)]
+    entries = [
+        entry for entry in environment.get(_PATH, "").split(os.pathsep) if not _is_here(entry)
+    ]
     others = {name: value for name, value in environment.items() if name != _PATH}
     return {**others, _PATH: os.pathsep.join(entries)} if entries else others
 
@@ -179,7 +183,9 @@ def is_ending(process_id: int, proc: Path = _PROC) -> bool:
         return (proc / "self").exists()
     except OSError:
         return False
-    pending = [line.split()[1] for line in status.splitlines() if line.startswith(("SigPnd:", "ShdPnd:"))]
+    pending = [
+        line.split()[1] for line in status.splitlines() if line.startswith(("SigPnd:", "ShdPnd:"))
+    ]
     is_killed = any(int(mask, 16) & _KILLED for mask in pending)
     fields = stat.rpartition(")")[2].split()
     return is_killed or fields[0] in "ZX" or bool(int(fields[_FLAGS]) & _ENDING)

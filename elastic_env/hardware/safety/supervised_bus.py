@@ -26,7 +26,10 @@ from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
 
-_ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
+_ERRORS = {
+    error.__name__: error
+    for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)
+}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
 """Longest silence of a supervisor beyond what was asked for [s].
@@ -78,7 +81,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         HardwareError: Its model is not known, or something is set such that nothing may move.
     """
 
-    def __init__(self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> None:
+    def __init__(
+        self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE
+    ) -> None:
         for ids in ports.values():
             require_ids(ids)
         self.models: list[list[int]] = []
@@ -106,7 +111,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             )
         try:
             self._receive(0, _START_S)
-            self.models = self._request("attach", self._slow_s, ids=list(self._ports.values()))["models"]
+            self.models = self._request("attach", self._slow_s, ids=list(self._ports.values()))[
+                "models"
+            ]
         except BaseException:
             self.close()
             raise
@@ -269,7 +276,10 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             how = f"ended (exit code {self._process.poll()})"
         else:
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
-        return FaultError(f"the supervisor process {how}; {emergency_stop(self._ports, self._baudrate, self.models)}")
+        return FaultError(
+            f"the supervisor process {how};"
+            f" {emergency_stop(self._ports, self._baudrate, self.models)}"
+        )
 
 
 def emergency_stop(
@@ -296,7 +306,11 @@ def emergency_stop(
             try:
                 bus.open()
                 opened.enter_context(_closing(bus))
-                known = dict(zip(ids, models[number], strict=True)) if models else _ask_models(bus, ids, problems)
+                known = (
+                    dict(zip(ids, models[number], strict=True))
+                    if models
+                    else _ask_models(bus, ids, problems)
+                )
                 bus.attach_known(known)
                 buses.append(bus)
             except HardwareError as error:

@@ -83,7 +83,9 @@ class Supervisor:
 
     def _next_request(self) -> dict[str, Any] | None:
         """The next request; a program that hangs loses its torque meanwhile."""
-        while not self._channel.is_waiting(None if self._guard is None else min(self._patience_s(), _GLANCE_S)):
+        while not self._channel.is_waiting(
+            None if self._guard is None else min(self._patience_s(), _GLANCE_S)
+        ):
             if is_ending(self._program):
                 return None
             self._stop_if_hanging()
@@ -100,7 +102,9 @@ class Supervisor:
 
     def _stop_if_hanging(self) -> None:
         if self._guard is not None and self._patience_s() == 0.0:
-            self._stop(f"no command for {1e3 * self._guard.limits.hang_s:.0f} ms: the program hangs")
+            self._stop(
+                f"no command for {1e3 * self._guard.limits.hang_s:.0f} ms: the program hangs"
+            )
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
         actions = {
@@ -120,9 +124,13 @@ class Supervisor:
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, servo_ids in zip(self._buses, ids, strict=True):
-            problems = [check for check in check_bus(bus, servo_ids) if check.is_vital and not check.is_good]
+            problems = [
+                check for check in check_bus(bus, servo_ids) if check.is_vital and not check.is_good
+            ]
             if problems:
-                words = "; ".join(f"{check.what} is {check.value}: {check.cure}" for check in problems)
+                words = "; ".join(
+                    f"{check.what} is {check.value}: {check.cure}" for check in problems
+                )
                 raise HardwareError(f"nothing can move at {bus.name} yet: {words}")
         return {"models": [[model.number for model in bus.models.values()] for bus in self._buses]}
 
@@ -137,7 +145,9 @@ class Supervisor:
         for bus, servo_id in servos:
             require_healthy(bus, servo_id)
             require_rest(bus, servo_id)
-        hottest = [require_cool(bus, servo_id, safety_limits.temperature_c) for bus, servo_id in servos]
+        hottest = [
+            require_cool(bus, servo_id, safety_limits.temperature_c) for bus, servo_id in servos
+        ]
         positions = np.array([bus.read_position(servo_id) for bus, servo_id in servos])
         guard = Guard(safety_limits, positions, self._servos.names, hottest)
         self._fault = None
@@ -172,7 +182,9 @@ class Supervisor:
         if exceeds(at - now, LONGEST_WAIT_S):
             raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
         is_held = guard.is_holding
-        allowed, is_limited = guard.command(np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S))
+        allowed, is_limited = guard.command(
+            np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S)
+        )
         self._servos.write_goals(allowed)
         self._commanded_s = now
         sleep_until(at)
@@ -282,7 +294,9 @@ def require_cool(bus: Bus, servo_id: int, limit_c: float) -> float:
     hottest = min(limit_c, bus.read_temperature_limit(servo_id))
     degrees = bus.read_temperature(servo_id)
     if exceeds(degrees, hottest):
-        raise FaultError(explain_heat(f"{servo_name(bus, servo_id)}: {degrees:g}", np.array(hottest)))
+        raise FaultError(
+            explain_heat(f"{servo_name(bus, servo_id)}: {degrees:g}", np.array(hottest))
+        )
     return hottest
 
 

@@ -28,7 +28,11 @@ class EndEffector:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, joints: Sequence[str], name: str, held: Mapping[str, float] | None = None
+        self,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        name: str,
+        held: Mapping[str, float] | None = None,
     ) -> None:
         self.body, self.place, R = _found(model, name)
         tree = Tree.of(model, joints, held or {}, gravcomp=False)
@@ -48,7 +52,9 @@ class EndEffector:
         return position.reshape(*q.shape[:-1], 3), R.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Derivative of the position and of the turn, (..., 3, n) each [m/rad], [1], in the world's axes."""
+        """Derivative of the position and of the turn, (..., 3, n) each [m/rad], [1], in the
+        world's axes.
+        """
         position, _, axes, anchors = self._walked(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
@@ -66,7 +72,8 @@ class EndEffector:
         return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
 
     def parts(self, q_ref: Array, q: Array) -> Array:
-        r"""Where the error of the position comes from: what the deviation of each joint alone moves, to first order.
+        r"""Where the error of the position comes from: what the deviation of each joint alone
+        moves, to first order.
 
         .. math:: p(q) - p(q_{ref}) \approx \sum_j J_j(q_{ref}) (q_j - q_{ref,j})
 
@@ -80,16 +87,20 @@ class EndEffector:
         return self.jacobian(q_ref)[0] * (q - q_ref)[..., None, :]
 
     def _walked(self, q: Array) -> tuple[Array, ...]:
-        """Position and orientation of the end effector; axis and anchor of each hinge before it, a row per pose."""
+        """Position and orientation of the end effector; axis and anchor of each hinge before it,
+        a row per pose.
+        """
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
-        count, hinges = len(rows), len(self._chain) - 1
+        count = len(rows)
+        hinges = len(self._chain) - 1
         made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
         walk(self._chain, rows, *made)
         return tuple(made)
 
 
 def outermost_body(model: mujoco.MjModel) -> str:
-    """The body with a name that has the most bodies between it and the base, the last one of several.
+    """The body with a name that has the most bodies between it and the base, the last one of
+    several.
 
     Raises:
         ConfigurationError: No body has a name.
@@ -99,7 +110,9 @@ def outermost_body(model: mujoco.MjModel) -> str:
         depth[body] = depth[model.body_parentid[body]] + 1
     named = [body for body in range(1, model.nbody) if model.body(body).name]
     if not named:
-        raise ConfigurationError("no body of the model has a name; give one to the body that is the end effector")
+        raise ConfigurationError(
+            "no body of the model has a name; give one to the body that is the end effector"
+        )
     return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
 
 
@@ -108,17 +121,21 @@ def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
     sites = {model.site(i).name: i for i in range(model.nsite)}
     bodies = {model.body(i).name: i for i in range(1, model.nbody)}
     if name in sites:
-        at, R = sites[name], np.zeros(9)
+        at = sites[name]
+        R = np.zeros(9)
         mujoco.mju_quat2Mat(R, model.site_quat[at])
         return int(model.site_bodyid[at]), model.site_pos[at].copy(), R.reshape(3, 3)
     if name not in bodies:
-        raise unknown_name("site or body for end_effector", name, [one for one in (*sites, *bodies) if one])
+        raise unknown_name(
+            "site or body for end_effector", name, [one for one in (*sites, *bodies) if one]
+        )
     return bodies[name], np.zeros(3), np.eye(3)
 
 
 def _chain(tree: Tree, body: int) -> Any:
     """Links from the base to what carries a body, and one more for what is fixed to it."""
-    path, link = [], tree.carrier[body]
+    path = []
+    link = tree.carrier[body]
     while link > 0:
         path.insert(0, link)
         link = int(tree.links[link]["parent"])
@@ -126,11 +143,14 @@ def _chain(tree: Tree, body: int) -> Any:
 
 
 @compiled
-def walk(chain: Any, q: Array, position: Array, orientation: Array, axes: Array, anchors: Array) -> None:
+def walk(
+    chain: Any, q: Array, position: Array, orientation: Array, axes: Array, anchors: Array
+) -> None:
     """Poses of a chain of hinges, a row after the other.
 
     Args:
-        chain: Rows of `LINK`, each in the frame of the one before it; the last is fixed to its parent.
+        chain: Rows of `LINK`, each in the frame of the one before it; the last is fixed to its
+            parent.
         q: Joint angles, (rows, n) [rad].
         position: Of the last row, into (rows, 3) [m].
         orientation: Of the last row, into (rows, 3, 3).
@@ -138,7 +158,9 @@ def walk(chain: Any, q: Array, position: Array, orientation: Array, axes: Array,
         anchors: Points on these axes, into (rows, len(chain) - 1, 3) [m].
     """
     hinges = len(chain) - 1
-    R, moved, p = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    R = np.empty((3, 3))
+    moved = np.empty((3, 3))
+    p = np.empty(3)
     for row in range(len(q)):
         for i in range(3):
             p[i] = 0.0
@@ -146,20 +168,26 @@ def walk(chain: Any, q: Array, position: Array, orientation: Array, axes: Array,
                 R[i, k] = 1.0 if i == k else 0.0
         for at in range(hinges + 1):
             link = chain[at]
-            frame, anchor = link["R"], link["anchor"]
+            frame = link["R"]
+            anchor = link["anchor"]
             for i in range(3):
                 p[i] += R[i, 0] * anchor[0] + R[i, 1] * anchor[1] + R[i, 2] * anchor[2]
             for i in range(3):
                 for k in range(3):
-                    moved[i, k] = R[i, 0] * frame[0, k] + R[i, 1] * frame[1, k] + R[i, 2] * frame[2, k]
+                    moved[i, k] = (
+                        R[i, 0] * frame[0, k] + R[i, 1] * frame[1, k] + R[i, 2] * frame[2, k]
+                    )
             R[:] = moved
             if at == hinges:
                 break
             angle = q[row, link["column"]] - link["zero"]
-            c, s = math.cos(angle), math.sin(angle)
+            c = math.cos(angle)
+            s = math.sin(angle)
             for i in range(3):
-                R[i, 0], R[i, 1] = c * moved[i, 0] + s * moved[i, 1], c * moved[i, 1] - s * moved[i, 0]
-                axes[row, at, i], anchors[row, at, i] = R[i, 2], p[i]
+                R[i, 0] = c * moved[i, 0] + s * moved[i, 1]
+                R[i, 1] = c * moved[i, 1] - s * moved[i, 0]
+                axes[row, at, i] = R[i, 2]
+                anchors[row, at, i] = p[i]
         for i in range(3):
             position[row, i] = p[i]
             for k in range(3):

@@ -1,24 +1,27 @@
-r"""Statics and dynamics of a tree of hinges on a fixed base, compiled: every row of a batch is a posture.
+r"""Statics and dynamics of a tree of hinges on a fixed base, compiled: every row of a batch is a
+posture.
 
-Each link has a frame in the anchor of its hinge, whose z axis is the hinge's axis. So a hinge turns its frame about z,
-and its torque is the third component of a moment. All vectors are in the frames of their links.
+Each link has a frame in the anchor of its hinge, whose z axis is the hinge's axis. So a hinge turns
+its frame about z, and its torque is the third component of a moment. All vectors are in the frames
+of their links.
 
-At rest, a link and all that it carries have the first moment l about the link's anchor. With u = −g, the torque that
-holds them and its derivatives are
+At rest, a link and all that it carries have the first moment l about the link's anchor. With u =
+−g, the torque that holds them and its derivatives are
 
 .. math:: \tau_i = z_i \cdot (l_i \times u), \quad \partial\tau_i/\partial q_j = z_i \cdot ((z_j \times l_j) \times u)
 
-for joints j that i carries. Gravity has a potential, so the matrix is symmetric. In motion the recursive Newton-Euler
-algorithm [Luh1980] adds what the masses need: rates and accelerations from the base to the tips, forces and moments
-back. Gravity is not part of that pass, because `gravcomp` changes the weight of a body and not its inertia.
+for joints j that i carries. Gravity has a potential, so the matrix is symmetric. In motion the
+recursive Newton-Euler algorithm [Luh1980] adds what the masses need: rates and accelerations from
+the base to the tips, forces and moments back. Gravity is not part of that pass, because `gravcomp`
+changes the weight of a body and not its inertia.
 
-Rows are taken in blocks, and a loop over the rows of a block is the innermost one, so that the compiler uses vector
-instructions. A row's numbers depend on that row alone. Numba keeps compiled code by the file of the function that was
-called: all that a kernel calls stands here.
+Rows are taken in blocks, and a loop over the rows of a block is the innermost one, so that the
+compiler uses vector instructions. A row's numbers depend on that row alone. Numba keeps compiled
+code by the file of the function that was called: all that a kernel calls stands here.
 
-[Luh1980] J. Y. S. Luh, M. W. Walker, R. P. C. Paul, "On-Line Computational Scheme for Mechanical Manipulators", J. Dyn.
-Sys., Meas., Control 102(2).
-"""
+[Luh1980] J. Y. S. Luh, M. W. Walker, R. P. C. Paul, "On-Line Computational Scheme for Mechanical
+Manipulators", J. Dyn. Sys., Meas., Control 102(2).
+"""  # noqa: E501
 
 import math
 from typing import Any, TypeAlias
@@ -49,8 +52,9 @@ LINK = np.dtype(
 )
 """A link: its parent in the tree, the column of its joint and the angle at which it is drawn [rad].
 
-R and anchor are the frame in that of the parent, at that angle [1], [m]. Mass, first moment and inertia are about the
-anchor, in the frame of the link [kg], [kg·m], [kg·m²]. The weight is the mass that gravity acts on. Row 0 is the base.
+R and anchor are the frame in that of the parent, at that angle [1], [m]. Mass, first moment and
+inertia are about the anchor, in the frame of the link [kg], [kg·m], [kg·m²]. The weight is the mass
+that gravity acts on. Row 0 is the base.
 """
 
 BLOCK = 64
@@ -71,9 +75,11 @@ LANES = np.dtype(
     ],
     align=True,
 )
-"""What the rows of a block know of a link: the weight that it carries, its joint's angle, u and l as above.
+"""What the rows of a block know of a link: the weight that it carries, its joint's angle, u and l
+as above.
 
-Of the motion: angular rate, angular acceleration, acceleration of the anchor; force and moment that the link needs.
+Of the motion: angular rate, angular acceleration, acceleration of the anchor; force and moment that
+the link needs.
 """
 
 
@@ -96,7 +102,9 @@ def gravity_torques(links: Any, gravity: Array, q: Array, lanes: Any, torque: Ar
 
 @compiled
 def gravity_gradients(links: Any, gravity: Array, q: Array, lanes: Any, gradient: Array) -> None:
-    """∂τ_g/∂q into `gradient`, (rows, n, n) [N·m/rad], which holds zeros; arguments as `gravity_torques`."""
+    """∂τ_g/∂q into `gradient`, (rows, n, n) [N·m/rad], which holds zeros; arguments as
+    `gravity_torques`.
+    """
     for start in range(0, len(q), len(lanes[0]["cosine"])):
         rows = q[start : start + len(lanes[0]["cosine"])]
         weigh(links, gravity, rows, lanes)
@@ -104,7 +112,9 @@ def gravity_gradients(links: Any, gravity: Array, q: Array, lanes: Any, gradient
 
 
 @compiled
-def inverse_dynamics(links: Any, gravity: Array, motion: tuple[Array, Array, Array], lanes: Any, torque: Array) -> None:
+def inverse_dynamics(
+    links: Any, gravity: Array, motion: tuple[Array, Array, Array], lanes: Any, torque: Array
+) -> None:
     """Torque of a motion without friction, into `torque`; arguments as `gravity_torques`.
 
     Args:
@@ -129,23 +139,27 @@ def weigh(links: Any, gravity: Array, q: Array, lanes: Any) -> None:
     for row in range(len(q)):
         put(lanes[0]["up"], row, (-gravity[0], -gravity[1], -gravity[2]))
     for i in range(1, len(links)):
-        link, lane = links[i], lanes[i]
-        above, R, column, zero, own = (
-            lanes[link["parent"]],
-            matrix(link["R"]),
-            link["column"],
-            link["zero"],
-            link["weight_moment"],
-        )
-        moment, cosine, sine = (own[0], own[1], own[2]), lane["cosine"], lane["sine"]
+        link = links[i]
+        lane = lanes[i]
+        above = lanes[link["parent"]]
+        R = matrix(link["R"])
+        column = link["column"]
+        zero = link["zero"]
+        own = link["weight_moment"]
+        moment = (own[0], own[1], own[2])
+        cosine = lane["cosine"]
+        sine = lane["sine"]
         lane["carried"] = link["weight"]
         for row in range(len(q)):  # by itself, as the compiler knows no vectors of sines
-            cosine[row], sine[row] = math.cos(q[row, column] - zero), math.sin(q[row, column] - zero)
+            cosine[row] = math.cos(q[row, column] - zero)
+            sine[row] = math.sin(q[row, column] - zero)
         for row in range(len(q)):
             put(lane["up"], row, into_link(R, cosine[row], sine[row], at(above["up"], row)))
             put(lane["lever"], row, moment)
     for i in range(len(links) - 1, 0, -1):
-        lane, above, R = lanes[i], lanes[links[i]["parent"]], matrix(links[i]["R"])
+        lane = lanes[i]
+        above = lanes[links[i]["parent"]]
+        R = matrix(links[i]["R"])
         hung = scaled(lane["carried"], links[i]["anchor"])
         above["carried"] += lane["carried"]
         for row in range(len(q)):
@@ -157,7 +171,8 @@ def weigh(links: Any, gravity: Array, q: Array, lanes: Any) -> None:
 def hold(links: Any, lanes: Any, torque: Array) -> None:
     """Gravity torque of rows that are weighed."""
     for i in range(1, len(links)):
-        lane, column = lanes[i], links[i]["column"]
+        lane = lanes[i]
+        column = links[i]["column"]
         for row in range(len(torque)):
             torque[row, column] = cross(at(lane["lever"], row), at(lane["up"], row))[2]
 
@@ -166,17 +181,23 @@ def hold(links: Any, lanes: Any, torque: Array) -> None:
 def differentiate(links: Any, lanes: Any, gradient: Array) -> None:
     """Gradient of rows that are weighed: of every joint, along all that carry it."""
     for j in range(1, len(links)):
-        change, column = lanes[j]["moment"], links[j]["column"]
+        change = lanes[j]["moment"]
+        column = links[j]["column"]
         for row in range(len(gradient)):
             x, y, _ = at(lanes[j]["lever"], row)
             put(change, row, cross((-y, x, 0.0), at(lanes[j]["up"], row)))
             gradient[row, column, column] = change[2, row]
         i = j
         while links[i]["parent"] != 0:
-            lane, R = lanes[i], matrix(links[i]["R"])
+            lane = lanes[i]
+            R = matrix(links[i]["R"])
             i = links[i]["parent"]
             for row in range(len(gradient)):
-                put(change, row, into_parent(R, lane["cosine"][row], lane["sine"][row], at(change, row)))
+                put(
+                    change,
+                    row,
+                    into_parent(R, lane["cosine"][row], lane["sine"][row], at(change, row)),
+                )
                 gradient[row, column, links[i]["column"]] = change[2, row]
                 gradient[row, links[i]["column"], column] = change[2, row]
 
@@ -189,13 +210,24 @@ def move(links: Any, q_dot: Array, q_ddot: Array, lanes: Any) -> None:
         put(lanes[0]["angular"], row, (0.0, 0.0, 0.0))
         put(lanes[0]["linear"], row, (0.0, 0.0, 0.0))
     for i in range(1, len(links)):
-        link, lane, above, column = links[i], lanes[i], lanes[links[i]["parent"]], links[i]["column"]
-        R, inertia, mass = matrix(link["R"]), matrix(link["inertia"]), link["mass"]
-        anchor, moment = scaled(1.0, link["anchor"]), scaled(1.0, link["moment"])
+        link = links[i]
+        lane = lanes[i]
+        above = lanes[links[i]["parent"]]
+        column = links[i]["column"]
+        R = matrix(link["R"])
+        inertia = matrix(link["inertia"])
+        mass = link["mass"]
+        anchor = scaled(1.0, link["anchor"])
+        moment = scaled(1.0, link["moment"])
         for row in range(len(q_dot)):
-            c, s, turn = lane["cosine"][row], lane["sine"][row], q_dot[row, column]
-            rate, angular = at(above["rate"], row), at(above["angular"], row)
-            linear = into_link(R, c, s, total(at(above["linear"], row), acceleration_of(anchor, rate, angular)))
+            c = lane["cosine"][row]
+            s = lane["sine"][row]
+            turn = q_dot[row, column]
+            rate = at(above["rate"], row)
+            angular = at(above["angular"], row)
+            linear = into_link(
+                R, c, s, total(at(above["linear"], row), acceleration_of(anchor, rate, angular))
+            )
             x, y, z = into_link(R, c, s, rate)
             angular = total(into_link(R, c, s, angular), (y * turn, -x * turn, q_ddot[row, column]))
             rate = (x, y, z + turn)
@@ -204,7 +236,13 @@ def move(links: Any, q_dot: Array, q_ddot: Array, lanes: Any) -> None:
             put(lane["linear"], row, linear)
             spun = acceleration_of(moment, rate, angular)
             put(
-                lane["force"], row, (mass * linear[0] + spun[0], mass * linear[1] + spun[1], mass * linear[2] + spun[2])
+                lane["force"],
+                row,
+                (
+                    mass * linear[0] + spun[0],
+                    mass * linear[1] + spun[1],
+                    mass * linear[2] + spun[2],
+                ),
             )
             needed = total(times(inertia, angular), cross(rate, times(inertia, rate)))
             put(lane["moment"], row, total(needed, cross(moment, linear)))
@@ -212,14 +250,21 @@ def move(links: Any, q_dot: Array, q_ddot: Array, lanes: Any) -> None:
 
 @compiled
 def push(links: Any, lanes: Any, torque: Array) -> None:
-    """Forces and moments from the tips to the base; what moves the joints is added to their torque."""
+    """Forces and moments from the tips to the base; what moves the joints is added to their
+    torque.
+    """
     for i in range(len(links) - 1, 0, -1):
-        lane, above, column = lanes[i], lanes[links[i]["parent"]], links[i]["column"]
-        R, anchor, is_inner = matrix(links[i]["R"]), scaled(1.0, links[i]["anchor"]), links[i]["parent"] != 0
+        lane = lanes[i]
+        above = lanes[links[i]["parent"]]
+        column = links[i]["column"]
+        R = matrix(links[i]["R"])
+        anchor = scaled(1.0, links[i]["anchor"])
+        is_inner = links[i]["parent"] != 0
         for row in range(len(torque)):
             torque[row, column] += lane["moment"][2, row]
         for row in range(len(torque) if is_inner else 0):
-            c, s = lane["cosine"][row], lane["sine"][row]
+            c = lane["cosine"][row]
+            s = lane["sine"][row]
             force = into_parent(R, c, s, at(lane["force"], row))
             moment = total(into_parent(R, c, s, at(lane["moment"], row)), cross(anchor, force))
             put(above["force"], row, total(at(above["force"], row), force))
@@ -228,13 +273,17 @@ def push(links: Any, lanes: Any, torque: Array) -> None:
 
 @compiled
 def acceleration_of(arm: Vector, rate: Vector, angular: Vector) -> Vector:
-    """α × r + ω × (ω × r): of a point that turns with a frame, without that of the frame's origin."""
+    """α × r + ω × (ω × r): of a point that turns with a frame, without that of the frame's
+    origin.
+    """
     return total(cross(angular, arm), cross(rate, cross(rate, arm)))
 
 
 @compiled
 def into_link(R: Matrix, c: float, s: float, v: Vector) -> Vector:
-    """A vector of the parent's frame in that of a link, whose joint has turned by an angle of this cosine and sine."""
+    """A vector of the parent's frame in that of a link, whose joint has turned by an angle of
+    this cosine and sine.
+    """
     x = R[0] * v[0] + R[3] * v[1] + R[6] * v[2]
     y = R[1] * v[0] + R[4] * v[1] + R[7] * v[2]
     z = R[2] * v[0] + R[5] * v[1] + R[8] * v[2]

@@ -1,4 +1,6 @@
-"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of `elastic_env.rigid.tree.kernels`."""
+"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of
+`elastic_env.rigid.tree.kernels`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +58,8 @@ class Tree:
             parent = links[i]["parent"]
             links[i]["R"] = R_wl[parent].T @ R_wl[i]
             links[i]["anchor"] = R_wl[parent].T @ (p_wl[i] - p_wl[parent])
-        com, R_li = _turned(R_lw, data.xipos - p_wl[carrier]), R_lw @ data.ximat.reshape(-1, 3, 3)
+        com = _turned(R_lw, data.xipos - p_wl[carrier])
+        R_li = R_lw @ data.ximat.reshape(-1, 3, 3)
         for b in range(1, model.nbody):
             inertia = R_li[b] @ np.diag(model.body_inertia[b]) @ R_li[b].T
             share = 1.0 - float(model.body_gravcomp[b]) if gravcomp else 1.0
@@ -66,7 +69,8 @@ class Tree:
 
     def loaded(self, body: int, mass: float, place: Array) -> Any:
         """The links with one point mass more, in the frame of a body [kg], [m]."""
-        links, carrier = self.links.copy(), self.carrier[body]
+        links = self.links.copy()
+        carrier = self.carrier[body]
         _add(links[carrier], mass, self.place[body] + self.R[body] @ place)
         return links
 
@@ -80,7 +84,9 @@ def _carriers(model: mujoco.MjModel, moving: Sequence[int]) -> list[int]:
     return carrier
 
 
-def _jointed(model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]) -> Any:
+def _jointed(
+    model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]
+) -> Any:
     """Links that know their parents and their joints, without frames and masses."""
     links = np.zeros(1 + len(moving), LINK)
     for i, j in enumerate(moving, start=1):
@@ -92,8 +98,12 @@ def _jointed(model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int]
     return links
 
 
-def _add(link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0) -> None:
-    """Give a link a further mass, with its inertia about its center of mass, and a share of its weight."""
+def _add(
+    link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0
+) -> None:
+    """Give a link a further mass, with its inertia about its center of mass, and a share of its
+    weight.
+    """
     link["mass"] += mass
     link["moment"] += mass * com
     link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))

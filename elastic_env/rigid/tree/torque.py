@@ -1,4 +1,6 @@
-"""Torque that the joints of a rigid tree have to deliver: gravity, inertia, springs of joints, less `gravcomp`."""
+"""Torque that the joints of a rigid tree have to deliver: gravity, inertia, springs of joints,
+less `gravcomp`.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,8 +15,8 @@ class TreeTorque:
 
     .. math:: \tau = M \ddot q + c(q, \dot q) + \tau_g(q) - \tau_{gravcomp}(q) + k_s (q - q_s)
 
-    k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and friction of the
-    model are not in it.
+    k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and
+    friction of the model are not in it.
 
     Args:
         model: Compiled rigid model on a fixed base.
@@ -38,14 +40,18 @@ class TreeTorque:
         self.has_springs = bool(self._spring.any())
 
     def gravity_torque(self, q: Array) -> Array:
-        """Torque at rest, from (..., n) [rad] to (..., n) [N·m]; springs and `gravcomp` are in it."""
+        """Torque at rest, from (..., n) [rad] to (..., n) [N·m]; springs and `gravcomp` are in
+        it.
+        """
         return self._with_springs(self._body.gravity_torque(q), q)
 
     def gravity_gradient(self, q: Array) -> Array:
         """Its gradient, from (..., n) [rad] to (..., n, n) [N·m/rad]."""
         gradient = self._body.gravity_gradient(q)
         if self.has_springs:
-            gradient.reshape(-1, gradient.shape[-1] ** 2)[:, :: gradient.shape[-1] + 1] += self._spring
+            gradient.reshape(-1, gradient.shape[-1] ** 2)[:, :: gradient.shape[-1] + 1] += (
+                self._spring
+            )
         return gradient
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:

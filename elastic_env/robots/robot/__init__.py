@@ -1,3 +1,4 @@
 """Any robot on a fixed base, from a file of MJCF or URDF and the elasticity of its joints."""
 
-NAME, ID = "robot", "elastic_env/Robot-v0"
+NAME = "robot"
+ID = "elastic_env/Robot-v0"

@@ -1,6 +1,8 @@
-"""`elastic_env/Robot-v0`: any robot on a fixed base, from a file of its rigid model and one of its elastic joints.
+"""`elastic_env/Robot-v0`: any robot on a fixed base, from a file of its rigid model and one of its
+elastic joints.
 
-env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml", end_effector="tool")
+env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml",
+end_effector="tool")
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,10 +37,14 @@ from elastic_env.world.joint_task import JointTask, stiffest
 from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
-"""The made-up arm that is played where no model is named; its joints are in the YAML file beside it."""
+"""The made-up arm that is played where no model is named; its joints are in the YAML file beside
+it.
+"""
 
 LOAD_SHARE = 0.2
-"""Share of the mass of the joints' links that servos of unknown limits can carry: what the scenario `payload` adds."""
+"""Share of the mass of the joints' links that servos of unknown limits can carry: what the
+scenario `payload` adds.
+"""
 
 
 class RobotConfig(JointRobotConfig):
@@ -66,44 +72,60 @@ def configure_robot(
     """The configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
 
     Args:
-        model: File of MJCF (.xml) or URDF (.urdf), the text of one, or a `mujoco.MjSpec`; without it and joints a
-            made-up arm of four joints.
-        joints: YAML file or mapping of the elastic joints by name or pattern, see `elastic_env.joint.joint_settings`.
-            All other joints are held where the model's first keyframe has them, or at its reference.
-        reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind` and
-            parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
+        model: File of MJCF (.xml) or URDF (.urdf), the text of one, or a `mujoco.MjSpec`; without
+            it and joints a made-up arm of four joints.
+        joints: YAML file or mapping of the elastic joints by name or pattern, see
+            `elastic_env.joint.joint_settings`. All other joints are held where the model's first
+            keyframe has them, or at its reference.
+        reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a
+            mapping with `kind` and parameters, such as {"kind": "csv", "file": "angles.csv"}, or a
+            reference model.
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         end_effector: Site or body whose place and tilt are scored; default the outermost body.
-        home: Angle about which each joint follows the reference, by name or in order [rad]; default the model's first
-            keyframe, or its reference, within the joint ranges.
-        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default the mass that the
-            joints carry.
+        home: Angle about which each joint follows the reference, by name or in order [rad]; default
+            the model's first keyframe, or its reference, within the joint ranges.
+        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default
+            the mass that the joints carry.
         imu: Site of the accelerometer.
         stiffness: K in place of that in `joints` [N·m/rad], one number or one per joint.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
         sensors: What is observed beside the standard set, see `elastic_env.world.further_sensors`.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
-        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where the joints explode
-            with it the largest stable one [s].
+        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where
+            the joints explode with it the largest stable one [s].
 
     Raises:
-        ConfigurationError: A file, a name, a parameter or a combination that does not exist, or a model that floats.
+        ConfigurationError: A file, a name, a parameter or a combination that does not exist, or a
+            model that floats.
     """
     if model is None and joints is None:
-        model, joints, end_effector = EXAMPLE, EXAMPLE.with_suffix(".yaml"), end_effector or "tool"
+        model = EXAMPLE
+        joints = EXAMPLE.with_suffix(".yaml")
+        end_effector = end_effector or "tool"
     if model is None:
         raise ConfigurationError(f"{ID} needs a model beside joints, such as model='arm.xml'")
     robot = joint_robot(model, {} if joints is None else joints, end_effector)
-    robot = replace(robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg}))
+    robot = replace(
+        robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg})
+    )
     settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
     if timestep_s is None:
-        played = stiffest(compiled_spec(robot.elastic(settings), "the model with elastic joints"), settings.scenario)
+        played = stiffest(
+            compiled_spec(robot.elastic(settings), "the model with elastic joints"),
+            settings.scenario,
+        )
         settings = settings.replace(timestep_s=stable_timestep(played, settings.control_period_s))
-    return RobotConfig(robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields})
+    return RobotConfig(
+        robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields}
+    )
 
 
-def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None = None) -> JointRobot:
-    """A robot from the file of its rigid model and that of its joints; arguments and errors as `configure_robot`."""
+def joint_robot(
+    model: GivenModel, joints: GivenJoints, end_effector: str | None = None
+) -> JointRobot:
+    """A robot from the file of its rigid model and that of its joints; arguments and errors as
+    `configure_robot`.
+    """
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
     require_fixed_base(whole)
@@ -114,11 +136,17 @@ def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None
     mass = float(rigid.body_subtreemass[0])
     elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
-        raise ConfigurationError("encoder_counts_per_turn must be the same for all joints; give it under '*'")
+        raise ConfigurationError(
+            "encoder_counts_per_turn must be the same for all joints; give it under '*'"
+        )
     return JointRobot(
-        NAME, RigidModel(model, tuple(names)), elastic, home=home_of_joints(whole, names).tolist(),
-        end_effector=end_effector or outermost_body(rigid), load_kg=mass,
-    )  # fmt: skip
+        NAME,
+        RigidModel(model, tuple(names)),
+        elastic,
+        home=home_of_joints(whole, names).tolist(),
+        end_effector=end_effector or outermost_body(rigid),
+        load_kg=mass,
+    )
 
 
 def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
@@ -135,7 +163,9 @@ def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, Joi
     return {name: settings[name] for name in without_fingers(model, settings, given)}
 
 
-def _home(robot: JointRobot, given: Mapping[str, float] | Sequence[float] | None) -> Sequence[float] | None:
+def _home(
+    robot: JointRobot, given: Mapping[str, float] | Sequence[float] | None
+) -> Sequence[float] | None:
     """Angles by name, of which those that are not given are the robot's own."""
     if not isinstance(given, Mapping):
         return robot.home if given is None else given
@@ -154,4 +184,5 @@ def _picture(task: JointTask) -> JointPicture:
 
 
 ROBOT = Robot(NAME, ID, configure_robot, _task, _picture)  # pyright: ignore[reportArgumentType]
-make, make_vector = ROBOT.make, ROBOT.make_vector
+make = ROBOT.make
+make_vector = ROBOT.make_vector

@@ -1,4 +1,6 @@
-"""The elastic joints of a robot: what is given by name or pattern, what the model says, and defaults for the rest."""
+"""The elastic joints of a robot: what is given by name or pattern, what the model says, and
+defaults for the rest.
+"""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,32 +13,55 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.frozen import home_of
-from elastic_env.joint.joint_settings import CURE, GivenJoints, JointSettings, ServoSettings, read_joints
+from elastic_env.joint.joint_settings import (
+    CURE,
+    GivenJoints,
+    JointSettings,
+    ServoSettings,
+    read_joints,
+)
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.rigid.tree.torque import TreeTorque
 
 ROTOR_FREQUENCY_RAD_S = 100.0
-"""An assumption for rotors that nobody knows: with the link blocked they swing on their spring at 16 Hz [rad/s]."""
+"""An assumption for rotors that nobody knows: with the link blocked they swing on their spring
+at 16 Hz [rad/s].
+"""
 DAMPING_RATIO = 0.17
-"""Of rotor and link on the spring between them; about that of the testbed's joint, K 1001, B 0.839, D 10 [1]."""
+"""Of rotor and link on the spring between them; about that of the testbed's joint, K 1001, B
+0.839, D 10 [1].
+"""
 _SERVO_TO_SPRING = 50.0
-"""k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while its integrator acts."""
-_LEAST_SERVO_TO_SPRING, _SERVO_RAD_S = 5.0, 1000.0
-"""The same where the rotor is as light as its links: by the frequency of the rotor on its servo, at least 5 K."""
+"""k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while
+its integrator acts.
+"""
+_LEAST_SERVO_TO_SPRING = 5.0
+_SERVO_RAD_S = 1000.0
+"""The same where the rotor is as light as its links: by the frequency of the rotor on its servo,
+at least 5 K.
+"""
 _FAR_STIFFER = 10.0
-"""k_p over K from which on a servo moves its rotor alone, and the spring keeps the links from it."""
+"""k_p over K from which on a servo moves its rotor alone, and the spring keeps the links from
+it.
+"""
 _FASTEST_PER_S = 2500.0
 """Rate of assumed dampers, which a physics step of 0.5 ms follows [1/s]."""
 _SPEED_LIMIT_RAD_S = 2.0 * np.pi
 """An assumption: position servos of arms turn about once a second."""
 DECAY_RATE_PER_S = 5.0
-"""At which links and servos come to rest, where nobody knows their damping: to 0.06 % within 1.5 s [1/s]."""
-_TORQUE_RESERVE, _RESERVE_RAD_S2 = 3.0, 20.0
-_POSES, _MASS_POSES = 200, 20
+"""At which links and servos come to rest, where nobody knows their damping: to 0.06 % within 1.5
+s [1/s].
+"""
+_TORQUE_RESERVE = 3.0
+_RESERVE_RAD_S2 = 20.0
+_POSES = 200
+_MASS_POSES = 20
 
 
-def elastic_settings(given: GivenJoints, hinges: Sequence[str], others: Sequence[str] = ()) -> dict[str, JointSettings]:
+def elastic_settings(
+    given: GivenJoints, hinges: Sequence[str], others: Sequence[str] = ()
+) -> dict[str, JointSettings]:
     """Settings of the joints that move on springs, by name, in the order of the model.
 
     Joints that nothing names, that are held, or that are rigid are left out: they stay at home.
@@ -47,7 +72,8 @@ def elastic_settings(given: GivenJoints, hinges: Sequence[str], others: Sequence
         others: Its further joints.
 
     Raises:
-        ConfigurationError: As of `read_joints`; no joint is elastic; or a rigid joint has a servo that gives way.
+        ConfigurationError: As of `read_joints`; no joint is elastic; or a rigid joint has a servo
+            that gives way.
     """
     if not hinges:
         raise ConfigurationError(
@@ -62,12 +88,14 @@ def elastic_settings(given: GivenJoints, hinges: Sequence[str], others: Sequence
             found[name] = own
         elif np.isfinite(gain):
             raise ConfigurationError(
-                f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it a stiffness K "
-                f"[N·m/rad] far above its position_gain of {gain:g}, such as {1e3 * gain:g}"
+                f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it"
+                f" a stiffness K [N·m/rad] far above its position_gain of {gain:g}, such as"
+                f" {1e3 * gain:g}"
             )
     if not found:
         raise ConfigurationError(
-            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(hinges)}, or '*' for all. {CURE}"
+            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(hinges)}, or"
+            f" '*' for all. {CURE}"
         )
     return found
 
@@ -83,14 +111,17 @@ def elastic_joints(
         load_kg: Load on the outermost body that servos of unknown limits have to be good for [kg].
 
     Raises:
-        ConfigurationError: An actuator of a joint is no position servo and none is given in its place, or limits and
-            gains contradict each other.
+        ConfigurationError: An actuator of a joint is no position servo and none is given in its
+            place, or limits and gains contradict each other.
 
     Warns:
-        UserWarning: A value is assumed otherwise than by default, as the default is out of scale with the model.
+        UserWarning: A value is assumed otherwise than by default, as the default is out of scale
+            with the model.
     """
-    model, names = spec.copy().compile(), list(settings)
-    poses, links = drawn_poses(model, names), TreeTorque(model, names)
+    model = spec.copy().compile()
+    names = list(settings)
+    poses = drawn_poses(model, names)
+    links = TreeTorque(model, names)
     links.set_load(model.body(outermost_body(model)).id, load_kg, np.zeros(3))
     torque = np.abs(links.gravity_torque(poses)).max(axis=0)
     inertias = _inertias(model, names, poses)
@@ -101,7 +132,9 @@ def elastic_joints(
         found[name] = joint.elastic()
         said += joint.said
     if said:
-        warnings.warn(f"assumed, as neither `joints` nor the model says it: {'; '.join(said)}", stacklevel=4)
+        warnings.warn(
+            f"assumed, as neither `joints` nor the model says it: {'; '.join(said)}", stacklevel=4
+        )
     return found
 
 
@@ -113,7 +146,8 @@ class _Links:
         torque: Largest torque at rest [N·m].
         least: Least inertia about the joint, where the other joints are free [kg·m²].
         most: Largest inertia about it, where the others are held [kg·m²].
-        together: Largest inertia about it, where all joints turn by the same angle, to whatever side [kg·m²].
+        together: Largest inertia about it, where all joints turn by the same angle, to whatever
+            side [kg·m²].
     """
 
     torque: float
@@ -124,8 +158,10 @@ class _Links:
 
 def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Array, Array, Array]:
     """Least and most inertia, and that of all together, as `_Links` has them, (n,) each [kg·m²]."""
-    data, at = mujoco.MjData(model), [int(model.joint(name).id) for name in names]
-    dofs, rotors = model.jnt_dofadr[at], np.diag([rotor_inertia(model, name) for name in names])
+    data = mujoco.MjData(model)
+    at = [int(model.joint(name).id) for name in names]
+    dofs = model.jnt_dofadr[at]
+    rotors = np.diag([rotor_inertia(model, name) for name in names])
     least = np.full(len(names), np.inf)
     most = np.zeros(len(names))
     together = np.zeros(len(names))
@@ -144,14 +180,18 @@ def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Ar
 
 
 class _Assumed:
-    """One elastic joint from what is given, what the model says, and assumptions within the scale of the model.
+    """One elastic joint from what is given, what the model says, and assumptions within the scale
+    of the model.
 
     Attributes:
         said: Assumptions that the default would not lead one to expect, with their values.
     """
 
     def __init__(self, model: mujoco.MjModel, name: str, own: JointSettings, links: _Links) -> None:
-        self._model, self._name, self._own, self._links = model, name, own, links
+        self._model = model
+        self._name = name
+        self._own = own
+        self._links = links
         self._dof = int(model.joint(name).dofadr[0])
         self.said: list[str] = []
 
@@ -161,7 +201,8 @@ class _Assumed:
         Raises:
             ConfigurationError: See `elastic_joints`.
         """
-        own, damping = self._own, float(self._model.dof_damping[self._dof])
+        own = self._own
+        damping = float(self._model.dof_damping[self._dof])
         is_given = own.servo.position_gain is not None
         actuator = None if is_given else position_servo(self._model, self._name)
         if actuator is not None and own.servo.velocity_gain is None:
@@ -174,7 +215,9 @@ class _Assumed:
             stiffness=own.stiffness,
             rotor_inertia=rotor,
             damping=_first(own.damping, self._damping(rotor)),
-            coulomb_friction=_first(own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])),
+            coulomb_friction=_first(
+                own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])
+            ),
             viscous_friction=_first(own.viscous_friction, damping),
             backlash=own.backlash,
             encoder_counts_per_turn=own.encoder_counts_per_turn,
@@ -182,7 +225,8 @@ class _Assumed:
         )
 
     def _rotor_inertia(self, velocity_gain: float) -> float:
-        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its links have.
+        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its
+        links have.
 
         A servo of a known velocity gain needs a rotor that is not too light for it.
         """
@@ -192,8 +236,8 @@ class _Assumed:
             return by_frequency
         scale = "its links have" if most == self._links.most else "its velocity gain needs"
         self.said.append(
-            f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)² would be "
-            f"{by_frequency:.3g}"
+            f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)²"
+            f" would be {by_frequency:.3g}"
         )
         return most
 
@@ -207,12 +251,15 @@ class _Assumed:
     def _damping(self, rotor: float) -> float:
         r"""D of a transmission that nobody knows [N·m·s/rad].
 
-        Rotor and lightest links swing with the damping ratio of the testbed's. All links that swing together come to
-        rest, too: with :math:`m_j = \sum_i |M_{ji}|` every mode of the links on their springs has :math:`\varphi^T M
-        \varphi \le \sum_j m_j \varphi_j^2`, so that :math:`D_j \ge 2 \sigma m_j` lets it decay by :math:`\sigma`.
-        A soft spring is damped critically at most, and light links no faster than a physics step follows.
+        Rotor and lightest links swing with the damping ratio of the testbed's. All links that swing
+        together come to rest, too: with :math:`m_j = \sum_i |M_{ji}|` every mode of the links on
+        their springs has :math:`\varphi^T M \varphi \le \sum_j m_j \varphi_j^2`, so that :math:`D_j
+        \ge 2 \sigma m_j` lets it decay by :math:`\sigma`. A soft spring is damped critically at
+        most, and light links no faster than a physics step follows.
         """
-        K, least, together = self._own.stiffness, self._links.least, self._links.together
+        K = self._own.stiffness
+        least = self._links.least
+        together = self._links.together
         of_lightest = DAMPING_RATIO * np.sqrt(K * rotor * least / (rotor + least))
         of_slowest = min(DECAY_RATE_PER_S * together, np.sqrt(K * together))
         fastest = _FASTEST_PER_S / 2.0 * rotor * least / (rotor + least)
@@ -224,18 +271,21 @@ class _Assumed:
         kp = _first(known.position_gain, ratio * self._own.stiffness)
         kv = known.velocity_gain
         if kv is None:
-            carries_links = known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
+            carries_links = (
+                known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
+            )
             kv = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
             if known.position_gain is not None and not is_given:
                 self.said.append(
-                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as nothing in the model "
-                    "damps its servo"
+                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as"
+                    " nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
         limit = known.torque_limit
         if limit is None:
             limit = force_limit(self._model, self._name)
-        # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh bounds by k_v/(B + M)
+        # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh
+        # bounds by k_v/(B + M)
         rate = min(DECAY_RATE_PER_S, kv / (4.0 * (rotor + links.most)))
         return Servo(
             position_gain=kp,
@@ -251,24 +301,34 @@ def _first(*values: float | None) -> float:
     return next(float(value) for value in values if value is not None)
 
 
-def drawn_poses(model: mujoco.MjModel, joints: list[str], count: int = _POSES, seed: int = 0) -> Array:
+def drawn_poses(
+    model: mujoco.MjModel, joints: list[str], count: int = _POSES, seed: int = 0
+) -> Array:
     """Poses within the ranges of the joints, or within half a turn about home, (count, n) [rad]."""
     lowest, highest = joint_ranges(model, joints)
     home = home_of_joints(model, joints)
-    lowest, highest = np.maximum(lowest, home - np.pi / 2), np.minimum(highest, home + np.pi / 2)
+    lowest = np.maximum(lowest, home - np.pi / 2)
+    highest = np.minimum(highest, home + np.pi / 2)
     generator = np.random.default_rng(seed)
     return generator.uniform(lowest, highest, (count, len(joints)))
 
 
 def joint_ranges(model: mujoco.MjModel, joints: list[str]) -> tuple[Array, Array]:
-    """Lowest and highest angle of every joint, infinite where there is no limit, (n,) each [rad]."""
+    """Lowest and highest angle of every joint, infinite where there is no limit, (n,) each
+    [rad].
+    """
     at = [model.joint(name).id for name in joints]
     limited = model.jnt_limited[at].astype(bool)
-    return (np.where(limited, model.jnt_range[at, end], bound) for end, bound in ((0, -np.inf), (1, np.inf)))  # pyright: ignore[reportReturnType]
+    return (
+        np.where(limited, model.jnt_range[at, end], bound)
+        for end, bound in ((0, -np.inf), (1, np.inf))
+    )  # pyright: ignore[reportReturnType]
 
 
 def home_of_joints(model: mujoco.MjModel, joints: list[str]) -> Array:
-    """The first keyframe, or the model's reference, moved inside the joint ranges by a tenth of them, (n,) [rad]."""
+    """The first keyframe, or the model's reference, moved inside the joint ranges by a tenth of
+    them, (n,) [rad].
+    """
     lowest, highest = joint_ranges(model, joints)
     home = home_of(model)[[model.jnt_qposadr[model.joint(name).id] for name in joints]]
     with np.errstate(invalid="ignore"):

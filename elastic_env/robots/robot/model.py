@@ -15,14 +15,15 @@ from elastic_env.rendering.simple_bodies import add_simple_bodies
 def read_robot(model: GivenModel) -> mujoco.MjSpec:
     """The specification of a robot, which compiles, see `read_model`.
 
-    Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot read, is drawn by
-    rods between the joints.
+    Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot
+    read, is drawn by rods between the joints.
 
     Args:
         model: File, text or specification; it is not changed.
 
     Raises:
-        ConfigurationError: It cannot be read or compiled, or a body has its mass from a mesh that is missing.
+        ConfigurationError: It cannot be read or compiled, or a body has its mass from a mesh that
+            is missing.
 
     Warns:
         UserWarning: Meshes are replaced.
@@ -30,8 +31,9 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     read = read_model(model, shapes=True)
     if read.lost:
         warnings.warn(
-            f"{len(read.lost)} meshes of {read.name} are missing or in a format that MuJoCo cannot read, such as "
-            f"{shown(read.lost[0])[1:-1]}; rods between the joints are drawn in their place",
+            f"{len(read.lost)} meshes of {read.name} are missing or in a format that MuJoCo cannot"
+            f" read, such as {shown(read.lost[0])[1:-1]}; rods between the joints are drawn in"
+            " their place",
             stacklevel=4,
         )
         add_simple_bodies(read.spec)
@@ -41,8 +43,9 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
 class RigidModel:
     """Makes the specification of a robot in which only some hinges move, as `JointRobot` takes it.
 
-    It holds what it was given, so that it can be pickled. Contacts are off. Taken out are actuators, and what elastic
-    joints have in their place: armature, dry friction and linear damping of the hinges.
+    It holds what it was given, so that it can be pickled. Contacts are off. Taken out are
+    actuators, and what elastic joints have in their place: armature, dry friction and linear
+    damping of the hinges.
 
     Args:
         model: As of `read_robot`.
@@ -50,7 +53,8 @@ class RigidModel:
     """
 
     def __init__(self, model: GivenModel, joints: tuple[str, ...]) -> None:
-        self._model, self._joints = model, joints
+        self._model = model
+        self._joints = joints
         self._spec: Any = None
 
     def __call__(self) -> mujoco.MjSpec:
@@ -76,7 +80,9 @@ def _copied(spec: Any) -> mujoco.MjSpec:
 
 
 def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
-    """A model without actuators and contacts, whose hinges have nothing of what an `ElasticJoint` says."""
+    """A model without actuators and contacts, whose hinges have nothing of what an
+    `ElasticJoint` says.
+    """
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name in joints:

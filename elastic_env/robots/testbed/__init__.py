@@ -1,3 +1,4 @@
 """The testbed of the paper: one servo, one spring, one pendulum."""
 
-NAME, ID = "testbed", "elastic_env/Testbed-v0"
+NAME = "testbed"
+ID = "elastic_env/Testbed-v0"

@@ -41,7 +41,8 @@ class TestbedConfig(JointConfig):
 
 def plant(config: TestbedConfig) -> JointPlant:
     """The testbed as it is built, and as it is known."""
-    joint, pendulum = config.true_joint, config.true_pendulum
+    joint = config.true_joint
+    pendulum = config.true_pendulum
 
     def robot_model(joint: ElasticJoint, pendulum: Pendulum) -> RobotModel:
         return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), config.control_period_s)
@@ -51,11 +52,15 @@ def plant(config: TestbedConfig) -> JointPlant:
         add_accelerometer(spec, "imu")
     true = robot_model(joint, pendulum)
     return JointPlant(
-        name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
-        true=true, static_torque=pendulum.torque,
+        name=NAME,
+        model=spec.compile(),
+        assumed=robot_model(config.joint, config.pendulum),
+        true=true,
+        static_torque=pendulum.torque,
         rest_angle=partial(_rest_angle, form=config.form, true=true, pendulum=pendulum),
-        motion=AboutHome(config.reference, np.zeros(1)), imu_arm_m=imu_arm(pendulum),
-    )  # fmt: skip
+        motion=AboutHome(config.reference, np.zeros(1)),
+        imu_arm_m=imu_arm(pendulum),
+    )
 
 
 def require_feasible(config: TestbedConfig) -> None:
@@ -64,9 +69,13 @@ def require_feasible(config: TestbedConfig) -> None:
     Raises:
         ConfigurationError: They are such.
     """
-    joint, pendulum, extent = config.true_joint, config.true_pendulum, config.reference.extent()
+    joint = config.true_joint
+    pendulum = config.true_pendulum
+    extent = config.reference.extent()
     if joint.servo is None:
-        raise ConfigurationError("the testbed's joint needs a servo, got None; see elastic_env.joint.elasticity.Servo")
+        raise ConfigurationError(
+            "the testbed's joint needs a servo, got None; see elastic_env.joint.elasticity.Servo"
+        )
     worst_angle = min(extent.q, np.pi / 2)
     needed = (
         abs(float(pendulum.torque(np.array(worst_angle))))
@@ -86,10 +95,14 @@ def _rest_angle(
     true: RobotModel,
     pendulum: Pendulum,
 ) -> Array:
-    """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
+    """Link angle at rest without friction; within the dead band the pendulum hangs straight
+    down.
+    """
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return theta
     half = np.sign(theta) * (true.backlash if backlash is None else backlash) / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
-    return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient, unique=False)
+    return static_link_angle(
+        engaged, stiffness, pendulum.torque, pendulum.torque_gradient, unique=False
+    )

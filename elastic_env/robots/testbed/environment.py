@@ -30,25 +30,33 @@ def configure_testbed(
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
 ) -> TestbedConfig:
-    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
+    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0",
+    ...)`.
 
     Args:
-        reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
+        reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a
+            reference model.
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
-        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
-        joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the default.
-        pendulum: The load, or a mapping of what differs from the default of 60 N·m at the horizontal.
+        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that
+            of the joint.
+        joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the
+            default.
+        pendulum: The load, or a mapping of what differs from the default of 60 N·m at the
+            horizontal.
         form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
         observe_link: Whether the link's IMU is part of the observation.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
-        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer", see
-            `elastic_env.world.further_sensors`, and "link_imu", which is the same as `observe_link`.
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
+            "accelerometer", see `elastic_env.world.further_sensors`, and "link_imu", which is the
+            same as `observe_link`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    require_models(joint=(joint, ElasticJoint), pendulum=(pendulum, Pendulum), reward=(reward, RewardWeights))
+    require_models(
+        joint=(joint, ElasticJoint), pendulum=(pendulum, Pendulum), reward=(reward, RewardWeights)
+    )
     chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
@@ -71,4 +79,5 @@ def picture(task: TestbedTask) -> TestbedPicture:
 
 
 TESTBED = Robot(NAME, ID, configure_testbed, TestbedTask, picture)
-make, make_vector = TESTBED.make, TESTBED.make_vector
+make = TESTBED.make
+make_vector = TESTBED.make_vector

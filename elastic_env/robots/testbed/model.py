@@ -1,9 +1,11 @@
-r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a pendulum, an IMU on the link.
+r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a pendulum, an IMU on
+the link.
 
-The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that holds it is
-τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length: the range of its static deflection
-(−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for which 60 N·m leave room; a steel bob of 10 kg, 0.61 m
-from the axis, with a radius of gyration of 0.1 m, is our choice.
+The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that
+holds it is τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length:
+the range of its static deflection (−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for
+which 60 N·m leave room; a steel bob of 10 kg, 0.61 m from the axis, with a radius of gyration of
+0.1 m, is our choice.
 """
 
 from typing import Self
@@ -27,15 +29,20 @@ _MOST = {"gravity_torque": ("N·m", 1e4), "mass": ("kg", 1e4), "gyration_radius"
 class Pendulum(Model):
     """The load of the testbed."""
 
-    gravity_torque: float = quantity("N·m", 60.0, gt=0, description="torque that holds it at the horizontal")
-    mass: float = quantity("kg", 10.0, gt=0, description="mass of bob and linkage")
-    gyration_radius: float = quantity("m", 0.1, gt=0, description="radius of gyration about its center of mass")
+    gravity_torque: float = quantity("N·m", 60.0, gt=0)
+    """Torque that holds it at the horizontal [N·m]."""
+    mass: float = quantity("kg", 10.0, gt=0)
+    """Mass of bob and linkage [kg]."""
+    gyration_radius: float = quantity("m", 0.1, gt=0)
+    """Radius of gyration about its center of mass [m]."""
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
         for name, (unit, most) in _MOST.items():
             if not _LEAST <= (value := getattr(self, name)) <= most:
-                raise ValueError(f"{name} must be from {_LEAST:g} to {most:g} [{unit}], got {value:g}")
+                raise ValueError(
+                    f"{name} must be from {_LEAST:g} to {most:g} [{unit}], got {value:g}"
+                )
         return self
 
     @property

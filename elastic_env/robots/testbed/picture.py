@@ -15,8 +15,10 @@ from elastic_env.robots.testbed.model import Pendulum
 EXAGGERATION = 8.0
 """Factor by which deviations from the reference are enlarged."""
 
-_WIDTH, _HEIGHT = 640, 480
-_BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+_WIDTH = 640
+_HEIGHT = 480
+_BOX = mujoco.mjtGeom.mjGEOM_BOX
+_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 _REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 _LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
 _STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
@@ -31,7 +33,9 @@ def exaggerated(angle: float, reference: float, factor: float = EXAGGERATION) ->
 
 
 class TestbedPicture(ModelPicture):
-    """The testbed of Fig. 4: housing, rotor pointer, pendulum, and the reference as a translucent pendulum."""
+    """The testbed of Fig. 4: housing, rotor pointer, pendulum, and the reference as a
+    translucent pendulum.
+    """
 
     __test__ = False
 
@@ -44,16 +48,22 @@ class TestbedPicture(ModelPicture):
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
         _add_mount(spec.worldbody)
-        _add_pendulum(spec.worldbody, "link", 0.0, self._pendulum.com_distance, _STEEL_RGBA, _LINK_RGBA)
-        return Alone(spec, ["link"], (1.6 * self._pendulum.com_distance, 0.0, 0.0), dress=_add_light)
+        _add_pendulum(
+            spec.worldbody, "link", 0.0, self._pendulum.com_distance, _STEEL_RGBA, _LINK_RGBA
+        )
+        return Alone(
+            spec, ["link"], (1.6 * self._pendulum.com_distance, 0.0, 0.0), dress=_add_light
+        )
 
-    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002  the signals say it all
+    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """See `HasSides`."""
-        link, reference = now["link_angle"], now["reference_angle"]
+        link = now["link_angle"]
+        reference = now["reference_angle"]
         return Sides(*(np.array([angle]) for angle in (reference, link + now["deflection"], link)))
 
-    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the signals say it all
-        reference, link = now["reference_angle"], now["link_angle"]
+    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
+        reference = now["reference_angle"]
+        link = now["link_angle"]
         rotor = link + now["deflection"]
         self._data.joint("reference").qpos = reference
         self._data.joint("link").qpos = exaggerated(link, reference)
@@ -61,8 +71,14 @@ class TestbedPicture(ModelPicture):
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
         return [
-            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {EXAGGERATION:g}",
-            f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error {1e3 * now['link_error']:+7.2f} mrad",
+            (
+                f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x"
+                f" {EXAGGERATION:g}"
+            ),
+            (
+                f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error"
+                f" {1e3 * now['link_error']:+7.2f} mrad"
+            ),
         ]
 
 
@@ -73,7 +89,9 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     reach = pendulum.com_distance
     world = spec.worldbody
     _add_light(spec)
-    world.add_camera(name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50)
+    world.add_camera(
+        name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50
+    )
     _add_mount(world)
     for name, y, rod, bob in (
         ("reference", 0.03, _REFERENCE_RGBA, _REFERENCE_RGBA),
@@ -81,29 +99,65 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     ):
         _add_pendulum(world, name, y, reach, rod, bob)
     rotor = _hinged(world, "rotor")
-    rotor.add_geom(name="rotor_disc", type=_CYLINDER, size=[0.055, 0.01, 0], pos=[0, -0.03, 0], zaxis=[0, 1, 0],
-                   rgba=_ROTOR_RGBA)  # fmt: skip
-    rotor.add_geom(name="rotor_pointer", type=_BOX, size=[0.005, 0.004, 0.36 * reach], pos=[0, -0.03, -0.36 * reach],
-                   rgba=_ROTOR_RGBA)  # fmt: skip
+    rotor.add_geom(
+        name="rotor_disc",
+        type=_CYLINDER,
+        size=[0.055, 0.01, 0],
+        pos=[0, -0.03, 0],
+        zaxis=[0, 1, 0],
+        rgba=_ROTOR_RGBA,
+    )
+    rotor.add_geom(
+        name="rotor_pointer",
+        type=_BOX,
+        size=[0.005, 0.004, 0.36 * reach],
+        pos=[0, -0.03, -0.36 * reach],
+        rgba=_ROTOR_RGBA,
+    )
     return spec
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_light(
-        pos=[0.3, -2.0, 2.0], dir=[-0.1, 0.8, -0.8], castshadow=False, diffuse=[0.45] * 3, specular=[0.1] * 3
+        pos=[0.3, -2.0, 2.0],
+        dir=[-0.1, 0.8, -0.8],
+        castshadow=False,
+        diffuse=[0.45] * 3,
+        specular=[0.1] * 3,
     )
 
 
 def _add_mount(world: mujoco.MjsBody) -> None:
-    world.add_geom(name="housing", type=_BOX, size=[0.07, 0.06, 0.09], pos=[0, 0.12, 0.02], rgba=_HOUSING_RGBA)
-    world.add_geom(name="stand", type=_BOX, size=[0.03, 0.03, 0.6], pos=[0, 0.2, -0.5], rgba=(0.72, 0.74, 0.77, 1))
+    world.add_geom(
+        name="housing", type=_BOX, size=[0.07, 0.06, 0.09], pos=[0, 0.12, 0.02], rgba=_HOUSING_RGBA
+    )
+    world.add_geom(
+        name="stand",
+        type=_BOX,
+        size=[0.03, 0.03, 0.6],
+        pos=[0, 0.2, -0.5],
+        rgba=(0.72, 0.74, 0.77, 1),
+    )
 
 
-def _add_pendulum(world: mujoco.MjsBody, name: str, y: float, reach: float, rod: Rgba, bob: Rgba) -> None:
+def _add_pendulum(
+    world: mujoco.MjsBody, name: str, y: float, reach: float, rod: Rgba, bob: Rgba
+) -> None:
     body = _hinged(world, name)
-    body.add_geom(name=f"{name}_rod", type=_BOX, size=[0.014, 0.008, reach / 2], pos=[0, y, -reach / 2], rgba=rod)
     body.add_geom(
-        name=f"{name}_bob", type=_CYLINDER, size=[0.09, 0.025, 0], pos=[0, y, -reach], zaxis=[0, 1, 0], rgba=bob
+        name=f"{name}_rod",
+        type=_BOX,
+        size=[0.014, 0.008, reach / 2],
+        pos=[0, y, -reach / 2],
+        rgba=rod,
+    )
+    body.add_geom(
+        name=f"{name}_bob",
+        type=_CYLINDER,
+        size=[0.09, 0.025, 0],
+        pos=[0, y, -reach],
+        zaxis=[0, 1, 0],
+        rgba=bob,
     )
 
 

@@ -31,14 +31,16 @@ Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], wi
 | `reward_terms` | 1 | weighted terms of the reward, by name |
 | `termination` | | why the episode ended: "diverged", or "" |
 | `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit |
-"""
+"""  # noqa: E501
 
 from elastic_env.robots.testbed.config import TestbedConfig, plant, require_feasible
 from elastic_env.world.joint_task import JointTask
 
 
 class TestbedTask(JointTask):
-    """Rules of `elastic_env/Testbed-v0`: those of elastic joints, for one joint that carries a pendulum and an IMU."""
+    """Rules of `elastic_env/Testbed-v0`: those of elastic joints, for one joint that carries a
+    pendulum and an IMU.
+    """
 
     __test__ = False
 

@@ -40,14 +40,18 @@ FALL_TILT_RAD = 0.4
 class WalkRewardWeights(Model):
     """Weights of the reward terms; every term is a penalty that grows without saturating."""
 
-    tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6, description="per rad of pelvis error: 1 at 0.01 rad")
-    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6, description="per m of ZMP deviation: 1 at 0.03 m")
-    effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6, description="per N·m of servo torque, rms over the joints")
-    smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6, description="per rad/s of the offsets, rms over joints")
-    fall: float = quantity("1", 200.0, ge=0, le=1e6, description="once, at a fall or where the simulation diverges")
-    standing: float = quantity(
-        "1", 1.0, ge=0, le=1e6, description="factor of tilt and zmp before and after the walk, which is not scored"
-    )
+    tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6)
+    """Per rad of pelvis error: 1 at 0.01 rad [1/rad]."""
+    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6)
+    """Per m of ZMP deviation: 1 at 0.03 m [1/m]."""
+    effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6)
+    """Per N·m of servo torque, rms over the joints [1/(N·m)]."""
+    smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6)
+    """Per rad/s of the offsets, rms over joints [s/rad]."""
+    fall: float = quantity("1", 200.0, ge=0, le=1e6)
+    """Once, at a fall or where the simulation diverges [1]."""
+    standing: float = quantity("1", 1.0, ge=0, le=1e6)
+    """Factor of tilt and zmp before and after the walk, which is not scored [1]."""
 
 
 class WalkConfig(Model):
@@ -57,21 +61,27 @@ class WalkConfig(Model):
     scenario: Scenario = make_scenario("nominal")
     """Of all worlds, or of the first one where each has its own."""
     scenarios: tuple[Scenario, ...] = ()
-    """Of every world of a vector environment, where they differ; with the same friction and rate of the IMU."""
+    """Of every world of a vector environment, where they differ; with the same friction and rate
+    of the IMU.
+    """
     robot: Thormang = Thormang()
     joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
-    """The leg joints in order, as they are known; the scenario says in what the true ones differ."""
+    """The leg joints in order, as they are known; the scenario says in what the true ones
+    differ.
+    """
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
     """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
-    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
-    timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
+    control_period_s: float = quantity("s", 0.004, gt=0)
+    """Time between commands [s]."""
+    timestep_s: float = quantity("s", 1e-3, gt=0)
+    """Physics step [s]."""
     reward: WalkRewardWeights = WalkRewardWeights()
-    bank: int = quantity("1", 0, ge=0, description="bank of robots that a scenario draws from")
-    spare_bodies: int = quantity(
-        "1", 0, ge=0, description="massless bodies on the torso, which give robots with other loads as many bodies"
-    )
+    bank: int = quantity("1", 0, ge=0)
+    """Bank of robots that a scenario draws from [1]."""
+    spare_bodies: int = quantity("1", 0, ge=0)
+    """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
 
     @model_validator(mode="after")
     def _worlds_know_the_same(self) -> Self:
@@ -83,15 +93,22 @@ class WalkConfig(Model):
             if len(values) > 1:
                 raise ValueError(
                     f"the scenarios of all worlds must have the same {name}, got "
-                    + " and ".join(f"{value:g} of {scenario!r}" for value, scenario in values.items())
+                    + " and ".join(
+                        f"{value:g} of {scenario!r}" for value, scenario in values.items()
+                    )
                 )
         return self
 
     def of_each_scenario(self) -> "list[WalkConfig]":
-        """The configuration of the worlds of each scenario, in the order in which these first occur."""
+        """The configuration of the worlds of each scenario, in the order in which these first
+        occur.
+        """
         if not self.scenarios:
             return [self]
-        alone = [self.replace(scenario=scenario, scenarios=()) for scenario in dict.fromkeys(self.scenarios)]
+        alone = [
+            self.replace(scenario=scenario, scenarios=())
+            for scenario in dict.fromkeys(self.scenarios)
+        ]
         most = max(config.loads for config in alone)
         return [config.replace(spare_bodies=most - config.loads) for config in alone]
 
@@ -102,7 +119,9 @@ class WalkConfig(Model):
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as a policy may know them: the ground's friction is known, from an identification."""
+        """The joints as a policy may know them: the ground's friction is known, from an
+        identification.
+        """
         return {
             name: joint.replace(
                 coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
@@ -126,7 +145,9 @@ class WalkConfig(Model):
     @property
     def true_robot(self) -> Thormang:
         """The robot as the plant has it."""
-        return self.robot.replace(torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg)
+        return self.robot.replace(
+            torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg
+        )
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
@@ -140,7 +161,8 @@ class WalkConfig(Model):
         return spec.compile()
 
 
-BANK_SIZE, RANGES_BANK_SIZE = 64, 256
+BANK_SIZE = 64
+RANGES_BANK_SIZE = 256
 """Robots in the bank of a scenario that draws them: of a named one, and of one with ranges."""
 _SETTLED = 2048
 """Robots that are kept with their state at rest, of 50 kB each."""
@@ -148,14 +170,17 @@ _SETTLED = 2048
 
 @lru_cache(maxsize=64)
 def require_stable_walker(config: WalkConfig) -> None:
-    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked at once.
+    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked
+    at once.
 
     Of ranges the robot with the stiffest springs, and with the strongest dampers.
     """
     for ranges in config.scenario.ranges or (RobotRanges(),):
         factor = ranges.stiffness[1] * ranges.joint_stiffness[1]
         joints = {
-            name: joint.replace(stiffness=joint.stiffness * factor, damping=joint.damping * ranges.damping[1])
+            name: joint.replace(
+                stiffness=joint.stiffness * factor, damping=joint.damping * ranges.damping[1]
+            )
             for name, joint in config.true_joints.items()
         }
         spec = elastic_spec(config.true_robot, joints, config.form, config.timestep_s)
@@ -190,7 +215,9 @@ def placed_robot(config: WalkConfig, draw: RobotDraw) -> PlacedRobot:
     except ElasticError as error:
         if not config.scenario.ranges:
             raise
-        raise ConfigurationError(f"the drawn robot {draw} cannot walk: {error}; narrow the ranges") from None
+        raise ConfigurationError(
+            f"the drawn robot {draw} cannot walk: {error}; narrow the ranges"
+        ) from None
     return PlacedRobot(model, rest)
 
 
@@ -224,25 +251,35 @@ def spring_ids(model: mujoco.MjModel) -> IntArray:
 def floor_tilt(angle: float, direction: float) -> Array:
     """Quaternion of a floor that rises by an angle in a direction, both [rad], (4,)."""
     half = angle / 2.0
-    return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
+    return np.array(
+        [np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0]
+    )
 
 
 def robot_bank(scenario: Scenario, number: int = 0) -> list[RobotDraw]:
-    """The robots of a scenario: one, or a bank, the same in every process; banks of other numbers have other robots."""
+    """The robots of a scenario: one, or a bank, the same in every process; banks of other
+    numbers have other robots.
+    """
     n = len(LEG_JOINTS)
     if scenario.ranges:
         return draw_robots(scenario.ranges, RANGES_BANK_SIZE, n, (_BANK_SEED, number))
     conditions: dict[str, Any] = {
-        "push_n": scenario.push_n, "slope_rad": scenario.slope_rad,
-        "is_delayed": scenario.delay_steps > 0, "is_inertial": scenario.inertial is not None,
-    }  # fmt: skip
+        "push_n": scenario.push_n,
+        "slope_rad": scenario.slope_rad,
+        "is_delayed": scenario.delay_steps > 0,
+        "is_inertial": scenario.inertial is not None,
+    }
     if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
         return [RobotDraw(stiffness_factor=(1.0,) * n, encoder_bias_rad=(0.0,) * n, **conditions)]
     generator = np.random.default_rng(_BANK_SEED + number)
     return [
         RobotDraw(
-            stiffness_factor=tuple((1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()),
-            encoder_bias_rad=tuple((scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()),
+            stiffness_factor=tuple(
+                (1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()
+            ),
+            encoder_bias_rad=tuple(
+                (scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()
+            ),
             slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
             **conditions,
         )

@@ -33,29 +33,35 @@ def configure_walk(
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
 ) -> WalkConfig:
-    """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
+    """The walker's configuration from the arguments of
+    `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
 
     Args:
-        step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
+        step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support
+            [s], or a `Gait`.
         num_steps: Number of steps; default 4, or that of the `Gait`.
-        scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`; or in a vector environment a list with
-            one of them for each world.
-        stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
-            that of the joints.
-        joint: Elastic joint for all twelve, or a mapping of what differs from the paper's H54-200-S500-R, the default.
+        scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`; or in a vector
+            environment a list with one of them for each world.
+        stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an
+            `identification.json`; default that of the joints.
+        joint: Elastic joint for all twelve, or a mapping of what differs from the paper's
+            H54-200-S500-R, the default.
         robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
         gait: What differs from the default gait: lift_m, hip_height_m, transfer.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
-        bank: Number of the bank that random robots come from, to keep those that are learned from apart.
+        bank: Number of the bank that random robots come from, to keep those that are learned from
+            apart.
         timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
-        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
-            `elastic_env.world.further_sensors`.
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
+            "accelerometer"; see `elastic_env.world.further_sensors`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    require_models(joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights))
+    require_models(
+        joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights)
+    )
     if not isinstance(gait, dict | None):
         raise ConfigurationError(
             f"gait must be a mapping of {', '.join(_GAIT)}, got {shown(gait)}; see also step_period"
@@ -72,7 +78,9 @@ def configure_walk(
     is_list = isinstance(scenario, list | tuple)
     scenarios = [make_scenario(own) for own in scenario] if is_list else [make_scenario(scenario)]
     if not scenarios:
-        raise ConfigurationError("scenario must be a name, or a list with one for each world, got an empty list")
+        raise ConfigurationError(
+            "scenario must be a name, or a list with one for each world, got an empty list"
+        )
     return WalkConfig(
         gait=make_gait(step_period, **steps, **(gait or {})),
         scenario=scenarios[0],
@@ -81,11 +89,14 @@ def configure_walk(
         joints=tuple(joints.values()),
         form=form,
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
-        reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
+        reward=(
+            reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {}))
+        ),
         bank=bank,
         **({} if timestep_s is None else dict[str, Any](timestep_s=timestep_s)),
     )
 
 
 WALKER = Robot(NAME, ID, configure_walk, WalkTask, WalkerPicture)
-make, make_vector = WALKER.make, WALKER.make_vector
+make = WALKER.make
+make_vector = WALKER.make_vector

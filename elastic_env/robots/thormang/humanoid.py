@@ -1,4 +1,6 @@
-"""The walker as it is drawn: simple shapes on the links of the robot, once solid and once as the translucent plan."""
+"""The walker as it is drawn: simple shapes on the links of the robot, once solid and once as the
+translucent plan.
+"""
 
 from typing import Any
 
@@ -11,7 +13,8 @@ from elastic_env.robots.thormang.model import LEG, SIDES, Thormang, rigid_spec
 
 PLAN = "plan_"
 """Prefix of the names of the translucent robot."""
-ZMP, ZMP_REFERENCE = "zmp", "zmp_reference"
+ZMP = "zmp"
+ZMP_REFERENCE = "zmp_reference"
 """Names of the markers on the floor, which are moved by `mocap_pos`."""
 
 LEFT_RGBA = (0.93, 0.56, 0.20, 1.0)
@@ -25,15 +28,21 @@ GRID_M = 0.2
 
 _SHELL_RGBA = (0.80, 0.82, 0.85, 1.0)
 _FRAME_RGBA = (0.24, 0.26, 0.30, 1.0)
-_FLOOR_RGB, _GRID_RGB = (1.0, 1.0, 1.0), (0.85, 0.87, 0.90)
+_FLOOR_RGB = (1.0, 1.0, 1.0)
+_GRID_RGB = (0.85, 0.87, 0.90)
 _SIZE = 720
-_EYE, _TARGET = np.array([3.3, 1.6, 2.05]), np.array([0.0, 0.0, 0.69])
+_EYE = np.array([3.3, 1.6, 2.05])
+_TARGET = np.array([0.0, 0.0, 0.69])
 _PLAN_INSET_M = 0.008
-"""By how much the plan's shapes are smaller, at most to half: the robot hides its plan where it follows it."""
+"""By how much the plan's shapes are smaller, at most to half: the robot hides its plan where it
+follows it.
+"""
 
 
 def display_spec(robot: Thormang) -> mujoco.MjSpec:
-    """A model for drawing only: the robot, its plan with the prefix `PLAN`, floor, markers, light and camera."""
+    """A model for drawing only: the robot, its plan with the prefix `PLAN`, floor, markers,
+    light and camera.
+    """
     spec = _dressed(robot, is_plan=False)
     set_stage(spec, _SIZE, _SIZE)
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -55,19 +64,30 @@ def solid_spec(robot: Thormang) -> mujoco.MjSpec:
 
 def set_floor_and_light(spec: mujoco.MjSpec) -> None:
     """Add to a scene what lies under the robot and above it."""
-    spec.worldbody.add_body(name="floor").add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
+    spec.worldbody.add_body(name="floor").add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05]
+    )
     _add_floor(spec)
     _add_light(spec)
 
 
 class _Shapes:
-    """Adds shapes to the links of a robot: solid ones, or smaller and translucent ones of the plan."""
+    """Adds shapes to the links of a robot: solid ones, or smaller and translucent ones of the
+    plan.
+    """
 
     def __init__(self, spec: mujoco.MjSpec, is_plan: bool) -> None:
         self._spec = spec
         self._is_plan = is_plan
 
-    def block(self, link: str, half_size: tuple[float, float, float], at: Any, rgba: Rgba, roundness: float) -> None:
+    def block(
+        self,
+        link: str,
+        half_size: tuple[float, float, float],
+        at: Any,
+        rgba: Rgba,
+        roundness: float,
+    ) -> None:
         """Box whose edges are rounder the larger `roundness`, 0 to 1."""
         name = f"block_{len(self._spec.meshes)}"
         mesh = self._spec.add_mesh(name=name, scale=self._inset(*half_size))
@@ -76,12 +96,20 @@ class _Shapes:
 
     def ball(self, link: str, radius: float, at: Any) -> None:
         """Sphere of the dark frame."""
-        self._add(link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[*self._inset(radius), 0, 0], pos=at)
+        self._add(
+            link,
+            _FRAME_RGBA,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[*self._inset(radius), 0, 0],
+            pos=at,
+        )
 
     def drum(self, link: str, radius: float, half_length: float, at: Any, axis: Any) -> None:
         """Cylinder of the dark frame."""
         size = [*self._inset(radius, half_length), 0]
-        self._add(link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=at, zaxis=axis)
+        self._add(
+            link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=at, zaxis=axis
+        )
 
     def limb(self, link: str, radius: float, begin: Any, end: Any, rgba: Rgba) -> None:
         """Capsule between two points."""
@@ -90,11 +118,14 @@ class _Shapes:
 
     def plate(self, link: str, half_size: tuple[float, float, float], at: Any) -> None:
         """Box of the dark frame."""
-        self._add(link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_BOX, size=self._inset(*half_size), pos=at)
+        self._add(
+            link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_BOX, size=self._inset(*half_size), pos=at
+        )
 
     def paint(self, geom: mujoco.MjsGeom, rgba: Rgba) -> None:
         """Give a box that the robot has already its colour, and its size in the plan."""
-        geom.rgba, geom.size = self._colour(rgba), self._inset(*geom.size)
+        geom.rgba = self._colour(rgba)
+        geom.size = self._inset(*geom.size)
 
     def _add(self, link: str, rgba: Rgba, **geom: Any) -> None:
         self._spec.body(link).add_geom(rgba=self._colour(rgba), mass=0.0, **geom)
@@ -103,7 +134,10 @@ class _Shapes:
         return PLAN_RGBA if self._is_plan else rgba
 
     def _inset(self, *lengths: float) -> list[float]:
-        return [max(length - _PLAN_INSET_M, length / 2) if self._is_plan else length for length in lengths]
+        return [
+            max(length - _PLAN_INSET_M, length / 2) if self._is_plan else length
+            for length in lengths
+        ]
 
 
 def _dressed(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
@@ -124,7 +158,13 @@ def _dressed(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
 
 def _add_trunk(shapes: _Shapes, robot: Thormang) -> None:
     torso = "upper_body"
-    shapes.block("pelvis", (0.075, robot.hip_half_spacing + 0.03, 0.05), (0, 0, 0.075), _FRAME_RGBA, roundness=0.25)
+    shapes.block(
+        "pelvis",
+        (0.075, robot.hip_half_spacing + 0.03, 0.05),
+        (0, 0, 0.075),
+        _FRAME_RGBA,
+        roundness=0.25,
+    )
     shapes.drum("pelvis", 0.055, 0.05, (0, 0, 0.15), axis=(0, 0, 1))
     shapes.block(torso, (0.095, 0.155, 0.15), (0, 0, 0.165), _SHELL_RGBA, roundness=0.35)
     shapes.block(torso, (0.02, 0.09, 0.05), (0.085, 0, 0.2), _FRAME_RGBA, roundness=0.3)
@@ -146,9 +186,13 @@ def _add_arm(shapes: _Shapes, mirror: float, rgba: Rgba) -> None:
 def _add_leg(shapes: _Shapes, side: str, rgba: Rgba) -> None:
     """Thigh, shank, and a fork between ankle and sole, through which one sees the markers."""
     shapes.ball(f"{side}_hip_roll_link", 0.062, (0, 0, 0))
-    shapes.block(f"{side}_thigh", (0.058, 0.052, 0.115), (0.004, 0, -LEG.thigh / 2), rgba, roundness=0.45)
+    shapes.block(
+        f"{side}_thigh", (0.058, 0.052, 0.115), (0.004, 0, -LEG.thigh / 2), rgba, roundness=0.45
+    )
     shapes.drum(f"{side}_thigh", 0.05, 0.058, (0, 0, -LEG.thigh), axis=(0, 1, 0))
-    shapes.block(f"{side}_shank", (0.05, 0.046, 0.115), (0.004, 0, -LEG.shank / 2), rgba, roundness=0.45)
+    shapes.block(
+        f"{side}_shank", (0.05, 0.046, 0.115), (0.004, 0, -LEG.shank / 2), rgba, roundness=0.45
+    )
     shapes.drum(f"{side}_shank", 0.036, 0.05, (0, 0, -LEG.shank), axis=(0, 1, 0))
     for y in (-0.048, 0.048):
         shapes.plate(f"{side}_foot", (0.022, 0.008, 0.05), (0, y, -0.045))
@@ -157,33 +201,52 @@ def _add_leg(shapes: _Shapes, side: str, rgba: Rgba) -> None:
 def _add_floor(spec: mujoco.MjSpec) -> None:
     """A light floor with a grid."""
     spec.add_texture(
-        name="grid", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        mark=mujoco.mjtMark.mjMARK_EDGE, rgb1=_FLOOR_RGB, rgb2=_FLOOR_RGB, markrgb=_GRID_RGB, width=128, height=128,
-    )  # fmt: skip
+        name="grid",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        rgb1=_FLOOR_RGB,
+        rgb2=_FLOOR_RGB,
+        markrgb=_GRID_RGB,
+        width=128,
+        height=128,
+    )
     repeat = 2.0 / GRID_M  # MuJoCo lays this many textures on two meters
-    floor = spec.add_material(name="floor", texrepeat=[repeat] * 2, texuniform=True, specular=0.0, shininess=0.0)
+    floor = spec.add_material(
+        name="floor", texrepeat=[repeat] * 2, texuniform=True, specular=0.0, shininess=0.0
+    )
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
     spec.geom("floor").material = "floor"
 
 
 def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
-    """A disc on the floor, higher than the soles are thick, so that one sees it where a foot stands on it."""
+    """A disc on the floor, higher than the soles are thick, so that one sees it where a foot
+    stands on it.
+    """
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
     spec.worldbody.add_body(name=name, mocap=True).add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[radius, height / 2, 0], pos=[0, 0, height / 2],
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[radius, height / 2, 0],
+        pos=[0, 0, height / 2],
         material=name,
-    )  # fmt: skip
+    )
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
     """Light from above with a shadow, which shows where the feet leave the floor."""
-    spec.stat.extent, spec.stat.center, spec.visual.map.shadowclip = 1.6, _TARGET, 1.0
+    spec.stat.extent = 1.6
+    spec.stat.center = _TARGET
+    spec.visual.map.shadowclip = 1.0
     spec.visual.map.znear = 0.2
     spec.visual.headlight.ambient = [0.6] * 3
     spec.worldbody.add_light(
-        pos=[1.2, 1.5, 3.0], dir=[-0.4, -0.45, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.35] * 3, specular=[0.15] * 3,
-    )  # fmt: skip
+        pos=[1.2, 1.5, 3.0],
+        dir=[-0.4, -0.45, -1.0],
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[0.35] * 3,
+        specular=[0.15] * 3,
+    )
 
 
 def _facing(direction: Array) -> list[float]:

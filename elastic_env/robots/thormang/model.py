@@ -1,14 +1,16 @@
-"""The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from the link table `thormang_legs.csv`.
+"""The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from the link table
+`thormang_legs.csv`.
 
-All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between the hip axes. x
-forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs. Sources (public GitHub repositories):
+All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between
+the hip axes. x forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs.
+Sources (public GitHub repositories):
 
-* lengths, masses and COMs of pelvis and legs, hip spacing 0.210 m, sole 0.26 × 0.16 m, ankle 0.100 m above the sole:
-  THORMANG "mk2", UPenn-RoboCup/UPennDev2, Robots/THOROP1/THOROPKinematics.h;
+* lengths, masses and COMs of pelvis and legs, hip spacing 0.210 m, sole 0.26 × 0.16 m, ankle 0.100
+  m above the sole: THORMANG "mk2", UPenn-RoboCup/UPennDev2, Robots/THOROP1/THOROPKinematics.h;
 * inertias of thigh, shank, foot, hip and ankle: THORMANG3 CAD values scaled by mass, from
   thor-mang/ROBOTIS-THORMANG-Common; hip yaw: a box of 0.16 × 0.08 × 0.10 m, assumed;
-* upper body: torso, waist, bent arms of the same header, head of psh117/thormang_mobile, and 4.7 kg of packs, assumed,
-  to reach the paper's 57 kg;
+* upper body: torso, waist, bent arms of the same header, head of psh117/thormang_mobile, and 4.7 kg
+  of packs, assumed, to reach the paper's 57 kg;
 * joint limits: THORMANG3, assumed for this robot.
 """
 
@@ -48,17 +50,23 @@ _TWIN_KNEE = {"stiffness": 2.0, "rotor_inertia": 2.0, "damping": 2.0, "coulomb_f
 class Thormang(Model):
     """The robot and its published uncertainties."""
 
-    hip_half_spacing: float = quantity("m", 0.105, gt=0, description="half the distance of the hips; 0.072 in mk1")
+    hip_half_spacing: float = quantity("m", 0.105, gt=0)
+    """Half the distance of the hips; 0.072 in mk1 [m]."""
     twin_knee: bool = False
-    """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction and torque."""
-    friction: float = quantity("1", 1.0, gt=0, description="friction of the soles on the floor")
-    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried on the shoulders")
+    """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction
+    and torque.
+    """
+    friction: float = quantity("1", 1.0, gt=0)
+    """Friction of the soles on the floor [1]."""
+    torso_load_kg: float = quantity("kg", 0.0, ge=0)
+    """Mass carried on the shoulders [kg]."""
 
     @property
     def joints(self) -> dict[str, ElasticJoint]:
         """The elastic leg joints: the paper's servo on all of them."""
         return {
-            name: _twin(H54_200_S500_R) if self.twin_knee and "knee" in name else H54_200_S500_R for name in LEG_JOINTS
+            name: _twin(H54_200_S500_R) if self.twin_knee and "knee" in name else H54_200_S500_R
+            for name in LEG_JOINTS
         }
 
 
@@ -66,12 +74,16 @@ class Thormang(Model):
 def biped(robot: Thormang) -> Biped:
     """The robot as gait and controller see it."""
     hips = np.array([[0.0, robot.hip_half_spacing, 0.0], [0.0, -robot.hip_half_spacing, 0.0]])
-    return Biped(rigid_spec(robot).compile(), LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
+    return Biped(
+        rigid_spec(robot).compile(), LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M
+    )
 
 
 @dataclass(frozen=True)
 class Link:
-    """A row of the link table, in the link frame and SI units; joint is "fixed", "floating" or the name of a hinge."""
+    """A row of the link table, in the link frame and SI units; joint is "fixed", "floating" or
+    the name of a hinge.
+    """
 
     name: str
     parent: str
@@ -87,7 +99,11 @@ class Link:
 
 def read_links() -> list[Link]:
     """The link table, parents before children."""
-    text = resources.files("elastic_env.robots.thormang").joinpath("legs.csv").read_text(encoding="utf-8")
+    text = (
+        resources.files("elastic_env.robots.thormang")
+        .joinpath("legs.csv")
+        .read_text(encoding="utf-8")
+    )
     return [_link(row) for row in csv.DictReader(text.splitlines())]
 
 
@@ -108,20 +124,37 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     bodies = {"world": spec.worldbody}
     for link in read_links():
         body = bodies[link.parent].add_body(
-            name=link.name, pos=_position(link, robot), mass=link.mass, ipos=link.com, fullinertia=link.inertia,
+            name=link.name,
+            pos=_position(link, robot),
+            mass=link.mass,
+            ipos=link.com,
+            fullinertia=link.inertia,
             explicitinertial=True,
-        )  # fmt: skip
+        )
         bodies[link.name] = body
         if link.joint == "floating" and floating:
             body.add_freejoint(name="pelvis")
         elif link.limits is not None:
-            body.add_joint(name=link.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=link.axis, range=link.limits,
-                           limited=mujoco.mjtLimited.mjLIMITED_TRUE)  # fmt: skip
+            body.add_joint(
+                name=link.joint,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=link.axis,
+                range=link.limits,
+                limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            )
     if robot.torso_load_kg > 0.0:
-        torso, load = bodies[_TORSO], robot.torso_load_kg
+        torso = bodies[_TORSO]
+        load = robot.torso_load_kg
         inertia = [load * _LOAD_GYRATION_M**2] * 3
         # 0.16 m above the center of mass of the torso, which is itself 0.16 m above its frame
-        torso.add_body(name="load", pos=torso.ipos, ipos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
+        torso.add_body(
+            name="load",
+            pos=torso.ipos,
+            ipos=torso.ipos,
+            mass=load,
+            inertia=inertia,
+            explicitinertial=True,
+        )
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
@@ -131,7 +164,10 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
 
 
 def elastic_spec(
-    robot: Thormang, joints: Mapping[str, ElasticJoint], form: Form = "tendon", timestep_s: float = 1e-3
+    robot: Thormang,
+    joints: Mapping[str, ElasticJoint],
+    form: Form = "tendon",
+    timestep_s: float = 1e-3,
 ) -> mujoco.MjSpec:
     """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
 
@@ -144,8 +180,16 @@ def elastic_spec(
     spec = transformed(rigid_spec(robot), joints, form, actuators="replace")
     spec.option.timestep = timestep_s
     for side in SIDES:
-        for kind, name in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
-            spec.add_sensor(name=f"{side}_{name}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{side}_ft")
+        for kind, name in (
+            (mujoco.mjtSensor.mjSENS_FORCE, "force"),
+            (mujoco.mjtSensor.mjSENS_TORQUE, "torque"),
+        ):
+            spec.add_sensor(
+                name=f"{side}_{name}",
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=f"{side}_ft",
+            )
     return spec
 
 
@@ -164,13 +208,15 @@ def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> None:
     """
     torso = spec.body(_TORSO)
     load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass, explicitinertial=True)
-    load.ipos, load.inertia = np.zeros(3), np.full(3, mass * _LOAD_GYRATION_M**2)
+    load.ipos = np.zeros(3)
+    load.inertia = np.full(3, mass * _LOAD_GYRATION_M**2)
 
 
 def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
     """Change mass and place of the `DRAWN_LOAD` in a compiled model, as `add_load` has them."""
     load = model.body(DRAWN_LOAD)
-    load.mass[:], load.inertia[:] = mass, mass * _LOAD_GYRATION_M**2
+    load.mass[:] = mass
+    load.inertia[:] = mass * _LOAD_GYRATION_M**2
     load.pos[:] = model.body(_TORSO).ipos + place
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
@@ -178,17 +224,26 @@ def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
 def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
     """Box sole and the site of the force-torque sensor at the ankle."""
     foot.add_geom(
-        name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS],
-        pos=[0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M], friction=[friction, 0.005, 0.0001], mass=0.0,
-        condim=4, contype=0, conaffinity=1, priority=1,  # else the larger friction of sole and floor would count
-    )  # fmt: skip
+        name=f"{side}_sole",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS],
+        pos=[0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M],
+        friction=[friction, 0.005, 0.0001],
+        mass=0.0,
+        condim=4,
+        contype=0,
+        conaffinity=1,
+        priority=1,  # else the larger friction of sole and floor would count
+    )
     foot.add_site(name=f"{side}_ft")
 
 
 def _position(link: Link, robot: Thormang) -> Array:
     """Position in the parent; the hips stand where the option says."""
     if link.joint.endswith("hip_yaw"):
-        return np.array([link.position[0], np.sign(link.position[1]) * robot.hip_half_spacing, link.position[2]])
+        return np.array(
+            [link.position[0], np.sign(link.position[1]) * robot.hip_half_spacing, link.position[2]]
+        )
     return link.position
 
 

@@ -1,10 +1,12 @@
-"""The walker's picture: the tilt and the position error of the pelvis are drawn enlarged, the feet where they are.
+"""The walker's picture: the tilt and the position error of the pelvis are drawn enlarged, the feet
+where they are.
 
-Relative to the feet the pelvis stands at planned + factor · (true − planned), in position and attitude; the feet, the
-ZMP and its reference are drawn to scale, so that the robot stands on the floor and the ZMP is where it is under the
-soles. The legs connect both, which enlarges the link errors of the supporting leg to first order by the same factor.
-The factor becomes smaller, down to one, where the legs could not reach the feet: a fall is drawn as it is. The
-translucent robot is the plan.
+Relative to the feet the pelvis stands at planned + factor · (true − planned), in position and
+attitude; the feet, the ZMP and its reference are drawn to scale, so that the robot stands on the
+floor and the ZMP is where it is under the soles. The legs connect both, which enlarges the link
+errors of the supporting leg to first order by the same factor. The factor becomes smaller, down to
+one, where the legs could not reach the feet: a fall is drawn as it is. The translucent robot is the
+plan.
 """
 
 from collections.abc import Mapping
@@ -62,7 +64,8 @@ class Posture:
 
     Attributes:
         pelvis, R: Position [m] and orientation of the pelvis, (3,), (3, 3).
-        ankles, feet_R: Positions of the ankles [m] and orientations of the feet, left and right, (2, 3), (2, 3, 3).
+        ankles, feet_R: Positions of the ankles [m] and orientations of the feet, left and right,
+            (2, 3), (2, 3, 3).
     """
 
     pelvis: Array
@@ -84,26 +87,37 @@ class Posture:
         return cls(plan.pelvis[row], level, plan.ankles[row], np.stack([level, level]))
 
     def joint_angles(self, robot: Biped) -> Array:
-        """The joint angles that go with it, of a straight leg where a foot is out of reach, (12,) [rad]."""
+        """The joint angles that go with it, of a straight leg where a foot is out of reach,
+        (12,) [rad].
+        """
         legs = hip_to_ankle(robot, self.pelvis, self.R, self.ankles)
         stretch = np.linalg.norm(legs, axis=-1, keepdims=True) / (_ALMOST * robot.leg.reach)
-        return leg_angles(robot.leg, legs / np.maximum(stretch, 1.0), self.R.T @ self.feet_R).ravel()
+        return leg_angles(
+            robot.leg, legs / np.maximum(stretch, 1.0), self.R.T @ self.feet_R
+        ).ravel()
 
 
 def hip_to_ankle(robot: Biped, pelvis: Array, R: Array, ankles: Array) -> Array:
-    """Ankles as seen from the hips, in the frame of the pelvis, for pelvis poses (..., 3), (..., 3, 3); (..., 2, 3)."""
+    """Ankles as seen from the hips, in the frame of the pelvis, for pelvis poses (..., 3), (...,
+    3, 3); (..., 2, 3).
+    """
     return (ankles - pelvis[..., None, :]) @ R - robot.hips
 
 
 def enlarged(
-    true: Posture, planned: Posture, share: Array | float, robot: Biped, largest: float = LARGEST_FACTOR
+    true: Posture,
+    planned: Posture,
+    share: Array | float,
+    robot: Biped,
+    largest: float = LARGEST_FACTOR,
 ) -> tuple[Posture, float]:
     """The posture that is drawn, and the factor of its deviations.
 
     Args:
         true: What the robot does; its feet stay where they are.
         planned: What it should do, its pelvis level.
-        share: Share μ of the weight on the right foot: the pelvis deviates relative to the feet that carry it.
+        share: Share μ of the weight on the right foot: the pelvis deviates relative to the feet
+            that carry it.
         robot: Legs that have to reach the feet.
         largest: The factor, if they do.
     """
@@ -112,8 +126,12 @@ def enlarged(
     pelvis = origin + factors[:, None] * (true.pelvis - origin)
     from scipy.spatial.transform import Rotation  # takes a quarter of a second, and few draw
 
-    R = Rotation.from_rotvec(np.outer(factors, Rotation.from_matrix(true.R).as_rotvec())).as_matrix()
-    reaches = (np.linalg.norm(hip_to_ankle(robot, pelvis, R, true.ankles), axis=-1) <= robot.leg.reach).all(axis=-1)
+    R = Rotation.from_rotvec(
+        np.outer(factors, Rotation.from_matrix(true.R).as_rotvec())
+    ).as_matrix()
+    reaches = (
+        np.linalg.norm(hip_to_ankle(robot, pelvis, R, true.ankles), axis=-1) <= robot.leg.reach
+    ).all(axis=-1)
     reaches[-1] = True  # the true posture
     chosen = int(np.argmax(reaches))
     return Posture(pelvis[chosen], R[chosen], true.ankles, true.feet_R), float(factors[chosen])
@@ -133,25 +151,40 @@ class WalkerPicture(ModelPicture):
 
     def alone(self) -> Alone:
         """See `HasSides`."""
-        return Alone(solid_spec(self._task.config.robot), LEG_JOINTS, _ROBOT_DISTANCE_M, "pelvis", set_floor_and_light)
+        return Alone(
+            solid_spec(self._task.config.robot),
+            LEG_JOINTS,
+            _ROBOT_DISTANCE_M,
+            "pelvis",
+            set_floor_and_light,
+        )
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
         """See `HasSides`."""
-        truth, row = self._task.truth(), self._row(now)
+        truth = self._task.truth()
+        row = self._row(now)
         planned = Posture.planned(self._task.plan, row)
         q_ref = planned.joint_angles(truth.model.biped)
         return Sides(
-            q_ref, truth.theta[world].copy(), truth.q[world].copy(), _pose(planned.pelvis, planned.R),
+            q_ref,
+            truth.theta[world].copy(),
+            truth.q[world].copy(),
+            _pose(planned.pelvis, planned.R),
             _pose(truth.pelvis[world], truth.pelvis_R[world]),
-        )  # fmt: skip
+        )
 
     def _row(self, now: Mapping[str, float]) -> int:
-        return min(round(now["time_s"] / self._task.config.control_period_s), self._task.plan.num_steps)
+        return min(
+            round(now["time_s"] / self._task.config.control_period_s), self._task.plan.num_steps
+        )
 
     def _pose(self, now: dict[str, float], world: int) -> None:
-        plan, row = self._task.plan, self._row(now)
+        plan = self._task.plan
+        row = self._row(now)
         truth = self._task.truth()
-        true, planned, robot = Posture.true(truth, world), Posture.planned(plan, row), truth.model.biped
+        true = Posture.true(truth, world)
+        planned = Posture.planned(plan, row)
+        robot = truth.model.biped
         drawn, self._factor = enlarged(true, planned, plan.share[row], robot)
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)
@@ -161,10 +194,17 @@ class WalkerPicture(ModelPicture):
     def _caption(self, now: dict[str, float], world: int) -> list[str]:
         failures = [FELL] if self._task.has_fallen()[world] else []
         deviation = now["zmp_deviation"]
-        zmp = "no ground contact" if np.isnan(deviation) else f"ZMP deviation {1e3 * deviation:5.1f} mm"
+        zmp = (
+            "no ground contact"
+            if np.isnan(deviation)
+            else f"ZMP deviation {1e3 * deviation:5.1f} mm"
+        )
         return [
             "     ".join([f"t = {now['time_s']:6.2f} s", _phase(now), *failures]),
-            f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad     pitch {1e3 * now['pelvis_pitch']:+6.1f} mrad     {zmp}",
+            (
+                f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad     pitch"
+                f" {1e3 * now['pelvis_pitch']:+6.1f} mrad     {zmp}"
+            ),
             f"tilt and shift of the pelvis drawn x {self._factor:.2g}     feet and ZMP to scale",
         ]
 

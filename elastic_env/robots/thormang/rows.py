@@ -1,4 +1,6 @@
-"""The walker's truth, measurements and scores beside its joints: one record per world, fields by name."""
+"""The walker's truth, measurements and scores beside its joints: one record per world, fields by
+name.
+"""
 
 from dataclasses import dataclass
 
@@ -15,46 +17,65 @@ _FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
 TRUTH = record_type(
     *COURSE,
     ("servo_torque", REAL),  # rms over the joints [N·m]
-    ("pelvis", REAL, 3), ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
+    ("pelvis", REAL, 3),
+    ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
     ("pelvis_velocity", REAL, 3),  # of its origin, where the IMU is, in the world [m/s]
     ("pelvis_rate", REAL, 3),  # in the frame of the pelvis [rad/s]
-    ("roll", REAL), ("pitch", REAL), ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
+    ("roll", REAL),
+    ("pitch", REAL),
+    ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
     ("ankles", REAL, (2, 3)),  # positions [m]
     ("wrench", REAL, _FEET_WRENCH),  # of the feet on the legs, in the frames of the feet [N], [N·m]
     ("force", REAL, 2),  # vertical force of the ground on the feet [N]
     ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
-    ("contact_since", WHOLE),  # step of the first touch in the second half of the swing, -1 before it
-)  # fmt: skip
+    (
+        "contact_since",
+        WHOLE,
+    ),  # step of the first touch in the second half of the swing, -1 before it
+)
 """What the physics did in a control step."""
 
 MEASURED = record_type(
-    ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
+    ("imu_attitude", REAL, 2),
+    ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
     ("wrench", REAL, _FEET_WRENCH),  # as in the truth
     # within an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
-    ("imu_up", REAL, 3), ("imu_gyro", REAL, 3),
-)  # fmt: skip
+    ("imu_up", REAL, 3),
+    ("imu_gyro", REAL, 3),
+)
 """What the sensors show, and what one of them keeps."""
 
-NOISE = record_type(*((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None))
-"""Standard normal samples of a control step [1], or their standard deviations in the units of the signals."""
+NOISE = record_type(
+    *((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None)
+)
+"""Standard normal samples of a control step [1], or their standard deviations in the units of
+the signals.
+"""
 
 BIAS = record_type(
     ("imu_attitude", REAL, 2),  # of mounting [rad]
-    ("gyro", REAL, 3), ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
-)  # fmt: skip
+    ("gyro", REAL, 3),
+    ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
+)
 """Errors that are drawn per episode."""
 
-SCORES = record_type(("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL))
+SCORES = record_type(
+    ("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL)
+)
 """Weighted terms of the reward."""
 
 WORLD = record_type(("truth", TRUTH), ("shown", MEASURED), ("scores", SCORES))
 """A control step of a world."""
 
 ROW_OF_PLAN = record_type(
-    ("clock", REAL, 3), ("share", REAL), ("zmp", REAL, 2),  # time, swing, support; μ; [m]
-    ("half_of_swing", WHOLE), ("swing_foot", WHOLE),
-    ("imu_is_due", np.bool_), ("weight", REAL),  # factor of tilt and zmp in the reward
-)  # fmt: skip
+    ("clock", REAL, 3),
+    ("share", REAL),
+    ("zmp", REAL, 2),  # time, swing, support; μ; [m]
+    ("half_of_swing", WHOLE),
+    ("swing_foot", WHOLE),
+    ("imu_is_due", np.bool_),
+    ("weight", REAL),  # factor of tilt and zmp in the reward
+)
 """What a control step needs of the plan."""
 
 INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
@@ -65,23 +86,27 @@ Where none is fitted, the attitude comes with the errors that `QUALITY` has for 
 
 QUALITY = record_type(
     ("noise", NOISE),  # standard deviations
-    ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
-)  # fmt: skip
+    ("imu_bias_rad", REAL),
+    ("imu_sine_error_rad", REAL),
+)
 """Quality of the sensors: noise and constant errors."""
 
 WALK_RULES = record_type(
-    ("lowest_pelvis_m", REAL), ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
+    ("lowest_pelvis_m", REAL),
+    ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP
     ("weights", SCORES),
-)  # fmt: skip
+)
 """Numbers that judge a control step."""
 
 CONSTANTS = record_type(
     ("at", record_type(("ankles", WHOLE, 2))),  # among the sites
-    ("foot_com", REAL, (2, 3)), ("foot_weight", REAL, (2, 3)),  # from the ankle [m], in the world [N]
-    ("quality", QUALITY), ("rules", WALK_RULES),
-)  # fmt: skip
+    ("foot_com", REAL, (2, 3)),
+    ("foot_weight", REAL, (2, 3)),  # from the ankle [m], in the world [N]
+    ("quality", QUALITY),
+    ("rules", WALK_RULES),
+)
 """What does not change."""
 
 COLUMNS = ("imu_attitude", "imu_rate", "wrench", "clock", "load_share", "zmp_reference")
@@ -90,7 +115,9 @@ COLUMNS = ("imu_attitude", "imu_rate", "wrench", "clock", "load_share", "zmp_ref
 
 @dataclass(frozen=True)
 class WalkTruth:
-    """Noise-free state of the walker and its true parameters, one row per world. For scoring and the oracle.
+    """Noise-free state of the walker and its true parameters, one row per world.
+
+    For scoring and the oracle.
 
     Attributes:
         theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
@@ -121,6 +148,7 @@ class WalkTruth:
         model, *others = self.models
         if others:
             raise ConfigurationError(
-                f"the worlds of {len(self.models)} scenarios have no true model in common; make an environment for each"
+                f"the worlds of {len(self.models)} scenarios have no true model in common; make an"
+                " environment for each"
             )
         return model

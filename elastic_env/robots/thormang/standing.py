@@ -12,7 +12,9 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.joint_names import JointAddresses
 
 _DAMPING = 75.0
-"""D of all springs while the robot settles [N·m·s/rad]; with more, light links make the integration unstable."""
+"""D of all springs while the robot settles [N·m·s/rad]; with more, light links make the
+integration unstable.
+"""
 _REST_RATE = 1e-4
 _CHECK_EVERY_S = 0.25
 _LONGEST_S = 20.0
@@ -27,11 +29,13 @@ class Equilibrium:
     warmstart: Array
 
 
-def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array) -> Equilibrium:
+def settle(
+    model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
+) -> Equilibrium:
     """Let a robot come to rest from a posture.
 
-    On the way its dampers are strengthened and its friction is switched off, which shortens the way; where it stands in
-    the end is an equilibrium with friction too.
+    On the way its dampers are strengthened and its friction is switched off, which shortens the
+    way; where it stands in the end is an equilibrium with friction too.
 
     Args:
         model: The plant; it is not changed.
@@ -41,12 +45,14 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
         command: Servo inputs, (n,) [rad].
 
     Raises:
-        ElasticError: It does not come to rest, or falls, or its joints are too stiff for the physics step.
+        ElasticError: It does not come to rest, or falls, or its joints are too stiff for the
+            physics step.
     """
     calm = copy.copy(model)
     calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPING)
     calm.dof_frictionloss[:] = 0.0
-    data, at = mujoco.MjData(calm), JointAddresses.of(calm, joints)
+    data = mujoco.MjData(calm)
+    at = JointAddresses.of(calm, joints)
     data.qpos[:3] = pelvis
     data.qpos[at.q] = data.qpos[at.theta] = q
     data.ctrl[:] = command
@@ -59,20 +65,25 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
             raise _diverged(model, data)
         if data.qpos[2] < 0.5 * pelvis[2]:
             break
-        was_calm, is_calm = rate < _REST_RATE, was_calm and rate < _REST_RATE
+        is_calm = was_calm and rate < _REST_RATE
+        was_calm = rate < _REST_RATE
         if is_calm:  # twice in a row: once may be the turning point of a swing
             return Equilibrium(data.qpos.copy(), data.act.copy(), data.qacc_warmstart.copy())
     raise ElasticError(
-        f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and moving with "
-        f"{np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a joint too soft for the load?"
+        f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and"
+        f" moving with {np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a"
+        " joint too soft for the load?"
     )
 
 
 def _diverged(model: mujoco.MjModel, data: mujoco.MjData) -> ElasticError:
     """The error for a state that is not finite: joints that the physics step cannot resolve."""
-    stiffest = model.tendon_stiffness.max(initial=0.0)  # the elastic joints' springs are all tendons that there are
+    stiffest = model.tendon_stiffness.max(
+        initial=0.0
+    )  # the elastic joints' springs are all tendons that there are
     return ElasticError(
-        f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K of {stiffest:g} "
-        "N·m/rad its joints are too stiff, or their links or rotors too light, for timestep_s = "
-        f"{model.opt.timestep:g} s; lower the stiffness or take a shorter timestep_s"
+        f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K"
+        f" of {stiffest:g} N·m/rad its joints are too stiff, or their links or rotors too light,"
+        f" for timestep_s = {model.opt.timestep:g} s; lower the stiffness or take a shorter"
+        " timestep_s"
     )

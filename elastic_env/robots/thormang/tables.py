@@ -1,4 +1,6 @@
-"""What the walking task observes, commands and scores, by name; `elastic_env.robots.thormang.task` shows the table."""
+"""What the walking task observes, commands and scores, by name;
+`elastic_env.robots.thormang.task` shows the table.
+"""
 
 from collections.abc import Mapping
 
@@ -21,14 +23,17 @@ def _wrenches() -> tuple[Signal, ...]:
     kinds = ("f", "N", "force", of_force), ("m", "N·m", "moment", of_moment)
     return tuple(
         Signal(
-            f"wrench.{side}_{letter}{axis}", unit,
-            f"{what} of the {foot} foot on its leg along {axis}, in the frame of the foot, at the ankle",
-            kind="measured", mirrored=mirrored,
+            f"wrench.{side}_{letter}{axis}",
+            unit,
+            f"{what} of the {foot} foot on its leg along {axis}, in the frame of the foot, at the"
+            " ankle",
+            kind="measured",
+            mirrored=mirrored,
         )
         for side, foot in zip(SIDES, ("left", "right"), strict=True)
         for letter, unit, what, axes in kinds
         for axis, mirrored in axes.items()
-    )  # fmt: skip
+    )
 
 
 def _clock() -> tuple[Signal, ...]:
@@ -53,25 +58,50 @@ GROUPS = (
     _of_joints["encoder_angle"],
     _of_joints["encoder_rate"],
     _of(
-        "imu_attitude", "rad", "{part} of the pelvis by its IMU", _TURNS, "measured",
+        "imu_attitude",
+        "rad",
+        "{part} of the pelvis by its IMU",
+        _TURNS,
+        "measured",
         noise=lambda scenario: scenario.pelvis_noise_rad,
     ),
     _of(
-        "imu_rate", "rad/s", "gyroscope of the pelvis about its {part}", _RATES, "measured",
+        "imu_rate",
+        "rad/s",
+        "gyroscope of the pelvis about its {part}",
+        _RATES,
+        "measured",
         noise=lambda scenario: scenario.pelvis_gyro_noise_rad_s,
     ),
     SignalGroup(
-        "wrench", _wrenches(), shape=(2, 2, 3),
-        noise=lambda scenario: np.array([[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3]),
+        "wrench",
+        _wrenches(),
+        shape=(2, 2, 3),
+        noise=lambda scenario: np.array(
+            [[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3]
+        ),
     ),
     _of_joints["reference_angle"],
     _of_joints["reference_rate"],
     _of_joints["reference_acceleration"],
     SignalGroup("clock", _clock(), shape=(3,)),
-    _of("load_share", "1", "share of the weight on the right foot", {"right": "complement"}, "reference", shape=()),
-    _of("zmp_reference", "m", "reference of the ZMP along {part}", {"x": "same", "y": "opposite"}, "reference"),
+    _of(
+        "load_share",
+        "1",
+        "share of the weight on the right foot",
+        {"right": "complement"},
+        "reference",
+        shape=(),
+    ),
+    _of(
+        "zmp_reference",
+        "m",
+        "reference of the ZMP along {part}",
+        {"x": "same", "y": "opposite"},
+        "reference",
+    ),
     _of_joints["last_command"],
-)  # fmt: skip
+)
 """The observation; what a sensor shows, its noise and its mirror image are said here alone."""
 
 OBSERVATION = SignalTable.of(GROUPS)
@@ -79,16 +109,30 @@ OBSERVATION = SignalTable.of(GROUPS)
 FELL = "fell"
 
 PHASES = ("double", "single", "transition")
-"""Masks by which the scores are split: double support, single support, ±0.2 s around lift-off and touch-down."""
+"""Masks by which the scores are split: double support, single support, ±0.2 s around lift-off
+and touch-down.
+"""
 
 _PELVIS = ("pelvis_roll", "pelvis_pitch", "pelvis_error")
 _ZMP = ("zmp_deviation", "zmp_deviation_x", "zmp_deviation_y")
 
 METRICS = (
     *(Metric(f"{signal}_{s}_rad", signal, s) for signal in _PELVIS for s in ("rms", "peak")),
-    *(Metric(f"{signal}_{s}_m", signal, s, over="loaded") for signal in _ZMP for s in ("rms", "peak")),
-    *(Metric(f"{signal}_{phase}_rms_rad", signal, "rms", over=phase) for phase in PHASES for signal in _PELVIS),
-    *(Metric(f"{signal}_{phase}_rms_m", signal, "rms", over=f"{phase}_loaded") for phase in PHASES for signal in _ZMP),
+    *(
+        Metric(f"{signal}_{s}_m", signal, s, over="loaded")
+        for signal in _ZMP
+        for s in ("rms", "peak")
+    ),
+    *(
+        Metric(f"{signal}_{phase}_rms_rad", signal, "rms", over=phase)
+        for phase in PHASES
+        for signal in _PELVIS
+    ),
+    *(
+        Metric(f"{signal}_{phase}_rms_m", signal, "rms", over=f"{phase}_loaded")
+        for phase in PHASES
+        for signal in _ZMP
+    ),
     Metric("unloaded_samples_count", "zmp_deviation", "count", over="unloaded"),
     Metric("link_error_rms_rad", "link_error", "rms"),
     Metric("link_error_min_rad", "link_error_lowest", "min"),

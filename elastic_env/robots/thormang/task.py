@@ -1,7 +1,9 @@
-"""The walking task: a humanoid on elastic legs walks in place, its pelvis level, its ZMP where the plan has it.
+"""The walking task: a humanoid on elastic legs walks in place, its pelvis level, its ZMP where the
+plan has it.
 
-Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee, l_ankle_pitch, l_ankle_roll,
-then the same of the right leg (r_...); a name before a dot has one column per joint or component after it:
+Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
+l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one
+column per joint or component after it:
 
 | columns | names | unit | meaning |
 |---|---|---|---|
@@ -22,10 +24,11 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 | 81, 82 | `zmp_reference.x`, `.y` | m | in the plan's world frame |
 | 83 to 94 | `last_command.<joint>` | rad | θ_cmd of the last control period |
 
-Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the joints, within ±0.3.
+Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the
+joints, within ±0.3.
 
-`info` of one world, all at the end of the control period, the truth where nothing else is said; positions are in the
-plan's world frame, x forward, y to the left:
+`info` of one world, all at the end of the control period, the truth where nothing else is said;
+positions are in the plan's world frame, x forward, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
@@ -52,7 +55,7 @@ plan's world frame, x forward, y to the left:
 | `reward_terms` | 1 | weighted terms of the reward, by name |
 | `termination` | | why the episode ended: "fell", "diverged", or "" |
 | `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit; ZMP where loaded |
-"""
+"""  # noqa: E501
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -132,12 +135,16 @@ class _Kind:
 
     @property
     def fits(self) -> list[tuple[bool, bool]]:
-        """Whether measurements are delayed, and whether the IMU is inertial, as far as robots of the bank have it."""
+        """Whether measurements are delayed, and whether the IMU is inertial, as far as robots of
+        the bank have it.
+        """
         return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
 
 
 class WalkTask(Task):
-    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP on top of the joints."""
+    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP on top of the
+    joints.
+    """
 
     config: WalkConfig
     assumed_model: WalkerModel
@@ -150,14 +157,20 @@ class WalkTask(Task):
         scenarios = config.scenarios or (config.scenario,) * num_worlds
         if len(scenarios) != num_worlds:
             raise ConfigurationError(
-                f"scenario must be a name, or a list with one for each world, {num_worlds}, got {len(scenarios)}"
+                f"scenario must be a name, or a list with one for each world, {num_worlds}, got"
+                f" {len(scenarios)}"
             )
         sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
         table = OBSERVATION.extended(sensors.signals)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         assumed = WalkerModel(
-            config.assumed_joints, robot.rigid, config.control_period_s, table, biped=robot, plan=self.plan
+            config.assumed_joints,
+            robot.rigid,
+            config.control_period_s,
+            table,
+            biped=robot,
+            plan=self.plan,
         )
         require_feasible(self.plan, robot, assumed.servos)
         self._kinds = [_Kind.of(own, self.plan, table) for own in config.of_each_scenario()]
@@ -183,9 +196,12 @@ class WalkTask(Task):
         self._plan_rows = _plan_rows(self.plan, config)
         self._walk_columns = columns_of(OBSERVATION, COLUMNS)
         self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
-        self._push_steps = np.array([
-            round(kind.config.scenario.push_s / config.control_period_s) for kind in self._kind_of_world
-        ])  # fmt: skip
+        self._push_steps = np.array(
+            [
+                round(kind.config.scenario.push_s / config.control_period_s)
+                for kind in self._kind_of_world
+            ]
+        )
         self._push_force = np.zeros((num_worlds, 3))
         self._push_begin = np.full(num_worlds, -1, dtype=np.int64)
         self._phases.flags.writeable = False
@@ -194,14 +210,20 @@ class WalkTask(Task):
         """Worlds whose pelvis is too low or too much tilted, (num_worlds,)."""
         truth = self._worlds[self._row]["truth"]
         rules = self._walk_constants["rules"][self._kind]
-        is_down = (truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]) | (truth["tilt"] > rules["highest_tilt_rad"])
+        is_down = (truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]) | (
+            truth["tilt"] > rules["highest_tilt_rad"]
+        )
         return is_down & ~truth["diverged"]
 
     def truth(self) -> WalkTruth:
         """State without noise, and the true parameters."""
-        joints, body = self._joints[self._row]["truth"], self._worlds[self._row]["truth"]
+        joints = self._joints[self._row]["truth"]
+        body = self._worlds[self._row]["truth"]
         return WalkTruth(
-            **{name: joints[name].copy() for name in ("theta", "theta_dot", "q", "q_dot", "stiffness")},
+            **{
+                name: joints[name].copy()
+                for name in ("theta", "theta_dot", "q", "q_dot", "stiffness")
+            },
             **{name: body[name].copy() for name in ("pelvis", "ankles")},
             pelvis_R=rotation_of(body["quaternion"]),
             models=tuple(kind.true_model for kind in self._kinds),
@@ -212,7 +234,8 @@ class WalkTask(Task):
 
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         generator = random.robot
-        kind, bias = self._kind_of_world[world], self._bias
+        kind = self._kind_of_world[world]
+        bias = self._bias
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot, kind.true_model)
         mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
@@ -228,17 +251,22 @@ class WalkTask(Task):
         begin = random.draw_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
         direction = random.draw_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
         self._push_begin[world] = begin
-        self._push_force[world] = self._robot(world).push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
+        self._push_force[world] = self._robot(world).push_n * np.array(
+            [np.cos(direction), np.sin(direction), 0.0]
+        )
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
-        scenario, bias = self._kind_of_world[world].config.scenario, self._bias
+        scenario = self._kind_of_world[world].config.scenario
+        bias = self._bias
         sensor = _fitted(scenario, self._robot(world).is_inertial).inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
         if sensor is not None:
             bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
             bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
-            bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
+            bias["specific_force"][world] = (
+                sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
+            )
 
     def _placed(self, world: int) -> PlacedRobot:
         """The robot of a world, at rest."""
@@ -255,7 +283,9 @@ class WalkTask(Task):
             simulation.qpos[world] = placed.rest.qpos
             simulation.qvel[world] = 0.0
             simulation.act[world] = placed.rest.act
-            simulation.ctrl[world] = self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
+            simulation.ctrl[world] = (
+                self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
+            )
             simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
         simulation.refresh(worlds)
 
@@ -269,13 +299,18 @@ class WalkTask(Task):
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
         steps = self._steps()
-        kernels.begin_walk(self._physics, self._constants, self._walker, self._noise.ready(), worlds, steps)
+        kernels.begin_walk(
+            self._physics, self._constants, self._walker, self._noise.ready(), worlds, steps
+        )
         self._worlds[self._row]["scores"][worlds] = np.zeros((), SCORES)
 
     def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
         noise = self._noise.ready()
-        joints, steps = self._constants, self._steps()
-        return kernels.sense_walk(self._physics, joints, self._walker, noise, commanded, steps, results)
+        joints = self._constants
+        steps = self._steps()
+        return kernels.sense_walk(
+            self._physics, joints, self._walker, noise, commanded, steps, results
+        )
 
     def _show_worlds(self, observed: Array) -> None:
         kernels.show_walk(self._constants, self._walker, self._steps(), observed)
@@ -291,9 +326,12 @@ class WalkTask(Task):
         return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        truth, plan, timing = worlds["truth"], self.plan, self.plan.timing
+        truth = worlds["truth"]
+        plan = self.plan
+        timing = self.plan.timing
         row = self._plan_row(truth)
-        error, deflection = joints["q_ref"] - joints["q"], joints["theta"] - joints["q"]
+        error = joints["q_ref"] - joints["q"]
+        deflection = joints["theta"] - joints["q"]
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
         return {
@@ -326,7 +364,9 @@ class WalkTask(Task):
         }
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """The walk (standing before and after it does not count), its phases, and where there is a ZMP."""
+        """The walk (standing before and after it does not count), its phases, and where there is
+        a ZMP.
+        """
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
@@ -354,7 +394,7 @@ class _Walk:
     walk: WalkPlan
     is_random = False
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  there is one
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
         """See `Planned`."""
         scored = self.walk.timing.walking
         nowhere = np.full(len(scored), -1, dtype=np.int64)
@@ -363,11 +403,14 @@ class _Walk:
 
 def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
     """What a control step needs of the plan, one row per step."""
-    timing, steps = plan.timing, np.arange(plan.num_steps + 1)
+    timing = plan.timing
+    steps = np.arange(plan.num_steps + 1)
     rows = np.zeros(len(steps), ROW_OF_PLAN)
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
-    rows["share"], rows["zmp"] = plan.share, plan.zmp
-    rows["half_of_swing"], rows["swing_foot"] = _halves_of_swing(plan), RIGHT - timing.support
+    rows["share"] = plan.share
+    rows["zmp"] = plan.zmp
+    rows["half_of_swing"] = _halves_of_swing(plan)
+    rows["swing_foot"] = RIGHT - timing.support
     rows["imu_is_due"] = is_due(steps, config.scenario.pelvis_imu.rate_hz, config.control_period_s)
     rows["weight"] = np.where(timing.walking, 1.0, config.reward.standing)
     rows.flags.writeable = False
@@ -375,8 +418,11 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
 
 
 def _phase_rows(plan: WalkPlan) -> BoolArray:
-    """The walk, its phases in the order of `PHASES`, and when a foot should touch down, by control step."""
-    timing, touchdown = plan.timing, np.zeros_like(plan.timing.single)
+    """The walk, its phases in the order of `PHASES`, and when a foot should touch down, by
+    control step.
+    """
+    timing = plan.timing
+    touchdown = np.zeros_like(plan.timing.single)
     touchdown[1:] = timing.single[:-1] & ~timing.single[1:]
     return timing.walking & np.stack(
         [np.ones_like(touchdown), ~timing.single, timing.single, timing.transition, touchdown]
@@ -386,12 +432,16 @@ def _phase_rows(plan: WalkPlan) -> BoolArray:
 def _halves_of_swing(plan: WalkPlan) -> IntArray:
     """Which half of a swing a control step is in, 0 for none."""
     timing = plan.timing
-    return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
+    return np.where(
+        timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0
+    )
 
 
-def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001  of all sensors
+def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
     """One record of `RULES`; arguments as `_constants`."""
-    counts = kind.true_model.encoder_counts_per_turn if kind.config.scenario.encoder_counts else None
+    counts = (
+        kind.true_model.encoder_counts_per_turn if kind.config.scenario.encoder_counts else None
+    )
     return one(
         RULES,
         control_period_s=kind.config.control_period_s,
@@ -401,7 +451,7 @@ def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  
     )
 
 
-def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001  that is of the joints
+def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
     """What does not change of a robot, one record of `CONSTANTS`.
 
     Args:
@@ -409,7 +459,8 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # 
         is_delayed: Whether its measurements are shown a step late.
         is_inertial: Whether its IMU computes its attitude.
     """
-    config, model = kind.config, kind.model
+    config = kind.config
+    model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
     gravity = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
@@ -434,37 +485,57 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # 
 
 
 def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
-    """The scenario of a robot with an inertial IMU, its own or where robots are drawn that of the data sheet."""
+    """The scenario of a robot with an inertial IMU, its own or where robots are drawn that of
+    the data sheet.
+    """
     if not is_inertial:
         return scenario
     return scenario.replace(ranges=(), inertial=scenario.inertial or InertialSensor())
 
 
 def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> Records | None:
-    """The inertial IMUs of robots as `WalkTask` lists them, rows of `INERTIAL`; None where no robot has one."""
+    """The inertial IMUs of robots as `WalkTask` lists them, rows of `INERTIAL`; None where no
+    robot has one.
+    """
     if not any(is_inertial for _, _, is_inertial in fits):
         return None
     sensors = [kind.config.scenario.inertial or InertialSensor() for kind, _, _ in fits]
-    return np.concatenate([
-        one(INERTIAL, is_fitted=fit[2], time_constant_s=sensor.time_constant_s, gravity_m_s2=gravity_m_s2)
-        for fit, sensor in zip(fits, sensors, strict=True)
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            one(
+                INERTIAL,
+                is_fitted=fit[2],
+                time_constant_s=sensor.time_constant_s,
+                gravity_m_s2=gravity_m_s2,
+            )
+            for fit, sensor in zip(fits, sensors, strict=True)
+        ]
+    )
 
 
 def _quality(scenario: Scenario) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
-    imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
+    imu = scenario.pelvis_imu
+    noise = np.zeros(1, NOISE)
     for group in GROUPS:
         if group.noise is not None:
             noise[group.name] = group.noise(scenario)
-    return one(QUALITY, noise=noise, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad)
+    return one(
+        QUALITY, noise=noise, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad
+    )
 
 
 def _true_model(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> WalkerModel:
     """The true joints and masses, and the torques that the planned motion needs of them."""
     true = biped(config.true_robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    plan = plan if config.true_robot == config.robot else with_torque(plan, true, config.control_period_s)
-    return WalkerModel(config.true_joints, true.rigid, config.control_period_s, table, biped=true, plan=plan)
+    plan = (
+        plan
+        if config.true_robot == config.robot
+        else with_torque(plan, true, config.control_period_s)
+    )
+    return WalkerModel(
+        config.true_joints, true.rigid, config.control_period_s, table, biped=true, plan=plan
+    )
 
 
 TOUCHDOWN = -1
@@ -485,7 +556,13 @@ def rotation_of(quaternion: Array) -> Array:
     """Rotation of unit quaternions w, x, y, z, (n, 4) to (n, 3, 3)."""
     w, x, y, z = quaternion.T
     R = np.empty((len(quaternion), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    R[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    R[:, 0, 1] = 2 * (x * y - w * z)
+    R[:, 0, 2] = 2 * (x * z + w * y)
+    R[:, 1, 0] = 2 * (x * y + w * z)
+    R[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    R[:, 1, 2] = 2 * (y * z - w * x)
+    R[:, 2, 0] = 2 * (x * z - w * y)
+    R[:, 2, 1] = 2 * (y * z + w * x)
+    R[:, 2, 2] = 1 - 2 * (x * x + y * y)
     return R
