@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 
 _FILES = "elastic_user_file_"
 _REFUSED_IN: ContextVar[Path | None] = ContextVar("refused_in", default=None)
@@ -50,7 +50,7 @@ def require_no_code(file: Path, names: Iterable[str]) -> None:
 
 def _trust_error(file: Path, name: str) -> ConfigurationError:
     return ConfigurationError(
-        f"{file} names {shown(name)}, whose code would run; look at it, then say --trust-code, or"
+        f"{file} names {quote(name)}, whose code would run; look at it, then say --trust-code, or"
         " name a configuration of yours"
     )
 
@@ -73,7 +73,7 @@ def named_object(name: str) -> Any:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(
-            f"{shortened(place)} cannot be imported: {type(error).__name__}: {error}"
+            f"{shorten(place)} cannot be imported: {type(error).__name__}: {error}"
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
@@ -83,8 +83,7 @@ def named_object(name: str) -> Any:
             if inspect.isfunction(f) and f.__module__ == module.__name__
         ]
         raise ConfigurationError(
-            f"{shortened(place)} has no {attribute!r}; its functions are:"
-            f" {', '.join(own) or 'none'}"
+            f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
         )
     return getattr(module, attribute)
 
@@ -116,7 +115,7 @@ def _from_file(path: Path) -> ModuleType:
     if known is not None and known.__file__ == str(resolved):
         return known
     if not resolved.is_file():
-        raise FileNotFoundError(f"there is no file {shortened(path)}")
+        raise FileNotFoundError(f"there is no file {shorten(path)}")
     spec = importlib.util.spec_from_file_location(name, resolved)
     assert spec is not None
     assert spec.loader is not None
