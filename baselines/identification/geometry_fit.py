@@ -1,0 +1,360 @@
+r"""Geometry, encoders and compliance of an arm from positions of markers: one least-squares problem.
+
+The parameters x minimise
+
+.. math:: \sum_i \|y_i - p_i(x)\|^2 / \sigma^2 + \sum_j (x_j - \mu_j)^2 / s_j^2
+
+with the noise σ of the residuals, estimated with x, and Gaussian priors in the units of
+manufacture. A prior is what is known before the poses: lengths to millimetres, angles to a fraction
+of a degree. Where the poses do not tell a parameter it keeps its prior, and is named. Intervals are
+of the posterior at the solution: ±1.96 standard deviations.
+
+Steps are those of Levenberg and Marquardt, in units of the derivatives.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from baselines.identification.geometry_model import Geometry, GeometryModel, Parameters
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array, IntArray
+
+_MOST_STEPS = 60
+_DAMPING = 1e-4
+_MOST_DAMPING = 1e8
+_SETTLED = 1e-6
+"""Relative change of the sum of squares below which it is least."""
+_FIRST_NOISE_M = 3e-3
+_NOISE_ROUNDS = 3
+_FINEST_M = 1e-5
+_TOLD = 0.9
+"""Share of its prior's deviation above which the poses do not tell a parameter."""
+_FEWEST_POSES = 2
+_LEAST_DAMPING = 1e-12
+_SMALLEST_MOMENT = 1e-3
+"""Share of the largest moment in the arm that a joint is taken to carry at least."""
+QUANTILE = 1.96
+"""Half-width of a 95 % interval in standard deviations."""
+
+
+class GeometryPriors(Model):
+    """Standard deviations of what is known before the poses."""
+
+    frame_m: float = quantity("m", 1.0, gt=0, le=100)
+    """Place of the tracker [m]."""
+    frame_rad: float = quantity("rad", 1.0, gt=0, le=10)
+    """Directions of the tracker [rad]."""
+    marker_m: float = quantity("m", 0.3, gt=0, le=10)
+    """Place of a marker on its link [m]."""
+    offset_rad: float = quantity("rad", 0.02, gt=0, le=1)
+    """Offset of an encoder [rad]."""
+    length_m: float = quantity("m", 0.002, gt=0, le=1)
+    """Length of a link [m]."""
+    angle_rad: float = quantity("rad", 0.005, gt=0, le=1)
+    """Angle between axes [rad]."""
+    deflection_rad: float = quantity("rad", 0.1, gt=0, le=1)
+    """Deflection of a joint about its axis under its largest torque [rad]."""
+    lateral_rad: float = quantity("rad", 0.02, gt=0, le=1)
+    """The same across its axis [rad]."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimate.
+
+    Attributes:
+        kind: Kind of parameter, a field of `Parameters`.
+        name: Joint or marker and axis, such as `elbow.x`.
+        value: Estimate.
+        deviation: Its standard deviation.
+        prior: Standard deviation of its prior.
+    """
+
+    kind: str
+    name: str
+    value: float
+    deviation: float
+    prior: float
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the poses tell more of it than the prior does."""
+        return self.deviation < _TOLD * self.prior
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Parameters that are sought, as one vector x.
+
+    Attributes:
+        kinds: Field of `Parameters` of each one, (p,).
+        names: Joint or marker and axis of each one, such as `elbow.x`, (p,).
+        basis: All parameters, flat, by x, (f, p).
+        prior: Standard deviations of the priors, (p,).
+    """
+
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+    basis: Array
+    prior: Array
+
+    def part(self, kind: str) -> IntArray:
+        """Positions of a kind in x."""
+        return np.flatnonzero([own == kind for own in self.kinds])
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryProblem:
+    """Poses, and what is sought.
+
+    Attributes:
+        model: Markers as a function of parameters.
+        theta: Motor encoders, (N, n) [rad].
+        measured: Places of the markers, (N, k, 3) [m].
+        joints: Names of the joints, (n,).
+        geometry: How much of the geometry is unknown.
+        elastic: Joints whose stiffness is sought; none for a rigid arm.
+        lateral: Whether their lateral compliance is sought too.
+        priors: What is known before the poses.
+        free: Joints whose frame is wholly unknown.
+    """
+
+    model: GeometryModel
+    theta: Array
+    measured: Array
+    joints: tuple[str, ...]
+    geometry: Geometry = "offsets"
+    elastic: tuple[str, ...] = ()
+    lateral: bool = False
+    priors: GeometryPriors = field(default_factory=GeometryPriors)
+    free: tuple[str, ...] = ()
+
+    def of_poses(self, chosen: Array) -> "GeometryProblem":
+        """The problem of some of the poses, with the same unknowns and priors."""
+        other = replace(self, theta=self.theta[chosen], measured=self.measured[chosen])
+        other.__dict__["unknowns"] = self.unknowns
+        return other
+
+    @cached_property
+    def largest_moment(self) -> Array:
+        """Largest moments of gravity in these poses about the axes of each joint, (n, 3) [N·m]."""
+        rigid = self.model.posture(self.model.nominal_parameters(), self.theta)
+        moments = np.abs(self.model.moments(rigid)).max(axis=0)
+        return np.maximum(moments, _SMALLEST_MOMENT * max(float(moments.max()), 1e-9))
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """Parameters that are sought, and their priors."""
+        own = self.priors
+        nominal = self.model.nominal_parameters()
+        starts = np.cumsum([0, *(part.size for part in nominal)])
+        begin = dict(zip(Parameters._fields, starts, strict=False))
+        found: list[tuple[str, str, Array, float]] = []
+
+        def seek(kind: str, name: str, first: int, direction: Array, prior: float) -> None:
+            column = np.zeros(starts[-1])
+            column[begin[kind] + first : begin[kind] + first + len(direction)] = direction
+            found.append((kind, name, column, prior))
+
+        for axis, unit in zip("xyz", np.eye(3), strict=True):
+            seek("translation", axis, 0, unit, own.frame_m)
+            seek("rotation", axis, 0, unit, own.frame_rad)
+            for i, marker in enumerate(self.model.markers):
+                seek("marker", f"{marker.name}.{axis}", 3 * i, unit, own.marker_m)
+        for j, joint in enumerate(self.joints):
+            is_free = joint in self.free
+            one = np.ones(1)
+            seek("offset", joint, j, one, own.frame_rad if is_free else own.offset_rad)
+            length = own.frame_m if is_free else own.length_m
+            angle = own.frame_rad if is_free else own.angle_rad
+            for name, direction, is_length in self._errors_of(j, is_free):
+                kind = "length" if is_length else "angle"
+                seek(kind, f"{joint}.{name}", 3 * j, direction, length if is_length else angle)
+            if joint not in self.elastic:
+                continue
+            moment = self.largest_moment[j]
+            axis_z = np.array([0.0, 0.0, 1.0])
+            seek("compliance", joint, 3 * j, axis_z, own.deflection_rad / moment[2])
+            for i, name in enumerate("xy" if self.lateral else ""):
+                prior = own.lateral_rad / moment[i]
+                seek("compliance", f"{joint}.{name}", 3 * j, np.eye(3)[i], prior)
+        kinds, names, columns, priors = zip(*found, strict=True)
+        return Unknowns(kinds, names, np.stack(columns, axis=1), np.array(priors))
+
+    def _errors_of(self, joint: int, is_free: bool) -> list[tuple[str, Array, bool]]:
+        """Name and direction of the unknown lengths, and angles, of a joint's frame."""
+        if self.geometry == "offsets" and not is_free:
+            return []
+        across, along = self.model.normals[joint]
+        axis = np.array([0.0, 0.0, 1.0])
+        errors = [("x", across, True), ("z", axis, True), ("x", across, False)]
+        if self.geometry == "full" or is_free:
+            errors += [("y", along, True), ("y", along, False)]
+        return errors
+
+    def parameters(self, x: Array) -> Parameters:
+        """All parameters at x."""
+        flat = self.unknowns.basis @ x
+        nominal = self.model.nominal_parameters()
+        ends = np.cumsum([part.size for part in nominal])
+        parts = np.split(flat, ends[:-1])
+        return Parameters(
+            *(part.reshape(like.shape) for part, like in zip(parts, nominal, strict=True))
+        )
+
+    def residual(self, x: Array) -> Array:
+        """Shown by the model less measured, (N k 3,) [m]."""
+        return (self.model.measured(self.parameters(x), self.theta) - self.measured).ravel()
+
+    def linearised(self, x: Array) -> tuple[Array, Array]:
+        """The residual, (N k 3,) [m], and its derivatives by x, (N k 3, p)."""
+        shown, gradient = self.model.gradient(self.parameters(x), self.theta)
+        rows = shown.size
+        flat = np.concatenate([part.reshape(rows, -1) for part in gradient], axis=1)
+        return (shown - self.measured).ravel(), flat @ self.unknowns.basis
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryFit:
+    """Parameters that fit, and how well they are known.
+
+    Attributes:
+        problem: The poses.
+        x: Estimates of the unknowns, (p,).
+        covariance: Of the estimates, (p, p).
+        noise_m: Standard deviation of a coordinate of a marker [m].
+    """
+
+    problem: GeometryProblem
+    x: Array
+    covariance: Array
+    noise_m: float
+
+    @property
+    def parameters(self) -> Parameters:
+        """All parameters."""
+        return self.problem.parameters(self.x)
+
+    @cached_property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """The unknowns with their intervals."""
+        own = self.problem.unknowns
+        deviations = np.sqrt(np.diag(self.covariance))
+        return tuple(
+            Estimate(*row)
+            for row in zip(
+                own.kinds,
+                own.names,
+                self.x.tolist(),
+                deviations.tolist(),
+                own.prior.tolist(),
+                strict=True,
+            )
+        )
+
+    def errors(self, problem: GeometryProblem) -> Array:
+        """Distances of the markers from where they were measured, (N, k) [m]."""
+        shown = problem.model.measured(self.parameters, problem.theta)
+        return np.linalg.norm(shown - problem.measured, axis=-1)
+
+
+def fit_geometry(
+    problem: GeometryProblem, progress: Callable[[int], None] | None = None
+) -> GeometryFit:
+    """Fit the unknowns of poses.
+
+    Args:
+        problem: The poses and what is sought.
+        progress: Called with the number of steps so far.
+
+    Raises:
+        ConfigurationError: Fewer than two poses.
+        ElasticError: The poses do not fit the arm, or the fit does not converge.
+    """
+    if len(problem.theta) < _FEWEST_POSES:
+        raise ConfigurationError(
+            f"a fit of the geometry needs at least {_FEWEST_POSES} poses, got {len(problem.theta)}"
+        )
+    x = np.zeros(len(problem.unknowns.prior))
+    noise = _FIRST_NOISE_M
+    steps = 0
+    for _ in range(_NOISE_ROUNDS):
+        x, steps = _least(problem, x, noise, steps, progress)
+        residual, _ = problem.linearised(x)
+        used = len(x) - float(np.trace(_covariance(problem, x, noise)))
+        spread = np.sqrt(residual @ residual / max(len(residual) - used, 1.0))
+        noise = max(float(spread), _FINEST_M)
+    prior = problem.unknowns.prior
+    return GeometryFit(problem, x, _covariance(problem, x, noise) * np.outer(prior, prior), noise)
+
+
+def _covariance(problem: GeometryProblem, x: Array, noise: float) -> Array:
+    """Of the unknowns in units of their priors, (p, p)."""
+    _, gradient = problem.linearised(x)
+    rows = gradient * problem.unknowns.prior / noise
+    return np.linalg.inv(rows.T @ rows + np.eye(len(x)))
+
+
+def _least(
+    problem: GeometryProblem,
+    x: Array,
+    noise: float,
+    steps: int,
+    progress: Callable[[int], None] | None,
+) -> tuple[Array, int]:
+    """Unknowns of the least sum of squares, and steps so far."""
+    prior = problem.unknowns.prior
+    damping = _DAMPING
+
+    def total(x: Array, residual: Array) -> float:
+        return float(residual @ residual / noise**2 + np.sum((x / prior) ** 2))
+
+    residual, gradient = problem.linearised(x)
+    best = total(x, residual)
+    for _ in range(_MOST_STEPS):
+        steps += 1
+        if progress is not None:
+            progress(steps)
+        rows = gradient * prior / noise
+        slope = rows.T @ residual / noise + x / prior
+        matrix = rows.T @ rows + np.eye(len(x))
+        size = np.sqrt(np.diag(matrix))
+        while True:
+            damped = matrix / np.outer(size, size) + damping * np.eye(len(x))
+            tried = x - prior * np.linalg.solve(damped, slope / size) / size
+            try:
+                found = total(tried, problem.residual(tried))
+            except ElasticError:
+                found = np.inf
+            if found <= best or damping > _MOST_DAMPING:
+                break
+            damping *= 10.0
+        if not found < best * (1.0 - _SETTLED):
+            return (tried if found <= best else x), steps
+        x = tried
+        best = found
+        residual, gradient = problem.linearised(x)
+        damping = max(damping / 10.0, _LEAST_DAMPING)
+    raise ElasticError(
+        f"the fit of the geometry did not converge in {_MOST_STEPS} steps; check the units of the"
+        " log's columns and the model"
+    )
+
+
+def aligned(model: GeometryModel, theta: Array, measured: Array) -> GeometryModel:
+    """The model with the rotation of the tracker that fits rigid nominal poses best.
+
+    Args:
+        model: The markers.
+        theta: Motor encoders, (N, n) [rad].
+        measured: Places of the markers, (N, k, 3) [m].
+    """
+    own = model.measured(model.nominal_parameters(), theta).reshape(-1, 3)
+    shown = measured.reshape(-1, 3)
+    R = Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[0].as_matrix()
+    return replace(model, alignment=R, origin=shown.mean(axis=0) - R @ own.mean(axis=0))
