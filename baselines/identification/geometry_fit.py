@@ -1,4 +1,4 @@
-r"""Geometry, encoders and compliance of an arm from positions of markers: one least-squares problem.
+r"""Geometry, encoders and compliance of an arm from positions of markers, by least squares.
 
 The parameters x minimise
 
@@ -35,6 +35,8 @@ _FINEST_M = 1e-5
 _TOLD = 0.9
 """Share of its prior's deviation above which the poses do not tell a parameter."""
 _FEWEST_POSES = 2
+_NOTHING = 1e-9
+"""Prior of what counts as known."""
 _LEAST_DAMPING = 1e-12
 _SMALLEST_MOMENT = 1e-3
 """Share of the largest moment in the arm that a joint is taken to carry at least."""
@@ -134,10 +136,17 @@ class GeometryProblem:
     priors: GeometryPriors = field(default_factory=GeometryPriors)
     free: tuple[str, ...] = ()
 
-    def of_poses(self, chosen: Array) -> "GeometryProblem":
+    def of_poses(self, chosen: IntArray) -> "GeometryProblem":
         """The problem of some of the poses, with the same unknowns and priors."""
         other = replace(self, theta=self.theta[chosen], measured=self.measured[chosen])
         other.__dict__["unknowns"] = self.unknowns
+        return other
+
+    def as_rigid(self) -> "GeometryProblem":
+        """The same poses of the rigid arm as it is given: only tracker and markers are sought."""
+        priors = self.priors.replace(offset_rad=_NOTHING)
+        other = replace(self, geometry="offsets", elastic=(), lateral=False, priors=priors)
+        other.__dict__.pop("unknowns", None)
         return other
 
     @cached_property
@@ -257,10 +266,13 @@ class GeometryFit:
             )
         )
 
+    def missed(self, problem: GeometryProblem) -> Array:
+        """Places of the markers less those that these parameters predict, (N, k, 3) [m]."""
+        return problem.measured - problem.model.measured(self.parameters, problem.theta)
+
     def errors(self, problem: GeometryProblem) -> Array:
         """Distances of the markers from where they were measured, (N, k) [m]."""
-        shown = problem.model.measured(self.parameters, problem.theta)
-        return np.linalg.norm(shown - problem.measured, axis=-1)
+        return np.linalg.norm(self.missed(problem), axis=-1)
 
 
 def fit_geometry(
@@ -346,7 +358,7 @@ def _least(
     )
 
 
-def aligned(model: GeometryModel, theta: Array, measured: Array) -> GeometryModel:
+def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> GeometryModel:
     """The model with the rotation of the tracker that fits rigid nominal poses best.
 
     Args:

@@ -6,8 +6,8 @@ The nominal model has a frame for each hinge, whose z axis is the hinge's axis. 
 * each frame is displaced by small lengths v and turned by small angles ω against its parent;
 * gravity turns each joint by φ = c ∘ Fᵀ m, with the moment m of all weight beyond the joint about
   its anchor, in the axes F of the joint's housing. c_z = 1/K is the compliance about the joint's
-  own axis, so that φ_z = −τ_g/K is what Eq. 10 has. c_x and c_y are lateral compliance: bearings and
-  links that bend [Tenhumberg2023];
+  own axis, so that φ_z = −τ_g/K is what Eq. 10 has. c_x and c_y are lateral compliance:
+  bearings and links that bend [Tenhumberg2023];
 * a tracker shows R p + t of the places p of markers, which are not exactly known either.
 
 With `dh` each frame has the four parameters of Denavit and Hartenberg: a length and an angle about

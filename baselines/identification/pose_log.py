@@ -17,12 +17,13 @@ from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array
 
-Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
+Kind = Literal["link_encoders", "end_effector", "markers", "imu", "torques"]
 """What a log has besides the motor encoders."""
 
 KINDS: dict[str, tuple[Kind, str]] = {
     "q": ("link_encoders", "rad"),
     "end_effector": ("end_effector", "m"),
+    "marker": ("markers", "m"),
     "imu": ("imu", "rad"),
     "torque": ("torques", "N·m"),
 }
@@ -99,6 +100,10 @@ def read_log(
     chosen = KINDS[quantity][0]
     _require_columns(path, chosen, names[quantity], joints)
     order = AXES.get(chosen) or tuple(joint for joint in joints if joint in names[quantity])
+    if chosen == "markers":
+        order = tuple(
+            f"{name}.{axis}" for name in _markers(path, names[quantity]) for axis in "xyz"
+        )
     log = PoseLog(
         joints,
         _table(columns, "theta", joints),
@@ -181,7 +186,8 @@ def _name(path: Path, text: str) -> str:
     if found is None or found[1] not in UNITS:
         raise ConfigurationError(
             f"{path} has the column {quote(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
-            " direction.JOINT, end_effector.x, .y, .z, imu.roll and imu.pitch"
+            " direction.JOINT, end_effector.x, .y, .z, marker.NAME.x, .y, .z, imu.roll and"
+            " imu.pitch"
         )
     quantity = found[1]
     of = found[2]
@@ -227,10 +233,25 @@ def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Seque
             f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
             f" {', '.join(given)}"
         )
-    if kind not in AXES and (without := [joint for joint in given if joint not in joints]):
+    if kind in ("link_encoders", "torques") and (
+        without := [joint for joint in given if joint not in joints]
+    ):
         raise ConfigurationError(
             f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column"
         )
+
+
+def _markers(path: Path, columns: Sequence[str]) -> list[str]:
+    """Markers that have a column for each axis."""
+    names = list(dict.fromkeys(column.rpartition(".")[0] for column in columns))
+    for name in names:
+        own = sorted(column for column in columns if column.rpartition(".")[0] == name)
+        if not name or own != [f"{name}.{axis}" for axis in "xyz"]:
+            raise ConfigurationError(
+                f"{path}: a marker needs the columns marker.NAME.x, .y and .z, where NAME is a site"
+                f" or body of the model; got marker.{own[0]}"
+            )
+    return names
 
 
 def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str]) -> Array:

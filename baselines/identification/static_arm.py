@@ -61,7 +61,7 @@ class StaticArm:
         self._bare = PositionCompensator(model, np.inf, joints=joints)
         self._loaded: PositionCompensator | None = None
         if payload is not None:
-            body, place = _place(model, payload)
+            body, place = place_of(model, payload)
             self._loaded = PositionCompensator(model, np.inf, joints=joints)
             self._loaded.set_payload(1.0, place, model.body(body).name)
         self._data = mujoco.MjData(model)
@@ -75,7 +75,7 @@ class StaticArm:
         self.end_effector = model.body(self._body).name or f"body {self._body}"
         if end_effector is not None:
             self.end_effector = end_effector
-            self._body, self._point = _place(model, end_effector)
+            self._body, self._point = place_of(model, end_effector)
             self._turn = _turn(model, end_effector)
         at = [int(model.joint(name).id) for name in joints]
         limited = model.jnt_limited[at].astype(bool)[:, None]
@@ -155,7 +155,7 @@ def _bodies(model: mujoco.MjModel) -> list[str]:
     return [model.body(i).name for i in range(1, model.nbody)]
 
 
-def _place(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
+def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
     """Body of a site or body, and the place of its origin in the body's frame [m]."""
     if name in _sites(model):
         site = model.site(name)

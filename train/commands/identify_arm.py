@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
+import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -29,6 +31,7 @@ from baselines.identification.arm_result import (
     Source,
     described,
 )
+from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
 from baselines.identification.pose_plan import (
@@ -43,7 +46,8 @@ from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.known_torque import commanded_hinges, hinges_of
-from elastic_env.joint.model_file import compiled_model, from_mujoco
+from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
+from train.commands.identify_geometry import GeometryOptions, identify_geometry
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
 from train.runs.console import make_table
@@ -94,6 +98,7 @@ class ArmOptions(Model):
     """Propose so many further poses, within limits and without contacts, that tell the stiffness
     best.
     """
+    markers: Annotated[GeometryOptions, tyro.conf.arg(name="")] = GeometryOptions()
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,11 @@ class _Setting:
     elastic: tuple[str, ...]
     seed: int
 
+    @property
+    def seeks_geometry(self) -> bool:
+        """Whether markers tell geometry and stiffness together."""
+        return self.log.kind == "markers" or self.options.markers.geometry is not None
+
     def model(self, log: PoseLog | None = None) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
         own = self.log if log is None else log
@@ -117,7 +127,7 @@ class _Setting:
 
 def run_arm_identification(
     options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
-) -> ArmIdentification | None:
+) -> ArmIdentification | GeometryIdentification | None:
     """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result;
     or plan.
 
@@ -145,6 +155,18 @@ def run_arm_identification(
         )
     plots.require_matplotlib()
     setting = _setting(options, compiled_model(options.robot), console, seed)
+    if setting.seeks_geometry:
+        spec = read_model(options.robot).spec
+        return identify_geometry(
+            options.markers,
+            spec,
+            setting.log,
+            setting.elastic,
+            setting.arm.end_effector,
+            console,
+            seed=seed,
+            output=output,
+        )
     recorded = {**options.model_dump(mode="json"), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
         if options.log is None:
@@ -322,7 +344,7 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
             " body"
         )
     setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
-    if options.log is not None:
+    if options.log is not None and not setting.seeks_geometry:
         require_poses(setting.model())
     return setting
 

@@ -1,0 +1,197 @@
+"""Result of an identification with geometry: estimates in JSON, K in YAML, a model in MJCF."""
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from pydantic import Field
+
+from baselines.identification.geometry_fit import QUANTILE, Estimate, GeometryFit
+from baselines.identification.geometry_model import Geometry, rotation_of
+from baselines.identification.holdout import HeldOut
+from elastic_env.core.config import Model
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import yaml_line
+from elastic_env.rigid.tree.links import Tree
+
+UNITS = {
+    "translation": "m",
+    "rotation": "rad",
+    "marker": "m",
+    "offset": "rad",
+    "length": "m",
+    "angle": "rad",
+    "compliance": "rad/(N·m)",
+}
+"""Units of the kinds of parameters."""
+
+
+class GeometryEstimate(Model):
+    """One parameter and its 95 % interval."""
+
+    kind: str
+    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance."""
+    name: str
+    """Joint or marker, with the axis of the joint's frame where it has several."""
+    value: float
+    half_width: float
+    """Half of the 95 % interval."""
+    unit: str
+    is_told: bool
+    """Whether the poses tell more of it than its prior does."""
+
+
+class JointCompliance(Model):
+    """Stiffness of one joint about its own axis."""
+
+    joint: str
+    stiffness_nm_per_rad: float = Field(allow_inf_nan=True)
+    """Value in `joints.yaml`; infinite for a rigid joint, which JSON has as null."""
+    stiffness_low_nm_per_rad: float | None
+    stiffness_high_nm_per_rad: float | None
+    """Ends of the 95 % interval; None where it reaches to rigid."""
+
+
+class GeometryIdentification(Model):
+    """Result of an identification with geometry; written as `identification.json`."""
+
+    poses: int
+    geometry: Geometry
+    lateral: bool
+    noise_mm: float
+    """Standard deviation of a coordinate of a marker that is not explained."""
+    joints: tuple[JointCompliance, ...]
+    parameters: tuple[GeometryEstimate, ...]
+    held_out: HeldOut | None = None
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Parameters of which the poses tell no more than the prior, such as `elbow.x length`."""
+        return tuple(
+            f"{parameter.name} {parameter.kind}"
+            for parameter in self.parameters
+            if not parameter.is_told
+        )
+
+    def stiffness(self) -> dict[str, dict[str, float]]:
+        """A mapping as `PositionCompensator` and the environments take it."""
+        return {
+            joint.joint: {"stiffness": float(f"{joint.stiffness_nm_per_rad:.6g}")}
+            for joint in self.joints
+        }
+
+    def save(self, folder: Path, model: mujoco.MjSpec) -> list[Path]:
+        """Write `identification.json`, `joints.yaml` and `model.xml`."""
+        files = [folder / name for name in ("identification.json", "joints.yaml", "model.xml")]
+        files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        head = "# stiffness [N·m/rad], by elastic identify --geometry; .inf for a rigid joint"
+        lines = [
+            yaml_line(joint.joint, self.stiffness()[joint.joint], _interval(joint))
+            for joint in self.joints
+        ]
+        files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+        files[2].write_text(model.to_xml(), encoding="utf-8")
+        return files
+
+
+def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIdentification:
+    """The result of a fit."""
+    problem = fit.problem
+    told = {estimate.name: estimate for estimate in fit.estimates if estimate.kind == "compliance"}
+    return GeometryIdentification(
+        poses=len(problem.theta),
+        geometry=problem.geometry,
+        lateral=problem.lateral,
+        noise_mm=1e3 * fit.noise_m,
+        joints=tuple(_joint(joint, told.get(joint)) for joint in problem.joints),
+        parameters=tuple(
+            GeometryEstimate(
+                kind=estimate.kind,
+                name=estimate.name,
+                value=estimate.value,
+                half_width=QUANTILE * estimate.deviation,
+                unit=UNITS[estimate.kind],
+                is_told=estimate.is_told,
+            )
+            for estimate in fit.estimates
+        ),
+        held_out=held_out,
+    )
+
+
+def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.MjSpec:
+    """A copy of a model with the identified lengths and angles.
+
+    Encoder offsets are no part of a model: subtract them from what the encoders read.
+
+    Args:
+        spec: Specification of the rigid model.
+        tree: Its links.
+        fit: Lengths and angles by which the frames of the joints differ.
+
+    Raises:
+        ConfigurationError: A body has two hinges.
+    """
+    corrected = spec.copy()
+    model = spec.compile()
+    problem = fit.problem
+    for j, joint in enumerate(problem.joints):
+        body = int(model.joint(joint).bodyid[0])
+        if model.body_jntnum[body] != 1:
+            raise ConfigurationError(
+                f"body {model.body(body).name!r} has {model.body_jntnum[body]} joints; a model with"
+                " identified geometry needs one joint a body"
+            )
+        above = int(model.body_parentid[body])
+        R = tree.R[above]  # from the body above to its link
+        turn = problem.model.nominal[j] @ rotation_of(fit.parameters.angle[j])
+        turn = R.T @ turn @ problem.model.nominal[j].T @ R
+        anchor = R.T @ (problem.model.anchor[j] - tree.place[above])
+        shift = R.T @ problem.model.nominal[j] @ fit.parameters.length[j]
+        own = corrected.body(model.body(body).name)
+        own.pos = anchor + shift + turn @ (model.body_pos[body] - anchor)
+        own.quat = _quaternion(turn @ _matrix(model.body_quat[body]))
+        own.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    return corrected
+
+
+def _joint(joint: str, estimate: Estimate | None) -> JointCompliance:
+    """Stiffness by a compliance; rigid where it is not sought or not above zero."""
+    if estimate is None or estimate.value <= 0.0:
+        return JointCompliance(
+            joint=joint,
+            stiffness_nm_per_rad=math.inf,
+            stiffness_low_nm_per_rad=None,
+            stiffness_high_nm_per_rad=None,
+        )
+    c = estimate.value
+    h = QUANTILE * estimate.deviation
+    return JointCompliance(
+        joint=joint,
+        stiffness_nm_per_rad=1.0 / c,
+        stiffness_low_nm_per_rad=1.0 / (c + h),
+        stiffness_high_nm_per_rad=1.0 / (c - h) if c > h else None,
+    )
+
+
+def _interval(joint: JointCompliance) -> str:
+    """How well a stiffness is known."""
+    if joint.stiffness_low_nm_per_rad is None:
+        return "rigid"
+    high = joint.stiffness_high_nm_per_rad
+    upper = "rigid" if high is None else f"{high:.4g}"
+    return f"{joint.stiffness_low_nm_per_rad:.4g} to {upper}"
+
+
+def _matrix(quaternion: Array) -> Array:
+    flat = np.empty(9)
+    mujoco.mju_quat2Mat(flat, quaternion)
+    return flat.reshape(3, 3)
+
+
+def _quaternion(matrix: Array) -> Array:
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
+    return quaternion

@@ -1,0 +1,310 @@
+"""Geometry together with stiffness: MuJoCo's kinematics, difference quotients, known truth."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from baselines.identification.geometry_fit import (
+    QUANTILE,
+    GeometryProblem,
+    align_tracker,
+    fit_geometry,
+)
+from baselines.identification.geometry_model import GeometryModel, Parameters
+from baselines.identification.geometry_result import correct_model, describe_geometry
+from baselines.identification.holdout import FITTED, HeldOut, HeldOutError, judge, split
+from baselines.identification.pose_log import read_log, write_poses
+from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.rigid.tree.links import Tree
+from train.commands.cli import main
+from train.commands.identify_geometry import verdict
+
+ARM = """<mujoco><worldbody><body name="base" pos="0 0 0.3">
+<joint name="pan" axis="0 0 1" range="-2 2" limited="true"/>
+<geom type="capsule" fromto="0 0 0 0.1 0 0.3" size="0.03" mass="4"/>
+<body name="upper" pos="0.1 0 0.3"><joint name="lift" axis="0 1 0" range="-2 2" limited="true"/>
+<geom type="capsule" fromto="0 0 0 0.4 0.05 0" size="0.03" mass="3"/>
+<body name="fore" pos="0.4 0.05 0" euler="10 20 30">
+<joint name="elbow" axis="0 1 0.2" range="-2 2" limited="true"/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0.1" size="0.02" mass="2"/>
+<site name="hand" pos="0.3 0 0.1"/></body>
+<body name="side" pos="0.2 0.05 0"><joint name="wing" axis="1 0 0" ref="0.3" range="-2 2"
+limited="true"/><geom type="capsule" fromto="0 0 0 0.1 0.3 0.1" size="0.02" mass="1.5"/>
+<site name="tip" pos="0.1 0.3 0.1"/></body></body></body></worldbody></mujoco>"""
+JOINTS = ("pan", "lift", "elbow", "wing")
+SITES = ("hand", "tip")
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+@pytest.fixture(scope="module")
+def tree(model: mujoco.MjModel) -> Tree:
+    return Tree.of(model, JOINTS, {}, gravcomp=True)
+
+
+@pytest.fixture(scope="module")
+def geometry(model: mujoco.MjModel, tree: Tree) -> GeometryModel:
+    places = [(name, int(model.site(name).bodyid[0]), model.site(name).pos) for name in SITES]
+    return GeometryModel.of(tree, model.opt.gravity, places)
+
+
+def draw(seed: int, count: int = 6) -> tuple[np.random.Generator, Array]:
+    """A generator, and angles of poses."""
+    generator = np.random.default_rng(seed)
+    return generator, generator.uniform(-1.2, 1.2, (count, len(JOINTS)))
+
+
+def some_parameters(generator: np.random.Generator) -> Parameters:
+    """Parameters far from nominal ones, with deflections of a tenth of a radian."""
+    return Parameters(
+        translation=0.1 * generator.standard_normal(3),
+        rotation=0.3 * generator.standard_normal(3),
+        marker=0.05 * generator.standard_normal((2, 3)),
+        offset=0.05 * generator.standard_normal(4),
+        length=0.02 * generator.standard_normal((4, 3)),
+        angle=0.05 * generator.standard_normal((4, 3)),
+        compliance=0.004 * np.abs(generator.standard_normal((4, 3))),
+    )
+
+
+def test_a_rigid_nominal_arm_is_mujocos(model: mujoco.MjModel, geometry: GeometryModel) -> None:
+    """Catches a frame, an anchor, a zero angle or a weight that is not where MuJoCo has it."""
+    _, q = draw(0)
+    data = mujoco.MjData(model)
+    nominal = geometry.nominal_parameters()
+    shown = geometry.measured(nominal, q)
+    moments = geometry.moments(geometry.posture(nominal, q))
+    for i, row in enumerate(q):
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        places = [data.site(name).xpos for name in SITES]
+        np.testing.assert_allclose(shown[i], places, atol=1e-12)
+        np.testing.assert_allclose(moments[i, :, 2], -data.qfrc_bias, atol=1e-12)
+
+
+def test_derivatives_are_difference_quotients(geometry: GeometryModel) -> None:
+    """Catches a moment that does not change with a parameter, and a twist about a wrong point."""
+    generator, q = draw(1)
+    parameters = some_parameters(generator)
+    shown, gradient = geometry.gradient(parameters, q)
+    np.testing.assert_array_equal(shown, geometry.measured(parameters, q))
+    for kind, values in parameters._asdict().items():
+        step = 1e-8 if kind == "compliance" else 1e-6
+        for index in np.ndindex(values.shape):
+            more = values.copy()
+            less = values.copy()
+            more[index] += step
+            less[index] -= step
+            change = geometry.measured(parameters._replace(**{kind: more}), q)
+            change = change - geometry.measured(parameters._replace(**{kind: less}), q)
+            own = getattr(gradient, kind)[(..., *index)]
+            size = np.abs(getattr(gradient, kind)).max()
+            np.testing.assert_allclose(own, change / (2.0 * step), atol=1e-7 * size)
+
+
+def test_deflection_about_the_axis_is_that_of_the_elastic_joint(geometry: GeometryModel) -> None:
+    """Eq. 10, q = θ − τ_g(q)/K: catches the sign of the moment."""
+    _, theta = draw(2)
+    nominal = geometry.nominal_parameters()
+    compliance = np.zeros((4, 3))
+    compliance[:, 2] = 1.0 / np.array([400.0, 300.0, 200.0, 100.0])
+    soft = nominal._replace(compliance=compliance)
+    torque = -geometry.moments(geometry.posture(soft, theta))[..., 2]
+    rigid = geometry.measured(nominal, theta - torque * compliance[:, 2])
+    np.testing.assert_allclose(geometry.measured(soft, theta), rigid, atol=1e-9)
+
+
+def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: GeometryModel) -> None:
+    """Catches a correction in the frame of another body."""
+    generator, theta = draw(3)
+    problem = GeometryProblem(
+        geometry, theta, geometry.measured(geometry.nominal_parameters(), theta), JOINTS, "full"
+    )
+    x = problem.unknowns.prior * generator.standard_normal(len(problem.unknowns.prior))
+    fit = fit_geometry(problem)
+    fit = type(fit)(problem, x, fit.covariance, fit.noise_m)
+    own = fit.parameters
+    corrected = correct_model(mujoco.MjSpec.from_string(ARM), tree, fit).compile()
+    data = mujoco.MjData(corrected)
+    unmoved = own._replace(marker=np.zeros_like(own.marker))
+    places = geometry.posture(unmoved, theta).marker
+    for i, row in enumerate(theta):
+        data.qpos[:] = row - own.offset
+        mujoco.mj_kinematics(corrected, data)
+        np.testing.assert_allclose([data.site(name).xpos for name in SITES], places[i], atol=1e-12)
+
+
+def made_up(
+    geometry: GeometryModel, seed: int, count: int, noise_m: float, **options: object
+) -> tuple[GeometryProblem, Array]:
+    """Poses of an arm whose parameters are drawn from their priors, and those parameters."""
+    generator, theta = draw(seed, count)
+    blank = np.zeros((count, len(SITES), 3))
+    problem = GeometryProblem(geometry, theta, blank, JOINTS, elastic=JOINTS, **options)  # type: ignore[arg-type]
+    prior = problem.unknowns.prior
+    truth = prior * generator.standard_normal(len(prior))
+    own = problem.unknowns.part("compliance")
+    truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
+    shown = geometry.measured(problem.parameters(truth), theta)
+    measured = shown + noise_m * generator.standard_normal(blank.shape)
+    return GeometryProblem(geometry, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("options", [{"geometry": "dh"}, {"geometry": "full", "lateral": True}])
+def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, object]) -> None:
+    """Of 95 % in at least 90 %: catches a wrong covariance, and a noise that is not estimated."""
+    held = []
+    for seed in range(12):
+        problem, truth = made_up(geometry, seed, count=30, noise_m=5e-4, **options)
+        fit = fit_geometry(problem)
+        assert fit.noise_m == pytest.approx(5e-4, rel=0.25)
+        own = QUANTILE * np.sqrt(np.diag(fit.covariance))
+        held.append(np.abs(fit.x - truth) < own)
+    assert np.mean(held) > 0.9
+
+
+def test_what_poses_do_not_tell_keeps_its_prior_and_is_named(geometry: GeometryModel) -> None:
+    """The first joint's height is the tracker's: catches a parameter that runs away."""
+    problem, _ = made_up(geometry, 0, count=30, noise_m=5e-4, geometry="dh")
+    result = describe_geometry(fit_geometry(problem), None)
+    assert "pan.z length" in result.kept
+    height = next(p for p in result.parameters if (p.kind, p.name) == ("length", "pan.z"))
+    assert abs(height.value) < 2e-3
+
+
+def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
+    """Catches an identification whose held-out error hangs on assumed masses, as K may."""
+    problem, _ = made_up(geometry, 4, count=60, noise_m=5e-4, geometry="dh")
+    parts = split(60, share=0.5, folds=1, seed=0)
+    errors = []
+    for scale in (0.6, 1.0, 1.6):
+        scaled = GeometryModel(
+            **{
+                **geometry.__dict__,
+                "weight": scale * geometry.weight,
+                "weight_moment": scale * geometry.weight_moment,
+            }
+        )
+        own = GeometryProblem(scaled, problem.theta, problem.measured, JOINTS, "dh", JOINTS)
+        errors.append(judge(own, parts, 0, lambda done: None).errors[-1].rms_mm)
+    assert np.ptp(errors) < 0.1 * errors[1]
+
+
+def test_rivals_learn_what_they_can() -> None:
+    """Catches a rival that is weaker than its name."""
+    generator = np.random.default_rng(0)
+    angles = generator.uniform(-1.0, 1.0, (80, 3))
+    others = generator.uniform(-1.0, 1.0, (40, 3))
+    straight = np.array([[1.0, 2.0, -1.0], [0.5, 0.0, 3.0]]).T
+    np.testing.assert_allclose(
+        predict_linear(angles, 2.0 + angles @ straight, others), 2.0 + others @ straight, atol=1e-9
+    )
+    np.testing.assert_allclose(predict_constant(angles, np.full((80, 2), 3.0), others), 3.0)
+
+    def curved(q: Array) -> Array:
+        return np.stack([np.sin(2.0 * q[:, 0]) * np.cos(q[:, 1]), q[:, 2] ** 2], axis=1)
+
+    left = {
+        name: np.abs(predict(angles, curved(angles), others) - curved(others)).mean()
+        for name, predict in (("linear", predict_linear), ("kernel", predict_by_kernel))
+    }
+    assert left["kernel"] < 0.2 * left["linear"]
+
+
+@pytest.mark.parametrize(
+    ("own", "first"), [(5.0, "held out: 18.00 mm"), (17.0, "kernel regression is ahead")]
+)
+def test_a_rival_that_is_ahead_comes_first(own: float, first: str) -> None:
+    """Catches a table that hides that regression does better."""
+    errors = [("rigid", 18.0), ("kernel regression", 16.0), (FITTED, own)]
+    held_out = HeldOut(
+        poses=10,
+        held_out=10,
+        errors=tuple(
+            HeldOutError(name=name, rms_mm=rms, mean_mm=rms, worst_mm=rms) for name, rms in errors
+        ),
+        curve=(),
+    )
+    assert verdict(held_out).startswith(first)
+
+
+def log_of(folder: Path, problem: GeometryProblem) -> Path:
+    """The poses as a user's log."""
+    columns = {f"theta.{name}": problem.theta[:, j] for j, name in enumerate(JOINTS)}
+    for k, site in enumerate(SITES):
+        columns |= {
+            f"marker.{site}.{axis}": problem.measured[:, k, i] for i, axis in enumerate("xyz")
+        }
+    return write_poses(folder / "poses.csv", columns)
+
+
+def test_the_command_identifies_and_its_files_hold(
+    geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From a log of two markers to a model that is better at unused poses."""
+    problem, _ = made_up(geometry, 7, count=60, noise_m=3e-4, geometry="dh")
+    model = tmp_path / "arm.xml"
+    model.write_text(ARM)
+    log = log_of(tmp_path, problem)
+    out = tmp_path / "out"
+    asked = ["identify", "--robot", str(model), "--log", str(log), "--geometry", "dh"]
+    assert main([*asked, "--output", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "held out" in said
+    assert "keep their prior" in said
+    files = {path.name for path in out.iterdir()}
+    assert {"identification.json", "joints.yaml", "model.xml", "identification.png"} <= files
+    assert mujoco.MjModel.from_xml_path(str(out / "model.xml")).njnt == len(JOINTS)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (["marker.hand.x", "marker.hand.y"], r"needs the columns marker\.NAME\.x, \.y and \.z"),
+        (["marker.x", "marker.y", "marker.z"], r"needs the columns marker\.NAME\.x, \.y and \.z"),
+    ],
+)
+def test_a_marker_has_three_columns(tmp_path: Path, columns: list[str], message: str) -> None:
+    """Catches a marker whose height is missing."""
+    path = write_poses(
+        tmp_path / "poses.csv",
+        {"theta.pan": np.linspace(0.0, 1.0, 5), **{name: np.zeros(5) for name in columns}},
+    )
+    with pytest.raises(ConfigurationError, match=message):
+        read_log(path, {"pan": (-2.0, 2.0)})
+
+
+def test_too_few_poses_for_a_split_are_said() -> None:
+    """Catches an error of two poses that looks like evidence."""
+    with pytest.raises(ConfigurationError, match=r"12 poses leave 4 .*--holdout 0"):
+        split(12, share=0.3, folds=1, seed=0)
+
+
+def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
+    """A tracker that is turned by half a turn: catches steps from a wrong side."""
+    _, theta = draw(5, 20)
+    turned = geometry.nominal_parameters()._replace(
+        rotation=np.array([0.0, 0.0, 3.0]), translation=np.array([1.0, -2.0, 0.5])
+    )
+    measured = geometry.measured(turned, theta)
+    own = align_tracker(geometry, theta, measured)
+    shown = own.measured(own.nominal_parameters(), theta)
+    np.testing.assert_allclose(shown, measured, atol=1e-9)
+
+
+def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
+    """Catches a pose that is fitted and judged, and a curve over other poses."""
+    problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4)
+    parts = split(40, share=0.3, folds=4, seed=0)
+    assert sorted(np.concatenate(parts)) == list(range(40))
+    held_out = judge(problem, parts, 0, lambda done: None)
+    assert held_out.held_out == 40
+    assert held_out.is_ahead
+    assert [point.poses for point in held_out.curve] == [15, 30]

@@ -1,0 +1,194 @@
+"""`elastic identify --geometry`: encoders, geometry and stiffness of an arm from markers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from rich import box
+from rich.console import Console
+
+from baselines.identification.geometry_fit import (
+    GeometryPriors,
+    GeometryProblem,
+    align_tracker,
+    fit_geometry,
+)
+from baselines.identification.geometry_model import Geometry, GeometryModel
+from baselines.identification.geometry_result import (
+    GeometryIdentification,
+    correct_model,
+    describe_geometry,
+)
+from baselines.identification.holdout import HeldOut, judge, num_fits, split
+from baselines.identification.pose_log import PoseLog
+from baselines.identification.static_arm import place_of
+from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.errors import list_names, unknown_name
+from elastic_env.rigid.tree.links import Tree
+from train.figures.geometry_plots import draw_geometry
+from train.runs.console import make_table
+from train.runs.folders import run_folder
+from train.runs.progress import show_progress
+
+
+class GeometryOptions(Model):
+    """Options of `elastic identify` for a log of markers, of which the geometry is sought too."""
+
+    geometry: Geometry | None = None
+    """Seek encoder offsets, the parameters of Denavit and Hartenberg (dh), or all lengths and
+    angles (full), together with K; default offsets for a log of markers.
+    """
+    lateral: bool = False
+    """Seek the compliance of bearings and links across the axes too."""
+    holdout: float = quantity("1", 0.3, ge=0, lt=1)
+    """Share of the poses that is not fitted, and predicted beside rivals; 0 for none."""
+    folds: int = quantity("1", 1, ge=1, le=20)
+    """Hold each pose out once, in so many folds."""
+    free: tuple[Title, ...] = ()
+    """Joints whose frame the model only guesses: it may be off by a metre and a radian."""
+    priors: GeometryPriors = GeometryPriors()
+
+
+def identify_geometry(
+    options: GeometryOptions,
+    spec: mujoco.MjSpec,
+    log: PoseLog,
+    elastic: Sequence[str],
+    end_effector: str,
+    console: Console,
+    seed: int = 0,
+    output: Path | None = None,
+) -> GeometryIdentification:
+    """Identify geometry and stiffness, write files and figure, print tables.
+
+    Args:
+        options: What is sought.
+        spec: Specification of the rigid model.
+        log: Poses with places of markers.
+        elastic: Joints whose stiffness is sought.
+        end_effector: Site or body that is measured, where the log names no markers.
+        console: Where progress and tables go.
+        seed: Seed of the poses that are held out.
+        output: Folder for the results; default runs/identify, numbered if taken.
+
+    Raises:
+        ConfigurationError: A name does not exist, or there are too few poses.
+        ElasticError: The poses do not fit the arm.
+    """
+    model = spec.compile()
+    problem, tree = pose_problem(options, model, log, elastic, end_effector)
+    parts = split(len(log), options.holdout, options.folds, seed) if options.holdout else []
+    recorded = {**options.model_dump(mode="json"), "seed": seed}
+    with run_folder("identify", recorded, seed, output) as folder:
+        total = 1 + (num_fits(problem, parts) if parts else 0)
+        with show_progress(console, {"fits": total}, transient=True) as show:
+            held_out = judge(problem, parts, seed, lambda done: show(0, done)) if parts else None
+            fit = fit_geometry(problem)
+            show(0, total)
+        result = describe_geometry(fit, held_out)
+        files = result.save(folder, correct_model(spec, tree, fit))
+        files.append(draw_geometry(result, folder / "identification.png"))
+    show_result(result, console)
+    for path in files:
+        console.print(f"wrote {path}", soft_wrap=True)
+    return result
+
+
+def pose_problem(
+    options: GeometryOptions,
+    model: mujoco.MjModel,
+    log: PoseLog,
+    elastic: Sequence[str],
+    end_effector: str,
+) -> tuple[GeometryProblem, Tree]:
+    """The poses of a log as a problem, and the links of the model."""
+    for joint in options.free:
+        if joint not in log.joints:
+            raise unknown_name("joint of the log", joint, log.joints)
+    held = {
+        model.joint(j).name: float(model.qpos0[model.jnt_qposadr[j]])
+        for j in range(model.njnt)
+        if model.joint(j).name not in log.joints
+    }
+    tree = Tree.of(model, log.joints, held, gravcomp=True)
+    names = [end_effector]
+    if log.kind == "markers":
+        names = [column.removesuffix(".x") for column in log.columns[::3]]
+    markers = [(name, *place_of(model, name)) for name in names]
+    measured = log.measured.reshape(len(log), len(names), 3)
+    geometry = align_tracker(
+        GeometryModel.of(tree, model.opt.gravity, markers), log.theta, measured
+    )
+    problem = GeometryProblem(
+        model=geometry,
+        theta=log.theta,
+        measured=measured,
+        joints=log.joints,
+        geometry=options.geometry or "offsets",
+        elastic=tuple(elastic),
+        lateral=options.lateral,
+        priors=options.priors,
+        free=options.free,
+    )
+    return problem, tree
+
+
+def show_result(result: GeometryIdentification, console: Console) -> None:
+    """Print held-out errors, stiffness, and what the poses do not tell."""
+    if result.held_out is not None:
+        console.print(verdict(result.held_out), highlight=False)
+        rows = [
+            [
+                error.name,
+                *(f"{value:.2f}" for value in (error.rms_mm, error.mean_mm, error.worst_mm)),
+            ]
+            for error in result.held_out.errors
+        ]
+        title = f"error of markers at {result.held_out.held_out} poses that were held out"
+        console.print(
+            make_table(title, ["prediction", "rms [mm]", "mean", "worst"], rows, box=box.SIMPLE)
+        )
+        points = ", ".join(
+            f"{point.poses} poses {point.rms_mm:.1f} mm" for point in result.held_out.curve
+        )
+        console.print(f"by the number of poses: {points}", highlight=False)
+    rows = [
+        [
+            joint.joint,
+            "rigid"
+            if np.isinf(joint.stiffness_nm_per_rad)
+            else f"{joint.stiffness_nm_per_rad:.4g}",
+            _number(joint.stiffness_low_nm_per_rad),
+            _number(joint.stiffness_high_nm_per_rad),
+        ]
+        for joint in result.joints
+    ]
+    title = f"K [N·m/rad] from {result.poses} poses; markers within {result.noise_mm:.2f} mm"
+    console.print(make_table(title, ["joint", "K", "from", "to"], rows, box=box.SIMPLE))
+    if result.kept:
+        console.print(
+            f"{len(result.kept)} of {len(result.parameters)} parameters keep their prior, as the"
+            f" poses do not tell them: {list_names(result.kept)}",
+            highlight=False,
+        )
+
+
+def verdict(held_out: HeldOut) -> str:
+    """Held-out errors in a sentence; a rival that is ahead comes first."""
+    rigid = held_out.errors[0]
+    own = held_out.errors[-1]
+    rival = held_out.best_rival
+    if held_out.is_ahead:
+        return (
+            f"held out: {rigid.rms_mm:.2f} mm rms as given, {own.rms_mm:.2f} mm identified;"
+            f" the best of the rest, {rival.name}, reaches {rival.rms_mm:.2f} mm"
+        )
+    return (
+        f"{rival.name} is ahead: {rival.rms_mm:.2f} mm rms at held-out poses, where the"
+        f" identification has {own.rms_mm:.2f} mm: use that, or log more poses"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

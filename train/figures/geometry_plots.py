@@ -1,0 +1,61 @@
+"""Figure of an identification with geometry: held-out errors, the curve over poses, stiffness."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.identification.geometry_result import GeometryIdentification
+from baselines.identification.holdout import HeldOut
+from train.figures.plots import require_matplotlib, save
+
+_OWN = "#2a6f97"
+_OTHER = "#9aa5b1"
+_HEIGHT = 3.4
+_ROW = 0.24
+
+
+def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
+    """Held-out errors beside rivals, the error over the number of poses, K of each joint."""
+    plt = require_matplotlib()
+    shown = [joint for joint in result.joints if np.isfinite(joint.stiffness_nm_per_rad)]
+    panels = 1 if result.held_out is None else 3
+    height = max(_HEIGHT, _ROW * len(shown) + 1.2)
+    figure, axes = plt.subplots(1, panels, figsize=(4.3 * panels, height), squeeze=False)
+    if result.held_out is not None:
+        _draw_errors(axes[0, 0], result.held_out)
+        _draw_curve(axes[0, 1], result.held_out)
+    axis = axes[0, -1]
+    axis.set_title("K [N·m/rad] with 95 % intervals")
+    for row, joint in enumerate(shown):
+        low = joint.stiffness_low_nm_per_rad
+        high = joint.stiffness_high_nm_per_rad
+        K = joint.stiffness_nm_per_rad
+        axis.plot([low or K, high or 10.0 * K], [row, row], color=_OTHER, lw=2.5)
+        axis.plot(K, row, "o", color=_OWN, ms=5)
+    axis.set_yticks(range(len(shown)), [joint.joint for joint in shown], fontsize=8)
+    axis.set_xscale("log")
+    axis.invert_yaxis()
+    figure.tight_layout()
+    return save(figure, path)
+
+
+def _draw_errors(axis: Any, held_out: HeldOut) -> None:
+    names = [error.name for error in held_out.errors]
+    values = [error.rms_mm for error in held_out.errors]
+    colours = [_OTHER] * (len(names) - 1) + [_OWN]
+    bars = axis.barh(names, values, color=colours)
+    axis.bar_label(bars, [f"{value:.2f}" for value in values], padding=3, fontsize=9)
+    axis.set_xlim(0.0, 1.18 * max(values))
+    axis.invert_yaxis()
+    axis.set_title(f"held-out error, rms [mm]\n{held_out.held_out} poses")
+
+
+def _draw_curve(axis: Any, held_out: HeldOut) -> None:
+    poses = [point.poses for point in held_out.curve]
+    axis.plot(poses, [point.rms_mm for point in held_out.curve], "o-", color=_OWN)
+    axis.axhline(held_out.errors[0].rms_mm, color=_OTHER, lw=1.0, ls="--")
+    axis.text(poses[0], held_out.errors[0].rms_mm, "rigid, as given", fontsize=8, va="bottom")
+    axis.set_ylim(bottom=0.0)
+    axis.set_xlabel("poses that were fitted")
+    axis.set_title("identified: rms [mm] over poses")
