@@ -8,15 +8,13 @@ with the noise σ of the residuals, estimated with x, and Gaussian priors in the
 manufacture. A prior is what is known before the poses: lengths to millimetres, angles to a fraction
 of a degree. Where the poses do not tell a parameter it keeps its prior, and is named. Intervals are
 of the posterior at the solution: ±1.96 standard deviations.
-
-Steps are those of Levenberg and Marquardt, in units of the derivatives.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from baselines.identification.geometry_model import Geometry, GeometryModel, Parameters
@@ -24,10 +22,10 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array, IntArray
 
-_MOST_STEPS = 60
-_DAMPING = 1e-4
-_MOST_DAMPING = 1e8
-_SETTLED = 1e-6
+_MOST_EVALUATIONS = 400
+_LOST_M = 10.0
+"""Error of a marker that counts where there is no posture at rest [m]."""
+_SETTLED = 1e-8
 """Relative change of the sum of squares below which it is least."""
 _FIRST_NOISE_M = 3e-3
 _NOISE_ROUNDS = 3
@@ -37,7 +35,6 @@ _TOLD = 0.9
 _FEWEST_POSES = 2
 _NOTHING = 1e-9
 """Prior of what counts as known."""
-_LEAST_DAMPING = 1e-12
 _SMALLEST_MOMENT = 1e-3
 """Share of the largest moment in the arm that a joint is taken to carry at least."""
 QUANTILE = 1.96
@@ -275,14 +272,11 @@ class GeometryFit:
         return np.linalg.norm(self.missed(problem), axis=-1)
 
 
-def fit_geometry(
-    problem: GeometryProblem, progress: Callable[[int], None] | None = None
-) -> GeometryFit:
+def fit_geometry(problem: GeometryProblem) -> GeometryFit:
     """Fit the unknowns of poses.
 
     Args:
         problem: The poses and what is sought.
-        progress: Called with the number of steps so far.
 
     Raises:
         ConfigurationError: Fewer than two poses.
@@ -294,9 +288,8 @@ def fit_geometry(
         )
     x = np.zeros(len(problem.unknowns.prior))
     noise = _FIRST_NOISE_M
-    steps = 0
     for _ in range(_NOISE_ROUNDS):
-        x, steps = _least(problem, x, noise, steps, progress)
+        x = _least(problem, x, noise)
         residual, _ = problem.linearised(x)
         used = len(x) - float(np.trace(_covariance(problem, x, noise)))
         spread = np.sqrt(residual @ residual / max(len(residual) - used, 1.0))
@@ -312,50 +305,40 @@ def _covariance(problem: GeometryProblem, x: Array, noise: float) -> Array:
     return np.linalg.inv(rows.T @ rows + np.eye(len(x)))
 
 
-def _least(
-    problem: GeometryProblem,
-    x: Array,
-    noise: float,
-    steps: int,
-    progress: Callable[[int], None] | None,
-) -> tuple[Array, int]:
-    """Unknowns of the least sum of squares, and steps so far."""
+def _least(problem: GeometryProblem, x: Array, noise: float) -> Array:
+    """Unknowns of the least sum of squares, from x on.
+
+    Raises:
+        ElasticError: They are not found.
+    """
     prior = problem.unknowns.prior
-    damping = _DAMPING
 
-    def total(x: Array, residual: Array) -> float:
-        return float(residual @ residual / noise**2 + np.sum((x / prior) ** 2))
+    def residual(z: Array) -> Array:
+        try:
+            missed = problem.residual(prior * z) / noise
+        except ElasticError:  # a posture that no spring holds: the solver takes a shorter step
+            missed = np.full(problem.measured.size, _LOST_M / noise)
+        return np.concatenate([missed, z])
 
-    residual, gradient = problem.linearised(x)
-    best = total(x, residual)
-    for _ in range(_MOST_STEPS):
-        steps += 1
-        if progress is not None:
-            progress(steps)
-        rows = gradient * prior / noise
-        slope = rows.T @ residual / noise + x / prior
-        matrix = rows.T @ rows + np.eye(len(x))
-        size = np.sqrt(np.diag(matrix))
-        while True:
-            damped = matrix / np.outer(size, size) + damping * np.eye(len(x))
-            tried = x - prior * np.linalg.solve(damped, slope / size) / size
-            try:
-                found = total(tried, problem.residual(tried))
-            except ElasticError:
-                found = np.inf
-            if found <= best or damping > _MOST_DAMPING:
-                break
-            damping *= 10.0
-        if not found < best * (1.0 - _SETTLED):
-            return (tried if found <= best else x), steps
-        x = tried
-        best = found
-        residual, gradient = problem.linearised(x)
-        damping = max(damping / 10.0, _LEAST_DAMPING)
-    raise ElasticError(
-        f"the fit of the geometry did not converge in {_MOST_STEPS} steps; check the units of the"
-        " log's columns and the model"
+    def jacobian(z: Array) -> Array:
+        _, gradient = problem.linearised(prior * z)
+        return np.concatenate([gradient * prior / noise, np.eye(len(z))])
+
+    found = least_squares(
+        residual,
+        x / prior,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]  a callable is meant to be here
+        method="lm",
+        x_scale="jac",
+        ftol=_SETTLED,
+        max_nfev=_MOST_EVALUATIONS,
     )
+    if not found.success:
+        raise ElasticError(
+            f"the fit of the geometry did not converge in {_MOST_EVALUATIONS} steps; check the"
+            " units of the log's columns and the model"
+        )
+    return prior * found.x
 
 
 def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> GeometryModel:

@@ -14,6 +14,7 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.arm_result import ArmIdentification
+from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.identify import Identification, identify
 from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -72,7 +73,9 @@ class Identify(Model):
             )
         return self
 
-    def run(self, console: Console) -> list[Identification] | ArmIdentification | None:
+    def run(
+        self, console: Console
+    ) -> list[Identification] | ArmIdentification | GeometryIdentification | None:
         """Identify the testbed, simulated or real, or an arm; write `identification.json` and the
         figure.
 
