@@ -13,7 +13,6 @@ from scipy import linalg
 from elastic_env.core.signals import Array
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_chains import LegLoads
 from elastic_env.rigid.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
@@ -33,18 +32,13 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
         unstable.
     """
     q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
-    legs = biped.chains.posture(q.reshape(2, -1))
-    carried = np.full(2, biped.chains.mass / 2.0)
-    torque = (
-        LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3)))
-        .torque()
-        .ravel()
-    )
-    theta = q + torque / stiffness
+    gravity = np.array([0.0, 0.0, -biped.gravity])
+    loads = biped.chains.loads(1, gravity, mass=-biped.chains.mass / 2.0)
+    theta = q + biped.chains.torque(loads, q[None])[0] / stiffness
 
     def potential(x: Array) -> Array:
         angles = _angles(biped, pelvis, x)
-        com = biped.chains.center_of_mass(angles.reshape(len(x), 2, -1))
+        com = biped.chains.center_of_mass(angles)
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
         return 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1) + biped.weight * height
 

@@ -18,7 +18,6 @@ from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_chains import LegLoads
 
 _COM_TOLERANCE_M = 1e-10
 _MAX_ITERATIONS = 50
@@ -190,9 +189,7 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Arra
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
-    com = pelvis + biped.chains.center_of_mass(
-        _angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1)
-    )
+    com = pelvis + biped.chains.center_of_mass(_angles(biped, pelvis, ankles[None], np.zeros(1)))
     return pelvis[0], float(com[0, 2])
 
 
@@ -204,7 +201,7 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: A
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
         q = _angles(biped, pelvis, ankles, time)
-        error = pelvis[:, :2] + biped.chains.center_of_mass(q.reshape(len(q), 2, -1))[:, :2] - com
+        error = pelvis[:, :2] + biped.chains.center_of_mass(q)[:, :2] - com
         pelvis[:, :2] -= error
         if np.abs(error).max() < _COM_TOLERANCE_M:
             return pelvis
@@ -278,10 +275,9 @@ def _joint_torque(
     moments = np.zeros_like(forces)
     moments[..., 2] = weights * dynamics.moment[:, None]
     arms = points - ankles
-    legs = biped.chains.posture(q.reshape(len(q), 2, -1))
     # soles and pelvis are level: the feet's frames are parallel to the world's
-    contact = LegLoads(legs, wrench=(forces, np.cross(arms, forces) + moments))
-    return dynamics.torque + contact.torque().reshape(len(q), -1)
+    contact = biped.chains.loads(len(q), wrench=(forces, np.cross(arms, forces) + moments))
+    return dynamics.torque + biped.chains.torque(contact, q)
 
 
 def _require(

@@ -40,7 +40,13 @@ class Biped:
     @cached_property
     def chains_above_feet(self) -> LegChains:
         """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
-        return LegChains(self.rigid, self._legs, feet_weigh=False)
+        return LegChains(self.rigid, self._legs, weightless=self.feet)
+
+    @cached_property
+    def weightless_chains(self) -> LegChains:
+        """The legs as if all mass were in the pelvis."""
+        bodies = [int(self.rigid.joint(name).bodyid[0]) for name in self.joint_names]
+        return LegChains(self.rigid, self._legs, weightless=bodies)
 
     @cached_property
     def feet(self) -> list[int]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.rigid import leg_kernels as kernels
+from elastic_env.rigid.tree import kernels
 
 JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 """Joints of a leg, from the hip to the foot."""

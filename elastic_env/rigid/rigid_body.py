@@ -14,13 +14,18 @@ from elastic_env.rigid.tree.links import Tree
 
 
 class RigidBody:
-    """A fixed-base tree of hinges, on (..., n) joint angles in a chosen order.
+    r"""What the links of a fixed-base tree of hinges ask of the joints that move them, on (..., n)
+    joint angles in a chosen order.
+
+    .. math:: \tau = M \ddot q + c(q, \dot q) + \tau_g(q) - \tau_{gravcomp}(q) + k_s (q - q_s)
+
+    k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and
+    friction of the model are not in it.
 
     Args:
         model: Compiled rigid model.
         joints: Hinges of the model, in the order of the last axis.
         held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
-        gravcomp: Whether `gravcomp` of the bodies takes from their weight.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
@@ -31,36 +36,37 @@ class RigidBody:
         model: mujoco.MjModel,
         joints: Sequence[str],
         held: Mapping[str, float] | Mapping[int, float] | None = None,
-        gravcomp: bool = False,
     ) -> None:
         held = held or {}
         require_hinge_tree(model, joints, but=list(held))
-        self._tree = Tree.of(model, joints, held, gravcomp)
+        self._tree = Tree.of(model, joints, held)
         self._links: Any = self._tree.links
-        self._gravity = model.opt.gravity.copy()
+        self._loads: Any = np.zeros(1, kernels.loads_type(0))
+        self._loads["gravity"] = model.opt.gravity
         self._n = len(joints)
-        self._lanes: Any = np.zeros(len(self._links), kernels.LANES)
+        at = [int(model.joint(name).id) for name in joints]
+        self._spring = model.jnt_stiffness[at].copy()
+        self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
+        self._has_springs = bool(self._spring.any())
         compile_now(
             self._compile, np.zeros((1, len(joints)))
         )  # the first command of a live robot cannot wait
 
     def gravity_torque(self, q: Array) -> Array:
-        """τ_g that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
+        """Torque that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
         rows = self._rows(q)
         torque = np.empty(q.shape)
-        kernels.gravity_torques(
-            self._links, self._gravity, rows, self._lanes, torque.reshape(rows.shape)
-        )
-        return torque
+        kernels.gravity_torques(self._links, self._loads, rows, torque.reshape(rows.shape))
+        return self._with_springs(torque, q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         rows = self._rows(q)
         n = self._n
-        gradient = np.zeros((*q.shape, n))
-        kernels.gravity_gradients(
-            self._links, self._gravity, rows, self._lanes, gradient.reshape(len(rows), n, n)
-        )
+        gradient = np.empty((*q.shape, n))
+        kernels.gravity_gradients(self._links, self._loads, rows, gradient.reshape(len(rows), n, n))
+        if self._has_springs:
+            np.einsum("...ii->...i", gradient)[...] += self._spring
         return gradient
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
@@ -74,10 +80,8 @@ class RigidBody:
             )
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
         torque = np.empty(q.shape)
-        kernels.inverse_dynamics(
-            self._links, self._gravity, motion, self._lanes, torque.reshape(motion[0].shape)
-        )
-        return torque
+        kernels.inverse_dynamics(self._links, self._loads, motion, torque.reshape(motion[0].shape))
+        return self._with_springs(torque, q)
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
         """Let a body carry one point mass, in the place of the last one.
@@ -88,6 +92,9 @@ class RigidBody:
             place: In the frame of the body, (3,) [m].
         """
         self._links = self._tree.loaded(body, mass, place)
+
+    def _with_springs(self, torque: Array, q: Array) -> Array:
+        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
 
     def _rows(self, values: Array) -> Array:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
@@ -103,6 +110,11 @@ class RigidBody:
         self.gravity_torque(zero)
         self.gravity_gradient(zero)
         self.inverse_dynamics(zero, zero, zero)
+
+
+def needs_more_than_gravity(model: mujoco.MjModel) -> bool:
+    """True where springs of joints or `gravcomp` act on the links of a model."""
+    return bool(model.jnt_stiffness.any() or model.body_gravcomp.any())
 
 
 def require_hinge_tree(

@@ -35,7 +35,7 @@ class EndEffector:
         held: Mapping[str, float] | None = None,
     ) -> None:
         self.body, self.place, R = _found(model, name)
-        tree = Tree.of(model, joints, held or {}, gravcomp=False)
+        tree = Tree.of(model, joints, held or {})
         self._chain = _chain(tree, self.body)
         if len(self._chain) < 2:
             raise ConfigurationError(
