@@ -149,27 +149,19 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     of_walk = np.clip((since - 1) // period, 0, gait.num_steps - 1)
     within = since - of_walk * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
-    lift_offs = np.arange(gait.num_steps) * period + first
-    events = np.concatenate([lift_offs, lift_offs + single])
-    nearest = _distance(since, np.sort(events))
+    around = int((TRANSITION_S + 1e-9) / control_period_s)
+    transition = np.zeros(len(time), dtype=np.bool_)
+    for lift_off in begin + np.arange(gait.num_steps) * period + first:
+        for event in (lift_off, lift_off + single):
+            transition[event - around : event + around + 1] = True
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
         support=of_walk % 2,
         single=(within > 0) & (within < single),
         swing=swing,
-        transition=walking & (nearest * control_period_s <= TRANSITION_S + 1e-9),
+        transition=walking & transition,
         walking=walking,
-    )
-
-
-def _distance(steps: IntArray, events: IntArray) -> IntArray:
-    """Control steps from each step to the nearest of some events in order, (T,)."""
-    after = np.searchsorted(events, steps)
-    last = len(events) - 1
-    return np.minimum(
-        np.abs(steps - events[np.minimum(after, last)]),
-        np.abs(steps - events[np.maximum(after - 1, 0)]),
     )
 
 

@@ -102,21 +102,21 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     share = load_share(zmp, support_points(gait, biped.footholds))
     torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
-        gait,
-        timing,
-        q,
-        q_dot,
-        q_ddot,
-        zmp,
-        dynamics.zmp,
-        motion.com,
-        motion.com_dot,
-        com_height,
-        biped.gravity,
-        pelvis,
-        ankles,
-        share,
-        torque,
+        gait=gait,
+        timing=timing,
+        q=q,
+        q_dot=q_dot,
+        q_ddot=q_ddot,
+        zmp=zmp,
+        zmp_of_motion=dynamics.zmp,
+        com=motion.com,
+        com_dot=motion.com_dot,
+        com_height=com_height,
+        gravity=biped.gravity,
+        pelvis=pelvis,
+        ankles=ankles,
+        share=share,
+        torque=torque,
     )
 
 
@@ -138,24 +138,23 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
     """
     joints = [biped.rigid.joint(name) for name in biped.joint_names]
     low, high = np.array([joint.range for joint in joints]).T
-    _require(plan, biped, -plan.q, -low, "an angle of at least", "rad", sign=-1.0)
-    _require(plan, biped, plan.q, high, "an angle of at most", "rad")
-    _require(
-        plan,
-        biped,
-        np.abs(plan.q_dot),
-        np.array([s.speed_limit for s in servos]),
-        "a speed of at most",
-        "rad/s",
-    )
-    _require(
-        plan,
-        biped,
-        np.abs(plan.torque),
-        np.array([s.torque_limit for s in servos]),
-        "at most",
-        "N·m",
-    )
+    speed = np.array([servo.speed_limit for servo in servos])
+    torque = np.array([servo.torque_limit for servo in servos])
+    for needed, allowed, sign, what, unit in (
+        (-plan.q, -low, -1.0, "an angle of at least", "rad"),
+        (plan.q, high, 1.0, "an angle of at most", "rad"),
+        (np.abs(plan.q_dot), speed, 1.0, "a speed of at most", "rad/s"),
+        (np.abs(plan.torque), torque, 1.0, "at most", "N·m"),
+    ):
+        excess = needed - allowed
+        row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[row, joint] > 0.0:
+            raise ConfigurationError(
+                f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
+                f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * allowed[joint]:.3f}"
+                f" {unit}, the plan needs {sign * needed[row, joint]:.3f} {unit}; use longer"
+                " durations, a lower lift or another hip height"
+            )
 
 
 def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
@@ -238,8 +237,8 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Dynamics:
-    """What a motion needs of the ground, (T, ...): force, its ZMP, its moment about the
-    vertical; and of the joints.
+    """Force, its ZMP and its moment about the vertical that a motion needs of the ground, and the
+    torque of the joints, (T, ...) each.
     """
 
     force: Array
@@ -278,23 +277,3 @@ def _joint_torque(
     # soles and pelvis are level: the feet's frames are parallel to the world's
     contact = biped.chains.loads(len(q), wrench=(forces, np.cross(arms, forces) + moments))
     return dynamics.torque + biped.chains.torque(contact, q)
-
-
-def _require(
-    plan: WalkPlan,
-    biped: Biped,
-    values: Array,
-    bound: Array,
-    what: str,
-    unit: str,
-    sign: float = 1.0,
-) -> None:
-    excess = values - bound
-    row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
-    if excess[row, joint] > 0.0:
-        raise ConfigurationError(
-            f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
-            f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * bound[joint]:.3f} {unit},"
-            f" the plan needs {sign * values[row, joint]:.3f} {unit}; use longer durations, a lower"
-            " lift or another hip height"
-        )
