@@ -7,10 +7,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.compiled import compile_now, compiled
+from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.rigid.tree.kernels import LINK
+from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Tree
 
 
@@ -94,7 +94,7 @@ class EndEffector:
         count = len(rows)
         hinges = len(self._chain) - 1
         made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
-        walk(self._chain, rows, *made)
+        kernels.poses(self._chain, rows, *made)
         return tuple(made)
 
 
@@ -139,56 +139,4 @@ def _chain(tree: Tree, body: int) -> Any:
     while link > 0:
         path.insert(0, link)
         link = int(tree.links[link]["parent"])
-    return np.concatenate([tree.links[path], np.zeros(1, LINK)])
-
-
-@compiled
-def walk(
-    chain: Any, q: Array, position: Array, orientation: Array, axes: Array, anchors: Array
-) -> None:
-    """Poses of a chain of hinges, a row after the other.
-
-    Args:
-        chain: Rows of `LINK`, each in the frame of the one before it; the last is fixed to its
-            parent.
-        q: Joint angles, (rows, n) [rad].
-        position: Of the last row, into (rows, 3) [m].
-        orientation: Of the last row, into (rows, 3, 3).
-        axes: Of the hinges in the world, into (rows, len(chain) - 1, 3).
-        anchors: Points on these axes, into (rows, len(chain) - 1, 3) [m].
-    """
-    hinges = len(chain) - 1
-    R = np.empty((3, 3))
-    moved = np.empty((3, 3))
-    p = np.empty(3)
-    for row in range(len(q)):
-        for i in range(3):
-            p[i] = 0.0
-            for k in range(3):
-                R[i, k] = 1.0 if i == k else 0.0
-        for at in range(hinges + 1):
-            link = chain[at]
-            frame = link["R"]
-            anchor = link["anchor"]
-            for i in range(3):
-                p[i] += R[i, 0] * anchor[0] + R[i, 1] * anchor[1] + R[i, 2] * anchor[2]
-            for i in range(3):
-                for k in range(3):
-                    moved[i, k] = (
-                        R[i, 0] * frame[0, k] + R[i, 1] * frame[1, k] + R[i, 2] * frame[2, k]
-                    )
-            R[:] = moved
-            if at == hinges:
-                break
-            angle = q[row, link["column"]] - link["zero"]
-            c = math.cos(angle)
-            s = math.sin(angle)
-            for i in range(3):
-                R[i, 0] = c * moved[i, 0] + s * moved[i, 1]
-                R[i, 1] = c * moved[i, 1] - s * moved[i, 0]
-                axes[row, at, i] = R[i, 2]
-                anchors[row, at, i] = p[i]
-        for i in range(3):
-            position[row, i] = p[i]
-            for k in range(3):
-                orientation[row, i, k] = R[i, k]
+    return np.concatenate([tree.links[path], np.zeros(1, kernels.LINK)])

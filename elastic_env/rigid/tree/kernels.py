@@ -110,8 +110,8 @@ def gravity_torques(links: Any, loads: Any, q: Array, torque: Array) -> None:
     for start in range(0, len(q), BLOCK):
         rows = q[start : start + BLOCK]
         of_rows = loads_of(loads, start, len(rows))
-        weigh(links, of_rows, rows)
-        hold(links, of_rows, torque[start : start + len(rows)])
+        has_tips = weigh(links, of_rows, rows)
+        hold(links, has_tips, torque[start : start + len(rows)])
 
 
 @compiled
@@ -121,8 +121,8 @@ def gravity_gradients(links: Any, loads: Any, q: Array, gradient: Array) -> None
     for start in range(0, len(q), BLOCK):
         rows = q[start : start + BLOCK]
         of_rows = loads_of(loads, start, len(rows))
-        weigh(links, of_rows, rows)
-        differentiate(links, of_rows, len(rows), found)
+        has_tips = weigh(links, of_rows, rows)
+        differentiate(links, has_tips, len(rows), found)
         for row in range(len(rows)):
             gradient[start + row] = found[:, :, row]
 
@@ -153,12 +153,12 @@ def solutions(links: Any, loads: Any, q: Array, stiffness: Array, torque: Array,
         rows = q[start : start + BLOCK]
         found = x[start : start + len(rows)]
         of_rows = loads_of(loads, start, len(rows))
-        weigh(links, of_rows, rows)
-        differentiate(links, of_rows, len(rows), gradient)
+        has_tips = weigh(links, of_rows, rows)
+        differentiate(links, has_tips, len(rows), gradient)
         if len(torque) > 0:
             found[:] = torque[start : start + len(rows)]
         else:
-            hold(links, of_rows, found)
+            hold(links, has_tips, found)
         for row in range(len(rows)):
             for first in range(0, n, joints):
                 b = found[row, first : first + joints]
@@ -191,10 +191,12 @@ def inverse_dynamics(
     q, q_dot, q_ddot = motion
     for start in range(0, len(q), BLOCK):
         stop = min(start + BLOCK, len(q))
-        weigh(links, loads, q[start:stop])
-        hold(links, loads, torque[start:stop])
+        turn(links, q[start:stop])
+        lift(links, loads, stop - start)
+        begin(links, stop - start, True)
         move(links, q_dot[start:stop], q_ddot[start:stop])
-        push(links, torque[start:stop])
+        carry(links, stop - start, True)
+        hold(links, True, torque[start:stop])
 
 
 @compiled
@@ -310,16 +312,53 @@ def tip_tilts(
 
 
 @compiled
+def poses(links: Any, q: Array, place: Array, R: Array, axes: Array, anchors: Array) -> None:
+    """Poses of a chain of hinges, a row after the other.
+
+    Args:
+        links: Rows of `LINK`, each in the frame of the one before it; the last has no hinge.
+        q: Joint angles, (rows, n) [rad].
+        place: Of the last link, to be filled, (rows, 3) [m].
+        R: Of the last link, to be filled, (rows, 3, 3).
+        axes: Of the hinges, to be filled, (rows, len(links) - 1, 3).
+        anchors: Points on these axes, to be filled, (rows, len(links) - 1, 3) [m].
+    """
+    for row in range(len(q)):
+        turned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+        moved = (0.0, 0.0, 0.0)
+        for i in range(len(links)):
+            link = links[i]
+            moved = total(moved, times(turned, vector(link["anchor"])))
+            turned = product(turned, matrix(link["R"]))
+            if i < len(links) - 1:
+                angle = q[row, link["column"]] - link["zero"]
+                c = math.cos(angle)
+                s = math.sin(angle)
+                xx, xy, xz, yx, yy, yz, zx, zy, zz = turned
+                turned = (
+                    c * xx + s * xy,
+                    c * xy - s * xx,
+                    xz,
+                    c * yx + s * yy,
+                    c * yy - s * yx,
+                    yz,
+                    c * zx + s * zy,
+                    c * zy - s * zx,
+                    zz,
+                )
+                fill(axes[row, i], (xz, yz, zz))
+                fill(anchors[row, i], moved)
+        fill(place[row], moved)
+        fill_matrix(R[row], turned)
+
+
+@compiled
 def tilt_rotations(attitude: Array, R: Array) -> None:
     """Rotations about x by a roll, then about y by a pitch, (rows, 2) [rad]: into `R`, (rows, 3,
     3).
     """
     for row in range(len(attitude)):
-        found = rotation_of(attitude[row, 0], attitude[row, 1])
-        for i in range(3):
-            R[row, i, 0] = found[3 * i]
-            R[row, i, 1] = found[3 * i + 1]
-            R[row, i, 2] = found[3 * i + 2]
+        fill_matrix(R[row], rotation_of(attitude[row, 0], attitude[row, 1]))
 
 
 @compiled
@@ -329,29 +368,36 @@ def loads_of(loads: Any, start: int, count: int) -> Any:
 
 
 @compiled
-def weigh(links: Any, loads: Any, q: Array) -> None:
-    """The vertical u from the base to the tips, and back what the links carry."""
+def weigh(links: Any, loads: Any, q: Array) -> bool:
+    """All that acts on the links at rest, and whether tips bear loads."""
     turn(links, q)
-    for row in range(len(q)):
-        x, y, z = vector(loads[min(row, len(loads) - 1)].gravity)
-        put(links[0]["up"], row, (-x, -y, -z))
-    for i in range(1, len(links)):
-        link = links[i]
-        above = links[link["parent"]]
-        R = matrix(link["R"])
-        for row in range(len(q)):
-            up = into_link(R, link["cosine"][row], link["sine"][row], at(above["up"], row))
-            put(link["up"], row, up)
+    lift(links, loads, len(q))
     has_tips = len(loads[0].mass) > 0
     begin(links, len(q), has_tips)
     for i in range(1, len(links)):
         if has_tips and links[i]["tip"] >= 0:
             load_tip(links[i], loads, len(q))
     carry(links, len(q), has_tips)
+    return has_tips
 
 
 @compiled
-def begin(links: Any, rows: int, has_tips: bool) -> None:
+def lift(links: Any, loads: Any, rows: int) -> None:
+    """The vertical u, from the base to the tips."""
+    for row in range(rows):
+        x, y, z = vector(loads[min(row, len(loads) - 1)].gravity)
+        put(links[0]["up"], row, (-x, -y, -z))
+    for i in range(1, len(links)):
+        link = links[i]
+        above = links[link["parent"]]
+        R = matrix(link["R"])
+        for row in range(rows):
+            up = into_link(R, link["cosine"][row], link["sine"][row], at(above["up"], row))
+            put(link["up"], row, up)
+
+
+@compiled
+def begin(links: Any, rows: int, has_wrenches: bool) -> None:
     """Every link carries itself."""
     for i in range(len(links)):
         link = links[i]
@@ -360,16 +406,14 @@ def begin(links: Any, rows: int, has_tips: bool) -> None:
         for row in range(rows):
             link["carried"][row] = weight
             put(link["lever"], row, moment)
-            if has_tips:
+            if has_wrenches:
                 put(link["force"], row, (0.0, 0.0, 0.0))
                 put(link["moment"], row, (0.0, 0.0, 0.0))
 
 
 @compiled
-def carry(links: Any, rows: int, has_tips: bool) -> None:
-    """From the tips to the base: weights, their first moments l, and what the links need against
-    wrenches on tips.
-    """
+def carry(links: Any, rows: int, has_wrenches: bool) -> None:
+    """Weights, their first moments l, and forces and moments, from the tips to the base."""
     for i in range(len(links) - 1, 0, -1):
         link = links[i]
         above = links[link["parent"]]
@@ -383,7 +427,7 @@ def carry(links: Any, rows: int, has_tips: bool) -> None:
             lever = total(lever, scaled(carried, anchor))
             put(above["lever"], row, total(at(above["lever"], row), lever))
             above["carried"][row] += carried
-            if has_tips:
+            if has_wrenches:
                 force = into_parent(R, c, s, at(link["force"], row))
                 moment = total(into_parent(R, c, s, at(link["moment"], row)), cross(anchor, force))
                 put(above["force"], row, total(at(above["force"], row), force))
@@ -425,22 +469,21 @@ def turn(links: Any, q: Array) -> None:
 
 
 @compiled
-def hold(links: Any, loads: Any, torque: Array) -> None:
-    """Torque of rows that are weighed."""
+def hold(links: Any, has_wrenches: bool, torque: Array) -> None:
+    """Torques of what the links carry."""
     for i in range(1, len(links)):
         link = links[i]
         column = link["column"]
         for row in range(len(torque)):
-            held = cross(at(link["lever"], row), at(link["up"], row))[2]
-            if len(loads[0].mass) > 0:
-                held += link["moment"][2, row]
-            torque[row, column] = held
+            needed = cross(at(link["lever"], row), at(link["up"], row))[2]
+            if has_wrenches:
+                needed += link["moment"][2, row]
+            torque[row, column] = needed
 
 
 @compiled
-def differentiate(links: Any, loads: Any, rows: int, gradient: Array) -> None:
-    """Gradient of rows that are weighed, of every joint along all that carry it, (n, n, BLOCK)."""
-    has_tips = len(loads[0].mass) > 0
+def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) -> None:
+    """Gradient of what the links carry, of every joint along all that carry it, (n, n, BLOCK)."""
     for j in range(1, len(links)):
         turned = links[j]
         column = links[j]["column"]
@@ -451,7 +494,7 @@ def differentiate(links: Any, loads: Any, rows: int, gradient: Array) -> None:
             x, y, _ = at(turned["lever"], row)
             put(change, row, cross((-y, x, 0.0), at(turned["up"], row)))
             gradient[column, column, row] = change[2, row]
-            if has_tips:
+            if has_wrenches:
                 x, y, _ = at(turned["force"], row)
                 put(force, row, (-y, x, 0.0))
                 x, y, _ = at(turned["moment"], row)
@@ -469,7 +512,7 @@ def differentiate(links: Any, loads: Any, rows: int, gradient: Array) -> None:
                 put(change, row, into_parent(R, c, s, at(change, row)))
                 gradient[column, before, row] = change[2, row]
                 gradient[before, column, row] = change[2, row]
-                if has_tips:
+                if has_wrenches:
                     moved = into_parent(R, c, s, at(force, row))
                     put(force, row, moved)
                     moved = total(into_parent(R, c, s, at(moment, row)), cross(anchor, moved))
@@ -547,29 +590,6 @@ def move(links: Any, q_dot: Array, q_ddot: Array) -> None:
 
 
 @compiled
-def push(links: Any, torque: Array) -> None:
-    """Forces and moments from the tips to the base; what moves the joints is added to their
-    torque.
-    """
-    for i in range(len(links) - 1, 0, -1):
-        link = links[i]
-        above = links[link["parent"]]
-        column = link["column"]
-        R = matrix(link["R"])
-        anchor = vector(link["anchor"])
-        is_inner = link["parent"] != 0
-        for row in range(len(torque)):
-            torque[row, column] += link["moment"][2, row]
-        for row in range(len(torque) if is_inner else 0):
-            c = link["cosine"][row]
-            s = link["sine"][row]
-            force = into_parent(R, c, s, at(link["force"], row))
-            moment = total(into_parent(R, c, s, at(link["moment"], row)), cross(anchor, force))
-            put(above["force"], row, total(at(above["force"], row), force))
-            put(above["moment"], row, total(at(above["moment"], row), moment))
-
-
-@compiled
 def acceleration_of(arm: Vector, rate: Vector, angular: Vector) -> Vector:
     """α × r + ω × (ω × r): of a point that turns with a frame, without that of the frame's
     origin.
@@ -612,6 +632,15 @@ def times(A: Matrix, v: Vector) -> Vector:
         A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
         A[6] * v[0] + A[7] * v[1] + A[8] * v[2],
     )
+
+
+@compiled
+def product(A: Matrix, B: Matrix) -> Matrix:
+    """A B."""
+    x = times(A, (B[0], B[3], B[6]))
+    y = times(A, (B[1], B[4], B[7]))
+    z = times(A, (B[2], B[5], B[8]))
+    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
 @compiled
@@ -660,3 +689,11 @@ def put(field: Array, row: int, v: Vector) -> None:
 def fill(out: Array, v: Vector) -> None:
     """Write a vector into an array of three numbers."""
     out[0], out[1], out[2] = v
+
+
+@compiled
+def fill_matrix(out: Array, A: Matrix) -> None:
+    """Write a matrix into its array."""
+    fill(out[0], (A[0], A[1], A[2]))
+    fill(out[1], (A[3], A[4], A[5]))
+    fill(out[2], (A[6], A[7], A[8]))
