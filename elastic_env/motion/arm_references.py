@@ -1,5 +1,4 @@
-"""References of robots of several joints: static poses, moves from pose to pose, a line and a
-circle, a user's file.
+"""References of robots of several joints: poses, moves, a line, a circle, a user's file.
 
 Those of `elastic_env.motion.references` move every joint alike. These know the robot: its joint
 ranges, its home, and where its end effector is. All begin with a second of standing.
@@ -27,6 +26,7 @@ from elastic_env.motion.references import (
     RepeatableReference,
     Sine,
     Steps,
+    by_kind,
     make_reference,
 )
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
@@ -44,7 +44,7 @@ _MARGIN = 0.1
 
 @dataclass(frozen=True)
 class Workspace:
-    """What a reference has to know of a robot.
+    """A robot as its references know it.
 
     Attributes:
         joints: Names of the joints, in order.
@@ -83,18 +83,6 @@ class Workspace:
         raise ConfigurationError(
             "the servos hold hardly any pose of the workspace; give them a larger torque_limit"
         )
-
-    def require_tool(self, kind: str) -> EndEffector:
-        """The end effector that a reference moves.
-
-        Raises:
-            ConfigurationError: There is none.
-        """
-        if self.end_effector is None:
-            raise ConfigurationError(
-                f"the reference {kind!r} moves an end effector; name one, end_effector=SITE"
-            )
-        return self.end_effector
 
 
 class _Drawn(RepeatableReference):
@@ -164,11 +152,14 @@ class _Path(RepeatableReference):
     def _along(
         self, workspace: Workspace, place: Any, phase: tuple[Array, ...], control_period_s: float
     ) -> Plan:
-        """The plan of joints whose tool is at `place(s)`, an offset from where it starts, for a
-        phase over time.
-        """
+        """Plan of joints whose tool moves by `place(s)` from its start, for a phase over time."""
         s, s_dot, s_ddot = phase
-        tool = workspace.require_tool(str(getattr(self, "kind", "")))
+        tool = workspace.end_effector
+        if tool is None:
+            raise ConfigurationError(
+                f"the reference {getattr(self, 'kind', '')!r} moves an end effector; name one,"
+                " end_effector=SITE"
+            )
         path = joint_path(tool, workspace.home, place, float(s.max()))
         q = path(s)
         slope = path(s, 1)
@@ -189,7 +180,7 @@ class Line(_Path):
 
     kind: Literal["line"] = "line"
     by: tuple[float, float, float] = (0.0, 0.0, -0.1)
-    """Where it leads, from home, in the axes of the base [m]."""
+    """Way from home, in the axes of the base [m]."""
 
     def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
@@ -274,14 +265,7 @@ OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
 ArmReference = Annotated[Hold | Sine | Multisine | Steps | OfArm, Field(discriminator="kind")]
 AnyArmReference: TypeAlias = Hold | Sine | Multisine | Steps | OfArm
 
-ARM_REFERENCES = {
-    **REFERENCES,
-    "poses": Poses,
-    "moves": Moves,
-    "line": Line,
-    "circle": Circle,
-    "csv": Csv,
-}
+ARM_REFERENCES = {**REFERENCES, **by_kind(OfArm)}
 
 
 make_arm_reference = partial(make_reference, kinds=ARM_REFERENCES)
@@ -306,9 +290,7 @@ class ArmMotion:
         return self.reference.is_random
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """Angles, rates and accelerations of all joints, (T, n); of a random one each joint has
-        a plan of its own.
-        """
+        """A plan of all joints, (T, n); of a random reference each joint has a plan of its own."""
         reference = self.reference
         if isinstance(reference, Poses | Moves):
             visits = reference.visits(self.workspace, generator)
@@ -351,9 +333,7 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
 
 
 def _moved(visits: Array, share: Array, move_s: float) -> tuple[Array, Array, Array]:
-    """Angle, rate and acceleration of moves between poses, each (T, n), from the shares of the
-    moves, (T, moves).
-    """
+    """Motion between poses, (T, n) each, from the shares of the moves, (T, moves)."""
     blend, blend_dot, blend_ddot = quintic(share)
     steps = np.diff(visits, axis=0)
     return visits[0] + blend @ steps, blend_dot @ steps / move_s, blend_ddot @ steps / move_s**2

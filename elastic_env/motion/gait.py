@@ -142,7 +142,12 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
         _whole_steps(name, getattr(gait, name), control_period_s) for name in _DURATIONS
     )
     period = first + single + last
-    _require_short(gait)
+    if gait.duration_s > LONGEST_WALK_S:
+        raise ConfigurationError(
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
+            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
+            " ones"
+        )
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
     since = np.arange(len(time)) - begin  # control steps since the walk began
@@ -188,9 +193,7 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
 
 
 def support_points(gait: Gait, feet: Array) -> Array:
-    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2,
-    2) [m].
-    """
+    """Place of the ZMP on one foot, under or inward of its ankle, (2, 2) [m]."""
     inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
     towards = feet.mean(axis=0) - feet
     return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -219,15 +222,6 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
         last = support
         begin = end
     return shifts
-
-
-def _require_short(gait: Gait) -> None:
-    if gait.duration_s > LONGEST_WALK_S:
-        raise ConfigurationError(
-            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
-            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
-            " ones"
-        )
 
 
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:

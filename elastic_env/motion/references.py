@@ -7,7 +7,7 @@ and moves by quintic (minimum-jerk) polynomials, which start and end without acc
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -71,8 +71,9 @@ class _JointReference(RepeatableReference):
 
 
 class Hold(_JointReference):
-    """The paper's static positions, evenly spaced in gravity torque, approached from below and then
-    from above.
+    """The paper's static positions, evenly spaced in gravity torque.
+
+    They are approached from below and then from above.
 
     Without compensation the link sags below its reference; the references lie so far beyond the
     positions that the uncompensated link rests at evenly spaced torques.
@@ -128,9 +129,7 @@ class Hold(_JointReference):
 
     @property
     def visits(self) -> tuple[Array, IntArray]:
-        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at
-        rest.
-        """
+        """Angle [rad] of each window at rest, and +1 if approached from below, else −1."""
         angles = self.angles
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
@@ -175,7 +174,7 @@ class Hold(_JointReference):
 
 
 class _Oscillation(_JointReference):
-    """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
+    """Amplitude, an envelope that starts smoothly, and a duration."""
 
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi)
     """Largest angle from the middle [rad]."""
@@ -236,8 +235,9 @@ class Sine(_Oscillation):
 
 
 class Multisine(_Oscillation):
-    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode;
-    their sum stays inside.
+    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode.
+
+    Their sum stays inside the amplitude.
     """
 
     kind: Literal["multisine"] = "multisine"
@@ -339,18 +339,20 @@ class Steps(_JointReference):
 AnyReference: TypeAlias = Hold | Sine | Multisine | Steps
 Reference = Annotated[AnyReference, Field(discriminator="kind")]
 
-REFERENCES: dict[str, type[AnyReference]] = {
-    "hold": Hold,
-    "sine": Sine,
-    "multisine": Multisine,
-    "steps": Steps,
-}
+
+def by_kind(union: Any) -> dict[str, Any]:
+    """Classes of a union of references by the names of their kinds."""
+    return {one.model_fields["kind"].default: one for one in get_args(union)}
+
+
+REFERENCES = by_kind(AnyReference)
 
 
 @dataclass(frozen=True)
 class AboutHome:
-    """A reference that every joint follows about its home; of a random one each joint has a plan of
-    its own.
+    """A reference that every joint follows about its home.
+
+    Of a random one each joint has a plan of its own.
 
     Attributes:
         reference: It.

@@ -1,5 +1,4 @@
-r"""How a robot sways on its springs: natural frequencies of standing on both feet with the motors
-held.
+r"""Natural frequencies of a robot that stands on both feet, on its springs, its motors held.
 
 With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint
 angles q(x). About the equilibrium, with the motors at θ = q + K⁻¹τ,
@@ -60,9 +59,7 @@ def _rotations(x: Array) -> Array:
 
 
 def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
-    """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n,
-    12).
-    """
+    """Joint angles that keep both soles on the ground, small pelvis motions (n, 6) to (n, 12)."""
     R = _rotations(x)
     ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips

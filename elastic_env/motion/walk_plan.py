@@ -1,5 +1,4 @@
-"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles at every control
-step.
+"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles.
 
 The pelvis stays level at one height and moves so that the center of mass of the whole robot, not
 the pelvis, follows the preview control.
@@ -25,8 +24,9 @@ _MAX_ITERATIONS = 50
 
 @dataclass(frozen=True, eq=False)
 class WalkPlan:
-    """A walk in place, one row per control step, row k at the end of control period k, row 0 the
-    start.
+    """A walk in place, one row per control step.
+
+    Row k is the end of control period k, row 0 the start.
 
     Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway
     between the feet.
@@ -121,9 +121,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
-    """The same motion with the torques, and the ZMP, that it has on another robot of the same
-    size.
-    """
+    """The same motion with the torques and the ZMP that it has on another robot of that size."""
     dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
     torque = _joint_torque(biped, plan.ankles, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
@@ -158,9 +156,7 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
 
 
 def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
-    """First and second derivative of samples, time first, by central differences; zero at the
-    ends, where it stands.
-    """
+    """First and second derivative by central differences, time first; zero at the ends."""
     first = np.zeros_like(samples)
     second = np.zeros_like(samples)
     first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
@@ -169,9 +165,7 @@ def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
 
 
 def swing_height(progress: Array) -> Array:
-    """Height of the swing foot over its lift, 64 s³ (1 − s)³: no speed and no acceleration at
-    both ends.
-    """
+    """Height of the swing foot over its lift, 64 s³ (1 − s)³: it starts and ends at rest."""
     return 64.0 * (progress * (1.0 - progress)) ** 3
 
 
@@ -193,9 +187,7 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Arra
 
 
 def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: Array) -> Array:
-    """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag
-    behind a little.
-    """
+    """Pelvis of one height that puts the center of mass where it belongs."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
@@ -237,9 +229,7 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Dynamics:
-    """Force, its ZMP and its moment about the vertical that a motion needs of the ground, and the
-    torque of the joints, (T, ...) each.
-    """
+    """Force of the ground, its ZMP and vertical moment; torque of the joints, (T, ...) each."""
 
     force: Array
     zmp: Array

@@ -1,4 +1,4 @@
-"""What a gait needs to know of a robot with two legs."""
+"""A robot with two legs, as its gait knows it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -80,7 +80,7 @@ class Biped:
 
     @property
     def ankles(self) -> Array:
-        """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
+        """Ankles with the feet flat on their footholds, left first, (2, 3) [m]."""
         return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
 
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:

@@ -57,16 +57,13 @@ class LegChains:
         self._no_torque = np.empty((0, len(joints)))
 
     def center_of_mass(self, q: Array) -> Array:
-        """Center of mass of the whole robot in the pelvis frame, (rows, n) [rad] to (rows, 3)
-        [m].
-        """
+        """Center of mass of the robot in the pelvis frame, (rows, n) [rad] to (rows, 3) [m]."""
         return self.com_and_feet(q)[0]
 
     def com_and_feet(
         self, q: Array, point: Array = _ANKLE, attitude: Array = _OF_PELVIS
     ) -> tuple[Array, Array]:
-        """Center of mass of the whole robot, and a point that is fixed in each foot, from the
-        pelvis.
+        """Center of mass of the robot, and a point that is fixed in each foot, from the pelvis.
 
         Args:
             q: (rows, n) [rad].
@@ -83,8 +80,7 @@ class LegChains:
         return com, feet
 
     def sole_tilts(self, q: Array, attitude: Array, bending: Array) -> tuple[Array, Array]:
-        """Tilt of the soles, roll and pitch, as motors and IMU see it, and what the bending of the
-        joints adds to it.
+        """Tilt of the soles by motors and IMU, and the share of it that the joints' bending makes.
 
         Args:
             q: (rows, n) [rad].

@@ -14,8 +14,7 @@ from elastic_env.rigid.tree.links import Tree
 
 
 class RigidBody:
-    r"""What the links of a fixed-base tree of hinges ask of the joints that move them, on (..., n)
-    joint angles in a chosen order.
+    r"""Torques of the joints of a fixed-base tree of hinges, on (..., n) arrays.
 
     .. math:: \tau = M \ddot q + c(q, \dot q) + \tau_g(q) - \tau_{gravcomp}(q) + k_s (q - q_s)
 
@@ -70,9 +69,7 @@ class RigidBody:
         return gradient
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
-        """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (...,
-        n) [N·m].
-        """
+        """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
         if not q.shape == q_dot.shape == q_ddot.shape:
             raise ElasticError(
                 f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape}"
@@ -91,7 +88,7 @@ class RigidBody:
             mass: Of the load, 0 for none [kg].
             place: In the frame of the body, (3,) [m].
         """
-        self._links = self._tree.loaded(body, mass, place)
+        self._links = self._tree.add_load(body, mass, place)
 
     def _with_springs(self, torque: Array, q: Array) -> Array:
         return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
@@ -120,8 +117,7 @@ def needs_more_than_gravity(model: mujoco.MjModel) -> bool:
 def require_hinge_tree(
     model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()
 ) -> None:
-    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints by
-    name or number.
+    """Check that a rigid model moves by the named hinges alone, `but` some joints.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.

@@ -1,4 +1,4 @@
-"""Where the end effector of a tree of hinges is, for a batch of poses at once."""
+"""Pose of the end effector of a tree of hinges, for a batch of postures at once."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -52,9 +52,7 @@ class EndEffector:
         return position.reshape(*q.shape[:-1], 3), R.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Derivative of the position and of the turn, (..., 3, n) each [m/rad], [1], in the
-        world's axes.
-        """
+        """Derivative of position and turn in the world's axes, (..., 3, n) each [m/rad], [1]."""
         position, _, axes, anchors = self._walked(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
@@ -72,8 +70,7 @@ class EndEffector:
         return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
 
     def parts(self, q_ref: Array, q: Array) -> Array:
-        r"""Where the error of the position comes from: what the deviation of each joint alone
-        moves, to first order.
+        r"""Error of the position that the deviation of each joint makes alone, to first order.
 
         .. math:: p(q) - p(q_{ref}) \approx \sum_j J_j(q_{ref}) (q_j - q_{ref,j})
 
@@ -87,9 +84,7 @@ class EndEffector:
         return self.jacobian(q_ref)[0] * (q - q_ref)[..., None, :]
 
     def _walked(self, q: Array) -> tuple[Array, ...]:
-        """Position and orientation of the end effector; axis and anchor of each hinge before it,
-        a row per pose.
-        """
+        """Pose of the end effector; axis and anchor of each hinge before it, a row per posture."""
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
         count = len(rows)
         hinges = len(self._chain) - 1
@@ -99,8 +94,7 @@ class EndEffector:
 
 
 def outermost_body(model: mujoco.MjModel) -> str:
-    """The body with a name that has the most bodies between it and the base, the last one of
-    several.
+    """The named body that has the most bodies between it and the base; the last of several.
 
     Raises:
         ConfigurationError: No body has a name.

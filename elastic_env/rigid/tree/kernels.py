@@ -175,10 +175,7 @@ def solutions(links: Any, loads: Any, q: Array, stiffness: Array, torque: Array,
 
 @compiled
 def inverse_dynamics(
-    links: Any,
-    loads: Any,
-    motion: tuple[Array, Array, Array],
-    torque: Array,
+    links: Any, loads: Any, motion: tuple[Array, Array, Array], torque: Array
 ) -> None:
     """Torque of a motion without friction, into `torque`; arguments as `gravity_torques`.
 
@@ -201,12 +198,7 @@ def inverse_dynamics(
 
 @compiled
 def local_frames(
-    links: Any,
-    q: Array,
-    attitude: Array,
-    point: Array,
-    com: Array,
-    tips: Array,
+    links: Any, q: Array, attitude: Array, point: Array, com: Array, tips: Array
 ) -> None:
     """Center of mass, and a point that is fixed in each tip, from the base in a level frame.
 
@@ -258,15 +250,9 @@ def local_frames(
 
 @compiled
 def tip_tilts(
-    links: Any,
-    q: Array,
-    attitude: Array,
-    bending: Array,
-    seen: Array,
-    expected: Array,
+    links: Any, q: Array, attitude: Array, bending: Array, seen: Array, expected: Array
 ) -> None:
-    """Tilt of the tips, roll and pitch, as motors and IMU see it, and what the bending of the
-    joints adds to it.
+    """Tilt of the tips by motors and IMU, and the share of it that the joints' bending makes.
 
     Args:
         links: See `gravity_torques`.
@@ -354,9 +340,7 @@ def poses(links: Any, q: Array, place: Array, R: Array, axes: Array, anchors: Ar
 
 @compiled
 def tilt_rotations(attitude: Array, R: Array) -> None:
-    """Rotations about x by a roll, then about y by a pitch, (rows, 2) [rad]: into `R`, (rows, 3,
-    3).
-    """
+    """Rotations about x by a roll, then about y by a pitch, (rows, 2) [rad] to (rows, 3, 3)."""
     for row in range(len(attitude)):
         fill_matrix(R[row], rotation_of(attitude[row, 0], attitude[row, 1]))
 
@@ -424,7 +408,7 @@ def carry(links: Any, rows: int, has_wrenches: bool) -> None:
             s = link["sine"][row]
             carried = link["carried"][row]
             lever = into_parent(R, c, s, at(link["lever"], row))
-            lever = total(lever, scaled(carried, anchor))
+            lever = total(lever, scale(carried, anchor))
             put(above["lever"], row, total(at(above["lever"], row), lever))
             above["carried"][row] += carried
             if has_wrenches:
@@ -447,9 +431,9 @@ def load_tip(link: Any, loads: Any, rows: int) -> None:
         force = times(R, vector(load.wrench[tip, 0]))
         moment = total(times(R, vector(load.wrench[tip, 1])), cross(place, force))
         link["carried"][row] += mass
-        put(link["lever"], row, total(at(link["lever"], row), scaled(mass, point)))
-        put(link["force"], row, scaled(-1.0, force))
-        put(link["moment"], row, scaled(-1.0, moment))
+        put(link["lever"], row, total(at(link["lever"], row), scale(mass, point)))
+        put(link["force"], row, scale(-1.0, force))
+        put(link["moment"], row, scale(-1.0, moment))
 
 
 @compiled
@@ -591,9 +575,7 @@ def move(links: Any, q_dot: Array, q_ddot: Array) -> None:
 
 @compiled
 def acceleration_of(arm: Vector, rate: Vector, angular: Vector) -> Vector:
-    """α × r + ω × (ω × r): of a point that turns with a frame, without that of the frame's
-    origin.
-    """
+    """α × r + ω × (ω × r): acceleration of a point of a frame, without that of the origin."""
     return total(cross(angular, arm), cross(rate, cross(rate, arm)))
 
 
@@ -609,9 +591,7 @@ def rotation_of(roll: float, pitch: float) -> Matrix:
 
 @compiled
 def into_link(R: Matrix, c: float, s: float, v: Vector) -> Vector:
-    """A vector of the parent's frame in that of a link, whose joint has turned by an angle of
-    this cosine and sine.
-    """
+    """A vector of the parent in the frame of a link whose joint has turned."""
     x = R[0] * v[0] + R[3] * v[1] + R[6] * v[2]
     y = R[1] * v[0] + R[4] * v[1] + R[7] * v[2]
     z = R[2] * v[0] + R[5] * v[1] + R[8] * v[2]
@@ -656,7 +636,7 @@ def total(a: Vector, b: Vector) -> Vector:
 
 
 @compiled
-def scaled(factor: float, v: Vector) -> Vector:
+def scale(factor: float, v: Vector) -> Vector:
     """A multiple of a vector."""
     return factor * v[0], factor * v[1], factor * v[2]
 

@@ -1,6 +1,4 @@
-"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of
-`elastic_env.rigid.tree.kernels`.
-"""
+"""A compiled MuJoCo model as the links of a tree of hinges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -69,7 +67,7 @@ class Tree:
         place = _turned(R_lw, data.xpos - p_wl[carrier])
         return cls(links, carrier, place, R_lw @ data.xmat.reshape(-1, 3, 3))
 
-    def loaded(self, body: int, mass: float, place: Array) -> Any:
+    def add_load(self, body: int, mass: float, place: Array) -> Any:
         """The links with one point mass more, in the frame of a body [kg], [m]."""
         links = self.links.copy()
         carrier = self.carrier[body]
@@ -104,9 +102,7 @@ def _jointed(
 def _add(
     link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0
 ) -> None:
-    """Give a link a further mass, with its inertia about its center of mass, and a share of its
-    weight.
-    """
+    """Give a link a further mass, with its own inertia, and a share of its weight."""
     link["mass"] += mass
     link["mass_moment"] += mass * com
     link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))
