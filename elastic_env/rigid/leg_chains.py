@@ -130,7 +130,7 @@ class LegChains:
 
     def gradient(self, loads: Any, q: Array) -> Array:
         """∂τ/∂q of `torque`, (rows, n, n) [N·m/rad]; symmetric without a wrench."""
-        gradient = np.zeros((*q.shape, q.shape[1]))
+        gradient = np.empty((*q.shape, q.shape[1]))
         kernels.gravity_gradients(self._links, loads, _dense(q), gradient)
         return gradient
 
