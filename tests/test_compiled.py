@@ -34,8 +34,6 @@ KERNELS = (
     "elastic_env.world.metrics",
     "elastic_env.world.control_kernels",
     "elastic_env.rigid.tree.kernels",
-    "elastic_env.rigid.leg_kernels",
-    "elastic_env.rigid.tree.end_effector",
     "baselines.compensation.compensators",
     "baselines.compensation.contact_torque",
     "baselines.walking.controller",

@@ -145,9 +145,11 @@ class GroundLevel:
         """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
         one, (n, 2).
         """
-        n = len(rows)
-        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
-        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
-        now, soon = com[:, :, None] - ankles
+        theta = rows[:, self._theta]
+        rate = rows[:, self._rate]
+        com, ankles = self._carried.com_and_feet(
+            np.concatenate([theta, theta + _DIFFERENCE_S * rate])
+        )
+        now, soon = np.split(com[:, None] - ankles, 2)
         velocity = (soon - now)[..., :2] / _DIFFERENCE_S
-        return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]
+        return now[..., 2:], velocity[np.arange(len(rows)), np.argmax(load, axis=1)]

@@ -24,7 +24,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.known_torque import hinges_of
 from elastic_env.joint.model_file import read_model
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.rigid.rigid_body import RigidBody
 
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
@@ -271,7 +271,7 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
     """  # noqa: E501
     names = hinges_of(model)
     poses = random_poses(model, np.random.default_rng(0))
-    torque = np.abs(TreeTorque(model, names).gravity_torque(poses)).max(axis=0)
+    torque = np.abs(RigidBody(model, names).gravity_torque(poses)).max(axis=0)
     inertia = np.array([_inertia(model, pose) for pose in poses])
     links = np.diagonal(inertia, axis1=1, axis2=2).max(axis=0)
     free = (1.0 / np.diagonal(np.linalg.inv(inertia), axis1=1, axis2=2)).min(axis=0)

@@ -35,8 +35,8 @@ from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, require_models
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
-from elastic_env.rigid.tree.torque import TreeTorque
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
 from elastic_env.world.joint_task import JointPlant, JointTask
@@ -159,7 +159,7 @@ class JointRobot:
         true = RobotModel(
             self._true_joints(config), self._loaded(config).compile(), config.control_period_s
         )
-        body = TreeTorque(true.rigid, true.joint_names)
+        body = RigidBody(true.rigid, true.joint_names)
         home = (
             np.zeros(len(true.joints))
             if self.home is None
@@ -343,7 +343,7 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
 
 
 def _workspace(
-    robot: RobotModel, body: TreeTorque, home: Array, tool: EndEffector | None
+    robot: RobotModel, body: RigidBody, home: Array, tool: EndEffector | None
 ) -> Workspace:
     """What references have to know of a robot, by its true model."""
     at = [int(robot.rigid.joint(name).id) for name in robot.joint_names]
@@ -362,7 +362,7 @@ def _workspace(
     )
 
 
-def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
+def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
     """Whether servos hold poses with a fifth of their torque to spare, from (..., n) [rad] to
     (...).
     """
@@ -375,7 +375,7 @@ def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
 def _require_torque(
     config: JointRobotConfig,
     robot: RobotModel,
-    body: TreeTorque,
+    body: RigidBody,
     motion: tuple[Array, Array, Array],
 ) -> None:
     """Refuse a reference that the servos cannot follow; `motion` has its angles, rates and
@@ -443,7 +443,7 @@ def _rest_angle(
     *,
     form: str,
     true: RobotModel,
-    body: TreeTorque,
+    body: RigidBody,
 ) -> Array:
     """Link angles at rest without friction: a dead band is crossed to the side to which the load
     pulls.

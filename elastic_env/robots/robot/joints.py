@@ -21,8 +21,8 @@ from elastic_env.joint.joint_settings import (
     read_joints,
 )
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body
-from elastic_env.rigid.tree.torque import TreeTorque
 
 ROTOR_FREQUENCY_RAD_S = 100.0
 """An assumption for rotors that nobody knows: with the link blocked they swing on their spring
@@ -121,7 +121,7 @@ def elastic_joints(
     model = spec.copy().compile()
     names = list(settings)
     poses = drawn_poses(model, names)
-    links = TreeTorque(model, names)
+    links = RigidBody(model, names)
     links.set_load(model.body(outermost_body(model)).id, load_kg, np.zeros(3))
     torque = np.abs(links.gravity_torque(poses)).max(axis=0)
     inertias = _inertias(model, names, poses)
