@@ -21,7 +21,7 @@ import numpy.typing as npt
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
-from elastic_env.core.robot_ranges import RobotDraw
+from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import (
     Array,
     BoolArray,
@@ -167,7 +167,7 @@ class Task(ABC):
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
         self._rules = rules
         self._kind = np.zeros(num_worlds, dtype=np.int64)
-        self._robots: list[RobotDraw | None] = [None] * num_worlds
+        self._robots: list[DrawnRobot | None] = [None] * num_worlds
         self._noise = NoiseStream(num_worlds, self.noise_type)
         self._bound = self.action_table.space(np.float32).high.astype(np.float64)
         self._failures = (DIVERGED, *self.failure_names)
@@ -360,13 +360,13 @@ class Task(ABC):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
-    def _robot(self, world: int) -> RobotDraw:
+    def _robot(self, world: int) -> DrawnRobot:
         """The robot of a world, from its first episode on."""
         robot = self._robots[world]
         assert robot is not None
         return robot
 
-    def _take_robot(self, world: int, robot: RobotDraw, true_model: RobotModel) -> None:
+    def _take_robot(self, world: int, robot: DrawnRobot, true_model: RobotModel) -> None:
         """Keep the robot of a world, and write what is true of its joints.
 
         Args:
@@ -376,9 +376,9 @@ class Task(ABC):
         """
         self._robots[world] = robot
         truth = self._joints[self._row, world]["truth"]
-        truth["homing"] = robot.encoder_bias_rad
-        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness_factor)
-        truth["damping"] = true_model.damping * robot.damping_factor
+        truth["homing"] = robot.homing_rad
+        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness)
+        truth["damping"] = true_model.damping * robot.damping
         truth["backlash"] = true_model.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed

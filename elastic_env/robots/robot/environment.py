@@ -32,8 +32,9 @@ from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotC
 from elastic_env.robots.robot import ID, NAME
 from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
 from elastic_env.robots.robot.model import RigidModel, read_robot
+from elastic_env.world.drawn_robot import stiffest_plant
 from elastic_env.world.joint_config import RewardWeights
-from elastic_env.world.joint_task import JointTask, stiffest
+from elastic_env.world.joint_task import JointTask
 from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
@@ -110,7 +111,7 @@ def configure_robot(
     )
     settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
     if timestep_s is None:
-        played = stiffest(
+        played = stiffest_plant(
             compiled_spec(robot.elastic(settings), "the model with elastic joints"),
             settings.scenario,
         )

@@ -66,7 +66,7 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotDraw
+from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import Plan, PlanTable
@@ -75,7 +75,6 @@ from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
-    PlacedRobot,
     WalkConfig,
     placed_robot,
     require_stable_walker,
@@ -122,7 +121,7 @@ class _Kind:
     """
 
     config: WalkConfig
-    bank: Sequence[RobotDraw]
+    bank: Sequence[DrawnRobot]
     model: mujoco.MjModel
     true_model: WalkerModel
 
@@ -239,7 +238,7 @@ class WalkTask(Task):
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot, kind.true_model)
         mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
-        bias["imu_attitude"][world] = mounting + np.array(robot.imu_bias_rad)
+        bias["imu_attitude"][world] = mounting + np.array(robot.mounting_rad)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
         self._kind[world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
@@ -268,25 +267,21 @@ class WalkTask(Task):
                 sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
             )
 
-    def _placed(self, world: int) -> PlacedRobot:
-        """The robot of a world, at rest."""
-        config = self._kind_of_world[world].config
-        return placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-
     def _place(self, worlds: BoolArray) -> None:
         simulation = self.simulation
         simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
         for world in np.flatnonzero(worlds).tolist():
-            placed = self._placed(world)
-            simulation.take(world, placed.model)
-            simulation.qpos[world] = placed.rest.qpos
+            config = self._kind_of_world[world].config
+            model, rest = placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+            simulation.take(world, model)
+            simulation.qpos[world] = rest.qpos
             simulation.qvel[world] = 0.0
-            simulation.act[world] = placed.rest.act
+            simulation.act[world] = rest.act
             simulation.ctrl[world] = (
                 self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
             )
-            simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
+            simulation.bind("qacc_warmstart")[world] = rest.warmstart
         simulation.refresh(worlds)
 
     def _disturb(self) -> None:
