@@ -57,7 +57,7 @@ def with_ranges(*ranges: RobotRanges, ground: str = "nominal") -> Scenario:
 
 def robot_of(env: Any, world: int = 0) -> DrawnRobot:
     """The robot that a world has drawn."""
-    return env.unwrapped.task._robot(world)
+    return env.unwrapped.task._robots[world]
 
 
 def place_of(robot: DrawnRobot) -> Array:

@@ -35,7 +35,7 @@ def interval(unit: str, nominal: float, bounds: Interval) -> Any:
 
 
 class RobotRanges(Model):
-    """What robots differ in from the assumed one; by default in nothing.
+    """Intervals of the quantities in which robots differ from the assumed one; by default none.
 
     The draws depend on the order of these fields, see `draw_robots`.
     """
@@ -151,8 +151,7 @@ class DrawnRobot:
 def draw_robots(
     ranges: Sequence[RobotRanges], number: int, joints: int, seed: Sequence[int]
 ) -> list[DrawnRobot]:
-    """Robots of ranges, in equal shares where there are several of these; the same in every
-    process.
+    """Robots of ranges, the same in every process; equal shares of each of several ranges.
 
     Args:
         ranges: One or several.
@@ -178,9 +177,7 @@ def draw_robot(
 
 
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:
-    """Points in the unit cube, (number, columns): each column has one value in each of `number`
-    equal intervals.
-    """
+    """Points in the unit cube, (number, columns), one of each column in each of equal intervals."""
     strata = generator.permuted(np.tile(np.arange(number), (columns, 1)), axis=1)
     points: Array = (strata + generator.random((columns, number))).T / number
     return points

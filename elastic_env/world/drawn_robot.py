@@ -1,4 +1,4 @@
-"""What the robots that a scenario draws are in the physics."""
+"""The joints of drawn robots in the physics."""
 
 import copy
 from collections.abc import Callable, Sequence

@@ -1,5 +1,4 @@
-"""A task of n elastic joints: make the links follow a reference although the joints bend under
-gravity.
+"""A task of n elastic joints: the links follow a reference while the joints bend under gravity.
 
 The observation has the encoders, the reference of the coming control period, the last command, and
 the sensors that are asked for; the action is the command offset of every joint. With one joint its
@@ -14,6 +13,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
@@ -30,9 +30,9 @@ from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import COURSE, REAL, RULES, WHOLE, Records, Sample, one, record_type
-from elastic_env.world.sensors import PendulumImu, angle_of_count, is_due
-from elastic_env.world.task import Task, joint_groups, spring_torque
+from elastic_env.world.rows import COURSE, REAL, WHOLE, Records, Sample, one, record_type
+from elastic_env.world.sensors import PendulumImu, is_due
+from elastic_env.world.task import Task, joint_groups, joint_rules, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
@@ -82,7 +82,7 @@ METRICS_OF_END_EFFECTOR = (
 
 @dataclass(frozen=True)
 class JointPlant:
-    """What moves, and what is known of it.
+    """The plant, and what is known of it.
 
     Attributes:
         name: Of the robot.
@@ -164,10 +164,9 @@ class JointTask(Task):
                 f" {len(joints)}; choose link_encoder to observe the links of several"
             )
         scenario = config.scenario
+        scenarios = [scenario] * num_worlds
         period_s = config.control_period_s
-        count_rad = angle_of_count(
-            plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
-        )
+        counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
         reference = PlanTable(plant.motion, period_s, num_worlds)
         require_stable(stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
@@ -180,25 +179,15 @@ class JointTask(Task):
             sensors=FurtherSensors(
                 names=[sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR],
                 joints=dict.fromkeys(joints),
-                scenarios=[scenario] * num_worlds,
+                scenarios=scenarios,
                 counts_per_turn=plant.true.encoder_counts_per_turn,
             ),
+            scenarios=scenarios,
             metrics=(
                 *(METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL),
                 *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
             ),
-            rules=np.concatenate(
-                [
-                    one(
-                        RULES,
-                        control_period_s=period_s,
-                        is_delayed=is_delayed,
-                        count_rad=count_rad,
-                        highest_rad_s=DIVERGED_RAD_S,
-                    )
-                    for is_delayed in (False, True)
-                ]
-            ),
+            rules=joint_rules(period_s, [(counts, False), (counts, True)]),
         )
         self._plant = plant
         self._joint_names = joints
@@ -227,9 +216,7 @@ class JointTask(Task):
         self._rest_watch.restart(worlds)
 
     def score(self) -> None:
-        """Take further steps into the metrics, and look whether the joints rest in windows at
-        rest.
-        """
+        """Score further steps, and look whether the joints rest in windows at rest."""
         if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
             for row in range(self._unscored, self._row + 1):
                 joints = self._joints[row]["truth"]
@@ -263,9 +250,6 @@ class JointTask(Task):
             model=self._true_model,
         )
 
-    def _has_ranges(self, world: int) -> bool:  # noqa: ARG002  all worlds have one scenario
-        return bool(self.config.scenario.ranges)
-
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         scenario = self.config.scenario
         generator = random.robot
@@ -296,7 +280,7 @@ class JointTask(Task):
         simulation = self.simulation
         at = self._at
         truth = self._joints[self._row]["truth"][worlds]
-        robots = {world: self._robot(world) for world in np.flatnonzero(worlds).tolist()}
+        robots = {world: self._robots[world] for world in np.flatnonzero(worlds).tolist()}
         if self.config.scenario.ranges or self.config.scenario.stiffness_spread > 0.0:
             for world, robot in robots.items():
 
@@ -332,19 +316,24 @@ class JointTask(Task):
             simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps()
         )
 
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        simulation = self.simulation
-        joints = self._constants
-        qpos = simulation.qpos
-        qvel = simulation.qvel
+    @override
+    def _sense_worlds(
+        self,
+        joints: tuple[Any, ...],
+        noise: tuple[Any, ...],
+        commanded: tuple[Any, ...],
+        steps: tuple[Any, ...],
+        results: tuple[Any, ...],
+    ) -> bool:
+        qpos = self.simulation.qpos
+        qvel = self.simulation.qvel
         if self._imu is not None:
             too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
             self._imu.advance(
                 ~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]]
             )
-        noise = self._noise.ready()
         return kernels.sense_links(
-            qpos, qvel, joints, self._links, noise, commanded, self._steps(), results
+            qpos, qvel, joints, self._links, noise, commanded, steps, results
         )
 
     def _show_worlds(self, observed: Array) -> None:

@@ -1,5 +1,4 @@
-"""`elastic_env/Robot-v0`: any robot on a fixed base, from a file of its rigid model and one of its
-elastic joints.
+"""`elastic_env/Robot-v0`: any robot on a fixed base, from files of its model and its joints.
 
 env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml",
 end_effector="tool")
@@ -124,9 +123,7 @@ def configure_robot(
 def joint_robot(
     model: GivenModel, joints: GivenJoints, end_effector: str | None = None
 ) -> JointRobot:
-    """A robot from the file of its rigid model and that of its joints; arguments and errors as
-    `configure_robot`.
-    """
+    """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
     require_fixed_base(whole)

@@ -80,9 +80,7 @@ def _copied(spec: Any) -> mujoco.MjSpec:
 
 
 def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
-    """A model without actuators and contacts, whose hinges have nothing of what an
-    `ElasticJoint` says.
-    """
+    """A model without actuators, contacts, and what an `ElasticJoint` has of its hinges."""
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name in joints:

@@ -72,7 +72,7 @@ class WalkConfig(Model):
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
+    """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
     timestep_s: float = quantity("s", 1e-3, gt=0)
@@ -100,9 +100,7 @@ class WalkConfig(Model):
         return self
 
     def of_each_scenario(self) -> "list[WalkConfig]":
-        """The configuration of the worlds of each scenario, in the order in which these first
-        occur.
-        """
+        """Configurations of the scenarios, in the order in which these first occur."""
         if not self.scenarios:
             return [self]
         alone = [
@@ -119,9 +117,7 @@ class WalkConfig(Model):
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as a policy may know them: the ground's friction is known, from an
-        identification.
-        """
+        """The joints as a policy may know them, with the ground's friction."""
         return {
             name: joint.replace(
                 coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
@@ -170,9 +166,7 @@ _SETTLED = 2048
 
 @lru_cache(maxsize=64)
 def require_stable_walker(config: WalkConfig) -> None:
-    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked
-    at once.
-    """
+    """Refuse joints that explode with the physics step; looked at once."""
     model = stiffest_plant(undrawn_model(config), config.scenario)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     require_stable(model, config.control_period_s)
 
@@ -225,8 +219,9 @@ def floor_tilt(angle: float, direction: float) -> Array:
 
 
 def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:
-    """The robots of a scenario: one, or a bank, the same in every process; banks of other
-    numbers have other robots.
+    """The robots of a scenario: one, or a bank, the same in every process.
+
+    Banks of other numbers have other robots.
     """
     n = len(LEG_JOINTS)
     if scenario.ranges:
