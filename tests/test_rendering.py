@@ -13,8 +13,9 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signals
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
+from elastic_env.robots.deviations import ENLARGEMENT, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
-from elastic_env.robots.testbed.picture import ENLARGEMENT, TestbedPicture, enlarge_deviation
+from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.picture import (
     LARGEST_FACTOR,

@@ -37,6 +37,14 @@ from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.robots.deviations import (
+    ENLARGEMENT,
+    HEIGHT,
+    REFERENCE_RGBA,
+    REFERENCE_WORD_RGBA,
+    WIDTH,
+    deviation_caption,
+)
 from elastic_env.robots.robot.joints import joint_ranges
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
@@ -45,13 +53,8 @@ from elastic_env.world.robot_model import RobotModel, read_stiffness, with_stiff
 from elastic_env.world.scenario import Scenario, make_scenario
 from elastic_env.world.task import ACTION_BOUND_RAD
 
-_WIDTH = 640
-_HEIGHT = 480
-_ENLARGED = 8.0
-"""Factor by which a picture enlarges deviations from the reference."""
 _REFERENCE = "elastic_env_reference_"
-_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
-"""Prefix and colour of the robot that is the reference."""
+"""Prefix of the names of the robot that is the reference."""
 _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
 _POINT = 1e-4
@@ -240,7 +243,7 @@ class JointPicture(ModelPicture):
 
     def __init__(self, robot: JointRobot, task: JointTask) -> None:
         spec = robot.rigid()
-        set_stage(spec, _WIDTH, _HEIGHT)
+        set_stage(spec, WIDTH, HEIGHT)
         look = spec.copy().compile().stat
         x, y, z = look.center
         spec.worldbody.add_camera(
@@ -257,9 +260,9 @@ class JointPicture(ModelPicture):
         )
         reference = robot.rigid()
         for geom in reference.geoms:
-            geom.rgba = _REFERENCE_RGBA
+            geom.rgba = REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-        super().__init__(spec, (("translucent: reference", (0.27, 0.55, 0.37, 1.0)),))
+        super().__init__(spec, (("translucent: reference", REFERENCE_WORD_RGBA),))
         self._robot = robot
         self._task = task
         self._joints = list(robot.joints)
@@ -278,19 +281,13 @@ class JointPicture(ModelPicture):
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         q = self._task.truth().q[world]
         q_ref = self._task.sample().joints["truth"]["q_ref"][world]
-        drawn = q_ref + _ENLARGED * (q - q_ref)
+        drawn = q_ref + ENLARGEMENT * (q - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return [
-            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {_ENLARGED:g}",
-            (
-                f"deflection {1e3 * now['deflection']:6.2f} mrad     link error"
-                f" {1e3 * now['link_error']:6.2f} mrad"
-            ),
-        ]
+        return deviation_caption(now)
 
 
 def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:

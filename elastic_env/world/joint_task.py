@@ -284,10 +284,10 @@ class JointTask(Task):
         if self.config.scenario.ranges or self.config.scenario.stiffness_spread > 0.0:
             for world, robot in robots.items():
 
-                def own(field: str, world: int = world) -> Array:
-                    return simulation.vary(field)[world]
+                def field(name: str, world: int = world) -> Array:
+                    return simulation.vary(name)[world]
 
-                set_joints(own, self.model, self._springs, at["q_dot"], robot)
+                set_joints(field, self.model, self._springs, at["q_dot"], robot)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
         factor = np.array([robot.stiffness for robot in robots.values()])

@@ -69,14 +69,10 @@ class RigidModel:
         """Files by name, specifications as text."""
         given: Any = self._model
         if isinstance(given, mujoco.MjSpec):
-            given = _copied(given)
+            given = given.copy()
             compiled_spec(given, "the specification")
             given = given.to_xml()
         return {"_model": given, "_joints": self._joints, "_spec": None}
-
-
-def _copied(spec: Any) -> mujoco.MjSpec:
-    return spec.copy()
 
 
 def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:

@@ -10,24 +10,21 @@ import numpy as np
 
 from elastic_env.rendering.picture import CAMERA, ModelPicture, Rgba, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.robots.deviations import (
+    HEIGHT,
+    REFERENCE_RGBA,
+    REFERENCE_WORD_RGBA,
+    WIDTH,
+    deviation_caption,
+    enlarge_deviation,
+)
 from elastic_env.robots.testbed.model import Pendulum
 
-ENLARGEMENT = 8.0
-"""Factor by which deviations from the reference are enlarged."""
-
-_WIDTH = 640
-_HEIGHT = 480
-_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 _LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
 _STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
 _HOUSING_RGBA = (0.2, 0.22, 0.26, 1.0)
 _ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
-_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", (0.27, 0.55, 0.37, 1.0)))
-
-
-def enlarge_deviation(angle: float, reference: float, factor: float = ENLARGEMENT) -> float:
-    """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
-    return reference + factor * (angle - reference)
+_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", REFERENCE_WORD_RGBA))
 
 
 class TestbedPicture(ModelPicture):
@@ -66,22 +63,13 @@ class TestbedPicture(ModelPicture):
         self._data.joint("rotor").qpos = enlarge_deviation(rotor, reference)
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return [
-            (
-                f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x"
-                f" {ENLARGEMENT:g}"
-            ),
-            (
-                f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error"
-                f" {1e3 * now['link_error']:+7.2f} mrad"
-            ),
-        ]
+        return deviation_caption(now)
 
 
 def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     """A model for drawing only: three independent hinges, no dynamics."""
     spec = mujoco.MjSpec()
-    set_stage(spec, _WIDTH, _HEIGHT)
+    set_stage(spec, WIDTH, HEIGHT)
     reach = pendulum.com_distance
     world = spec.worldbody
     _add_light(spec)
@@ -89,7 +77,7 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
         name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50
     )
     _add_mount(world)
-    _add_pendulum(world, "reference", 0.03, reach, _REFERENCE_RGBA, _REFERENCE_RGBA)
+    _add_pendulum(world, "reference", 0.03, reach, REFERENCE_RGBA, REFERENCE_RGBA)
     _add_pendulum(world, "link", 0.0, reach, _STEEL_RGBA, _LINK_RGBA)
     rotor = _add_hinge(world, "rotor")
     _add_disc(rotor, "rotor_disc", [0.055, 0.01, 0], [0, -0.03, 0], _ROTOR_RGBA)
