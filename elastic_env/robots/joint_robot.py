@@ -45,11 +45,10 @@ from elastic_env.robots.deviations import (
     WIDTH,
     deviation_caption,
 )
-from elastic_env.robots.robot.joints import joint_ranges
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
 from elastic_env.world.joint_task import JointPlant, JointTask
-from elastic_env.world.robot_model import RobotModel, read_stiffness, with_stiffness
+from elastic_env.world.robot_model import RobotModel, joint_ranges, read_stiffness, with_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 from elastic_env.world.task import ACTION_BOUND_RAD
 

@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import DrawnRobot, draw_robot
+from elastic_env.core.robot_ranges import draw_robot
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
@@ -263,12 +263,7 @@ class JointTask(Task):
         factor = np.ones(n)
         if scenario.stiffness_spread > 0.0:
             factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
-        robot = DrawnRobot(
-            stiffness=tuple(factor.tolist()),
-            homing_rad=tuple(homing.tolist()),
-            mounting_rad=(float(mounting), 0.0),
-            is_delayed=scenario.delay_steps > 0,
-        )
+        robot = scenario.make_robot(factor, homing, mounting_rad=(float(mounting), 0.0))
         if scenario.ranges:
             robot = draw_robot([ranges.on_fixed_base() for ranges in scenario.ranges], n, generator)
         self._take_robot(world, robot, self._true_model)

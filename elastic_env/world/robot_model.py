@@ -155,6 +155,14 @@ def with_stiffness(
     }
 
 
+def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
+    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit."""
+    at = [model.joint(name).id for name in joints]
+    limited = model.jnt_limited[at].astype(bool)[:, None]
+    lowest, highest = np.where(limited, model.jnt_range[at], [-np.inf, np.inf]).T
+    return lowest, highest
+
+
 @dataclass(frozen=True)
 class WalkerModel(RobotModel):
     """A walker as a policy may know it, with its legs and its walk plan."""

@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.robot_ranges import RobotRanges
+from elastic_env.core.robot_ranges import DrawnRobot, RobotRanges
+from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
@@ -96,6 +97,24 @@ class Scenario(Model):
             return self
         each = [changes] if isinstance(changes, Mapping) else changes
         return self.replace(ranges=[self.ranges[0].replace(**own) for own in each])
+
+    def make_robot(self, stiffness: Array, homing_rad: Array, **drawn: Any) -> DrawnRobot:
+        """A robot of the scenario without its ranges.
+
+        Args:
+            stiffness: Factor on K of every joint, (n,) [1].
+            homing_rad: Error of the encoder of every joint, (n,) [rad].
+            **drawn: Other quantities that were drawn.
+        """
+        return DrawnRobot(
+            stiffness=tuple(stiffness.tolist()),
+            homing_rad=tuple(homing_rad.tolist()),
+            slope_rad=self.slope_rad,
+            push_n=self.push_n,
+            is_delayed=self.delay_steps > 0,
+            is_inertial=self.inertial is not None,
+            **drawn,
+        )
 
     @property
     def draws_robots(self) -> bool:

@@ -21,6 +21,7 @@ from elastic_env.joint.joint_settings import (
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.world.robot_model import joint_ranges
 
 ROTOR_FREQUENCY_RAD_S = 100.0
 """An assumption for rotors that nobody knows: with the link blocked they swing on their spring
@@ -307,14 +308,6 @@ def drawn_poses(
     highest = np.minimum(highest, home + np.pi / 2)
     generator = np.random.default_rng(seed)
     return generator.uniform(lowest, highest, (count, len(joints)))
-
-
-def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit."""
-    at = [model.joint(name).id for name in joints]
-    limited = model.jnt_limited[at].astype(bool)[:, None]
-    lowest, highest = np.where(limited, model.jnt_range[at], [-np.inf, np.inf]).T
-    return lowest, highest
 
 
 def home_of_joints(model: mujoco.MjModel, joints: list[str]) -> Array:

@@ -2,7 +2,7 @@
 
 import copy
 from functools import lru_cache, partial
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import mujoco
 import numpy as np
@@ -226,25 +226,16 @@ def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:
     n = len(LEG_JOINTS)
     if scenario.ranges:
         return draw_robots(scenario.ranges, RANGES_BANK_SIZE, n, (_BANK_SEED, number))
-    conditions: dict[str, Any] = {
-        "push_n": scenario.push_n,
-        "slope_rad": scenario.slope_rad,
-        "is_delayed": scenario.delay_steps > 0,
-        "is_inertial": scenario.inertial is not None,
-    }
-    if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
-        return [DrawnRobot(stiffness=(1.0,) * n, homing_rad=(0.0,) * n, **conditions)]
-    generator = np.random.default_rng(_BANK_SEED + number)
+    spread = scenario.stiffness_spread
+    width_rad = scenario.encoder_bias_rad
+    if spread == width_rad == scenario.slope_rad == 0.0:
+        return [scenario.make_robot(np.ones(n), np.zeros(n))]
+    uniform = np.random.default_rng(_BANK_SEED + number).uniform
     return [
-        DrawnRobot(
-            stiffness=tuple(
-                (1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()
-            ),
-            homing_rad=tuple(
-                (scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()
-            ),
-            slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
-            **conditions,
+        scenario.make_robot(
+            stiffness=1.0 + spread * uniform(-1.0, 1.0, n),
+            homing_rad=width_rad * uniform(-1.0, 1.0, n),
+            slope_direction_rad=float(uniform(0.0, 2.0 * np.pi)),
         )
         for _ in range(BANK_SIZE)
     ]
