@@ -30,7 +30,6 @@ from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.world.metrics",
     "elastic_env.world.control_kernels",
     "elastic_env.rigid.tree.kernels",
     "elastic_env.rigid.leg_kernels",
