@@ -214,8 +214,8 @@ def test_a_full_arena_is_said_once_and_is_no_divergence() -> None:
     simulation = SingleWorld(mujoco.MjModel.from_xml_string(FULL.format(bodies=bodies)))
     simulation.advance(5)
     with pytest.warns(UserWarning, match="too many .* for its memory"):
-        assert simulation.diverged().tolist() == [False]
+        assert simulation.divergence().tolist() == [False]
     simulation.advance(5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert simulation.diverged().tolist() == [False]
+        assert simulation.divergence().tolist() == [False]

@@ -230,8 +230,9 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
 def random_poses(
     model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES
 ) -> Array:
-    """Poses within the inner part of the joints' ranges, (number, n) [rad]; they may cross the
-    robot itself.
+    """Poses within the inner part of the joints' ranges, (number, n) [rad].
+
+    The robot may cross itself in them.
     """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
@@ -296,8 +297,9 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
 
 
 def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:
-    """A servo that holds its angle: three equal poles for a rigid load, and no softer than the
-    spring behind it.
+    """A servo that holds its angle, no softer than the spring behind it.
+
+    It gives a rigid load three equal poles.
     """
     carried = max(inertia, stiffness / (3.0 * _SERVO_RATE**2))
     return Servo(

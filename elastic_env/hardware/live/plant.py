@@ -176,7 +176,7 @@ class ServoPlant:
     def refresh(self, worlds: BoolArray) -> None:
         """Nothing: hardware has nothing to compute."""
 
-    def diverged(self) -> BoolArray:
+    def divergence(self) -> BoolArray:
         """Hardware does not diverge: where something is wrong, an error says what."""
         return np.zeros(1, dtype=np.bool_)
 

@@ -97,9 +97,9 @@ class HardwareTestbedTask(TestbedTask):
         super()._begin_worlds(worlds)
         self._keep_cycle()
 
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+    def _sense_worlds(self, *arguments: Any, **named: Any) -> bool:
         """Behind the last step the pendulum is brought to rest."""
-        is_over = super()._sense_worlds(commanded, results)
+        is_over = super()._sense_worlds(*arguments, **named)
         self._keep_cycle()  # before the way back to rest, which measures too
         if is_over:
             self.plant.finish()

@@ -69,20 +69,14 @@ class RigidModel:
         """Files by name, specifications as text."""
         given: Any = self._model
         if isinstance(given, mujoco.MjSpec):
-            given = _copied(given)
+            given = given.copy()
             compiled_spec(given, "the specification")
             given = given.to_xml()
         return {"_model": given, "_joints": self._joints, "_spec": None}
 
 
-def _copied(spec: Any) -> mujoco.MjSpec:
-    return spec.copy()
-
-
 def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
-    """A model without actuators and contacts, whose hinges have nothing of what an
-    `ElasticJoint` says.
-    """
+    """A model without actuators, contacts, and what an `ElasticJoint` has of its hinges."""
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name in joints:

@@ -1,5 +1,4 @@
-r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a pendulum, an IMU on
-the link.
+r"""The paper's single-joint testbed (Fig. 4): a servo, a linkage with a pendulum, an IMU.
 
 The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that
 holds it is τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length:
