@@ -56,14 +56,10 @@ class EmulatedServo:
     model_number: int | None = None
     motor: Motor = field(default_factory=Motor)
     _memory: bytearray = field(init=False)
-    _registered: tuple[int, bytes] | None = None
     _heard_s: float = 0.0
 
     def __post_init__(self) -> None:
         self._memory = bytearray(self.model.table.size)
-        self._reset()
-
-    def _reset(self) -> None:
         limit = self.model.current_limit
         allowed = int(current_of_torque(LARGEST_TORQUE_NM) / self.model.current_unit)
         for register in self.model.table.values():
@@ -140,21 +136,6 @@ class EmulatedServo:
                 return self.read(*words(parameters))
             case packets.WRITE if len(parameters) > 2:
                 return self.write(words(parameters)[0], parameters[2:]), b""
-            case packets.REG_WRITE if len(parameters) > 2:
-                self._registered = (words(parameters)[0], parameters[2:])
-                self["registered_instruction"] = 1
-                return self._alert, b""
-            case packets.ACTION if self._registered is not None:
-                address, data = self._registered
-                self._registered = None
-                self["registered_instruction"] = 0
-                return self.write(address, data), b""
-            case packets.FACTORY_RESET | packets.REBOOT:
-                self._change("torque_enable", 0)
-                if instruction == packets.FACTORY_RESET:
-                    self._reset()
-                self["hardware_error_status"] = 0
-                return 0, b""
             case _:
                 return packets.INSTRUCTION_ERROR | self._alert, b""
 
@@ -207,8 +188,6 @@ class EmulatedServo:
                 return packets.RANGE_ERROR
             case "torque_enable":
                 return packets.RESULT_FAIL if value and self["hardware_error_status"] else 0
-            case "id":
-                return 0 if 0 <= value <= packets.LARGEST_ID else packets.RANGE_ERROR
             case _:
                 return 0
 
@@ -219,8 +198,6 @@ class EmulatedServo:
         they do not.
         """
         self[name] = value
-        if name == "id":
-            self.servo_id = value
         if name in _SWITCHES:
             self.notify(self.servo_id, name, value)
 
@@ -251,70 +228,23 @@ class EmulatedBus:
             )
         parameters = packet.parameters
         match packet.instruction:
-            case packets.STATUS:
-                return []
-            case packets.SYNC_READ | packets.FAST_SYNC_READ:
-                groups = [(servo_id, *words(parameters)) for servo_id in parameters[4:]]
-                return self._read(groups, packet.instruction == packets.FAST_SYNC_READ)
-            case packets.BULK_READ | packets.FAST_BULK_READ:
-                groups = [
-                    (parameters[i], *words(parameters[i + 1 :]))
-                    for i in range(0, len(parameters) - 4, 5)
-                ]
-                return self._read(groups, packet.instruction == packets.FAST_BULK_READ)
+            case packets.SYNC_READ:
+                address, length = words(parameters)
+                asked = [i for i in parameters[4:] if i in self.servos]
+                return [packets.status(i, *self.servos[i].read(address, length)) for i in asked]
             case packets.SYNC_WRITE:
                 address, length = words(parameters)
                 for at in range(4, len(parameters) - length, length + 1):
-                    self._write(parameters[at], address, parameters[at + 1 : at + 1 + length])
-                return []
-            case packets.BULK_WRITE:
-                while len(parameters) >= 5:
-                    address, length = words(parameters[1:])
-                    self._write(parameters[0], address, parameters[5 : 5 + length])
-                    parameters = parameters[5 + length :]
+                    if servo := self.servos.get(parameters[at]):
+                        servo.write(address, parameters[at + 1 : at + 1 + length])
                 return []
             case packets.PING if packet.servo_id == packets.BROADCAST:
-                return [
-                    reply
-                    for servo_id in sorted(self.servos)
-                    for reply in self._instruct(servo_id, packet)
-                ]
-            case _ if packet.servo_id == packets.BROADCAST:
-                for servo_id in list(self.servos):
-                    self._instruct(servo_id, packet)
-                return []
+                return [self._instruct(servo_id, packet) for servo_id in sorted(self.servos)]
+            case _ if packet.servo_id in self.servos:
+                return [self._instruct(packet.servo_id, packet)]
             case _:
-                return self._instruct(packet.servo_id, packet)
+                return []
 
-    def _instruct(self, servo_id: int, packet: Packet) -> list[bytes]:
-        servo = self.servos.get(servo_id)
-        if servo is None:
-            return []
-        error, data = servo.answer(packet.instruction, packet.parameters)
-        if servo.servo_id != servo_id:
-            self.servos[servo.servo_id] = self.servos.pop(servo_id)
-        return [packets.status(servo_id, error, data)]
-
-    def _read(self, groups: Sequence[tuple[int, int, int]], is_fast: bool) -> list[bytes]:
-        replies = [
-            (i, *self.servos[i].read(address, length))
-            for i, address, length in groups
-            if i in self.servos
-        ]
-        if not is_fast:
-            return [packets.status(servo_id, error, data) for servo_id, error, data in replies]
-        return [_join(replies)] if len(replies) == len(groups) else []
-
-    def _write(self, servo_id: int, address: int, data: bytes) -> None:
-        if servo_id in self.servos:
-            self.servos[servo_id].write(address, data)
-
-
-def _join(replies: Sequence[tuple[int, int, bytes]]) -> bytes:
-    """A fast reply: the parts of all servos in one packet, each with a checksum of all so far."""
-    length = 1 + sum(len(data) + 4 for _, _, data in replies)
-    wire = packets.HEADER + bytes([packets.BROADCAST]) + word(length) + bytes([packets.STATUS])
-    for servo_id, error, data in replies:
-        wire += bytes([error, servo_id]) + data
-        wire += word(packets.crc16(wire))
-    return wire
+    def _instruct(self, servo_id: int, packet: Packet) -> bytes:
+        servo = self.servos[servo_id]
+        return packets.status(servo_id, *servo.answer(packet.instruction, packet.parameters))
