@@ -118,10 +118,6 @@ class SignalTable:
         """The columns of groups, one group after the other."""
         return cls(tuple(signal for group in groups for signal in group.signals))
 
-    def extended(self, signals: Sequence[Signal]) -> "SignalTable":
-        """This table with further columns behind its own."""
-        return SignalTable((*self.signals, *signals))
-
     def signals_of(self, name: str) -> tuple[Signal, ...]:
         """The signals of a group, see `group`."""
         return self.signals[self.group(name)]
@@ -158,7 +154,7 @@ class SignalTable:
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
-def renamed(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
+def rename_group(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
     """The same quantities by another way, under the name of another group."""
     return tuple(
         replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None)

@@ -26,11 +26,6 @@ def servo_name(joint: str) -> str:
     return f"{joint}_servo"
 
 
-def link_name(joint: str) -> str:
-    """Name of the tendon whose length is q in the series form."""
-    return f"{joint}_link"
-
-
 @dataclass(frozen=True)
 class JointAddresses:
     """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""

@@ -15,7 +15,7 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
-def frozen(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
+def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
     """A copy of a specification in which all joints but the named hinges are held where the first
     keyframe has them.
 
