@@ -220,8 +220,8 @@ def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
         RunningEmulator(EmulatorConfig(model_number=2020)) as newer,
         DynamixelBus(newer.port) as bus,
     ):
-        found = {one.what: one.cure for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
-    assert set(found.values()) == {""}
+        found = {one.what: one.is_good for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
+    assert set(found.values()) == {True}
 
 
 @pytest.mark.parametrize("fault", ["lost", "corrupted"])

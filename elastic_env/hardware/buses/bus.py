@@ -60,6 +60,20 @@ class States:
         return States(**arrays, time_s=max(part.time_s for part in parts))
 
 
+@dataclass(frozen=True)
+class Condition:
+    """State of one servo that decides whether it may get torque."""
+
+    velocity: float
+    """[rad/s]"""
+    temperature: float
+    """[°C]"""
+    temperature_limit: float
+    """Highest temperature by the servo's own setting [°C]."""
+    error: str
+    """The hardware error that it reports, "" if none."""
+
+
 class Bus(Protocol):
     """A port with its attached servos, as the supervisor needs it.
 
@@ -90,20 +104,8 @@ class Bus(Protocol):
         """Present position [rad]."""
         ...
 
-    def read_velocity(self, servo_id: int) -> float:
-        """Present velocity [rad/s]."""
-        ...
-
-    def read_temperature(self, servo_id: int) -> float:
-        """Present temperature [°C]."""
-        ...
-
-    def read_temperature_limit(self, servo_id: int) -> float:
-        """Highest temperature by the servo's own setting [°C]."""
-        ...
-
-    def read_error(self, servo_id: int) -> str:
-        """The hardware error that the servo reports, "" if none."""
+    def read_condition(self, servo_id: int) -> Condition:
+        """Velocity, temperature and hardware error."""
         ...
 
     def write_torque(self, servo_id: int, is_on: bool) -> None:

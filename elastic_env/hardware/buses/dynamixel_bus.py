@@ -14,7 +14,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.hardware.buses import packets
-from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States, servo_name
+from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States, servo_name
 from elastic_env.hardware.buses.packets import word
 from elastic_env.hardware.buses.port import (
     COMM_SUCCESS,
@@ -181,21 +181,15 @@ class DynamixelBus:
         """Present position of one servo [rad]."""
         return self.read(servo_id, "present_position") * self.models[servo_id].position_unit
 
-    def read_velocity(self, servo_id: int) -> float:
-        """Present velocity of one servo [rad/s]."""
-        return self.read(servo_id, "present_velocity") * self.models[servo_id].velocity_unit
-
-    def read_temperature(self, servo_id: int) -> float:
-        """Present temperature of one servo [°C]."""
-        return float(self.read(servo_id, "present_temperature"))
-
-    def read_temperature_limit(self, servo_id: int) -> float:
-        """Highest temperature by the servo's own setting [°C]."""
-        return float(self.read(servo_id, "temperature_limit"))
-
-    def read_error(self, servo_id: int) -> str:
-        """The hardware error that a servo reports, "" if none."""
-        return explain_errors(self.read(servo_id, "hardware_error_status"))
+    def read_condition(self, servo_id: int) -> Condition:
+        """Velocity, temperature and hardware error of one servo."""
+        speed = self.read(servo_id, "present_velocity")
+        return Condition(
+            velocity=speed * self.models[servo_id].velocity_unit,
+            temperature=float(self.read(servo_id, "present_temperature")),
+            temperature_limit=float(self.read(servo_id, "temperature_limit")),
+            error=explain_errors(self.read(servo_id, "hardware_error_status")),
+        )
 
     def write_goal(self, servo_id: int, angle: float) -> None:
         """Command one servo [rad], which confirms it.
