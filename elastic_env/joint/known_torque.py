@@ -165,11 +165,11 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     ids = _ids_of(model, joints)
     _require_flags(model)
     for e in _active(model):
-        acts = _acted_on(model, e)
+        acts, ends = _equality(model, e)
         if acts & ids:
             raise ConfigurationError(
-                f"the model has an equality constraint of {_ends_of(model, e)}, whose torque is not"
-                f" known in advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
+                f"the model has an equality constraint of {ends}, whose torque is not known in"
+                f" advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
             )
     for t in range(model.ntendon):
         if _pulls(model, t) and (acts := _joints_of_tendon(model, t) & ids):
@@ -249,31 +249,26 @@ def _active(model: mujoco.MjModel) -> Iterator[int]:
         yield from (e for e in range(model.neq) if model.eq_active0[e])
 
 
-def _acted_on(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Joints that feel an equality constraint."""
+def _equality(model: mujoco.MjModel, equality: int) -> tuple[set[int], str]:
+    """Joints that feel an equality constraint, and the names of what it couples."""
     kind = int(model.eq_type[equality])
     ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
     if kind == _EQ_JOINT:
-        return set(ends)
-    if kind == _EQ_TENDON:
-        return set().union(*(_joints_of_tendon(model, t) for t in ends))
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-        return _between(model, [int(model.site_bodyid[site]) for site in ends])
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
-        return _between(model, [*ends, 0][:2])
-    return set(range(model.njnt))
-
-
-def _ends_of(model: mujoco.MjModel, equality: int) -> str:
-    kind = int(model.eq_type[equality])
-    of = model.eq_objtype[equality]
-    read = model.joint if kind == _EQ_JOINT else model.tendon if kind == _EQ_TENDON else model.body
-    if of == mujoco.mjtObj.mjOBJ_SITE:
-        read = model.site
-    elif kind not in (_EQ_JOINT, _EQ_TENDON) and of != mujoco.mjtObj.mjOBJ_BODY:
-        return "a deformable body"
-    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
-    return " and ".join(quote(read(i).name)[1:-1] or f"number {i}" for i in ends)
+        acts = set(ends)
+        element = model.joint
+    elif kind == _EQ_TENDON:
+        acts = set().union(*(_joints_of_tendon(model, t) for t in ends))
+        element = model.tendon
+    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        acts = _between(model, [int(model.site_bodyid[site]) for site in ends])
+        element = model.site
+    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
+        acts = _between(model, [*ends, 0][:2])
+        element = model.body
+    else:
+        return set(range(model.njnt)), "a deformable body"
+    names = [quote(element(i).name)[1:-1] or f"number {i}" for i in ends]
+    return acts, " and ".join(names)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> set[int]:

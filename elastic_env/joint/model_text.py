@@ -7,7 +7,6 @@ first (xacro, entities) is refused.
 
 import codecs
 import re
-import stat
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 from xml.parsers import expat
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.files import read_bounded
 
 LARGEST_BYTES = 50_000_000
 """Of a model's file, and of its text."""
@@ -150,21 +150,18 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
         ConfigurationError: It is no regular file, is too large, or cannot be read.
     """
     try:
-        facts = path.stat()
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(
+                f"no {what} at {name_of(path)}: it is no regular file; {_FILE}"
+            )
+        return read_bounded(path, LARGEST_BYTES)
+    except ConfigurationError:
+        raise
+    except PermissionError as error:
+        problem = f"{name_of(path)} cannot be read: {error.strerror}"
     except (OSError, ValueError):
-        raise ConfigurationError(f"no {what} at {name_of(path)}; {_FILE}") from None
-    if not stat.S_ISREG(facts.st_mode):
-        raise ConfigurationError(f"no {what} at {name_of(path)}: it is no regular file; {_FILE}")
-    if facts.st_size > LARGEST_BYTES:
-        raise ConfigurationError(
-            f"{name_of(path)} must have at most {LARGEST_BYTES} bytes, it has {facts.st_size}"
-        )
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(
-            f"{name_of(path)} cannot be read: {error.strerror}; {_FILE}"
-        ) from None
+        problem = f"no {what} at {name_of(path)}"
+    raise ConfigurationError(f"{problem}; {_FILE}")
 
 
 def parse_xml(text: str, name: str) -> ET.Element:

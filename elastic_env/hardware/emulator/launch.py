@@ -3,11 +3,9 @@
 import json
 import subprocess
 import termios
-import time
 from contextlib import AbstractContextManager
 from typing import Any, Self
 
-import numpy as np
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
@@ -19,10 +17,6 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 from elastic_env.robots.testbed.config import TestbedConfig
 
 _END_S = 10.0
-_LONGEST_SWING_S = 10.0
-_REST_RAD_S = 0.02
-_LOOK_S = 0.05
-_STILL_LOOKS = 3  # where a swing turns back it stands still for one look
 
 
 class EmulatorConfig(Model):
@@ -97,27 +91,6 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
         return self._request({"state": True})
-
-    def wait_until_rest(self) -> None:
-        """Wait until joints that were let go have swung out: torque goes on at rest only.
-
-        Raises:
-            HardwareError: They still move after 10 s.
-        """
-        deadline = time.monotonic() + _LONGEST_SWING_S
-        before = self.state()
-        still_looks = 0
-        while still_looks < _STILL_LOOKS:
-            if time.monotonic() > deadline:
-                raise HardwareError(
-                    f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?"
-                )
-            time.sleep(_LOOK_S)
-            now = self.state()
-            moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
-            is_still = moved < _REST_RAD_S * (now["time_s"] - before["time_s"])
-            still_looks = still_looks + 1 if is_still else 0
-            before = now
 
     def wait(self) -> None:
         """Wait until it ends by itself, or an interrupt comes."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
@@ -180,35 +181,17 @@ class ServoPlant:
         """Hardware does not diverge: where something is wrong, an error says what."""
         return np.zeros(1, dtype=np.bool_)
 
-    def bind(self, field: str) -> Array:
-        """Hardware has no fields of MuJoCo.
+    def bind(self, field: object, *_: object) -> NoReturn:
+        """Hardware has no fields of MuJoCo, and no other model than the one it is.
 
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError(f"hardware has no {field!r} of MuJoCo")
+        raise HardwareError(f"hardware has no {field!r} of MuJoCo, and cannot be varied")
 
-    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """As `bind`, for several fields."""
-        return tuple(map(self.bind, fields))
-
-    def vary(self, field: str) -> Array:
-        """Hardware cannot be varied.
-
-        Raises:
-            HardwareError: Always.
-        """
-        raise HardwareError(f"{field!r} of hardware cannot be varied")
-
-    def take(self, world: int, model: mujoco.MjModel) -> None:
-        """Hardware has no other model than the one it is.
-
-        Raises:
-            HardwareError: Always.
-        """
-        raise HardwareError(
-            f"world {world} of hardware cannot take a model of {model.nbody} bodies"
-        )
+    views: Any = bind
+    vary: Any = bind
+    take: Any = bind
 
     def _open_bus(self) -> SupervisedBus:
         settings = self.settings
