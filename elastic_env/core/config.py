@@ -181,10 +181,9 @@ def load_yaml(
     content = read_mapping(file, empty=bool(changes))
     try:
         return model(**{**content, **(changes or {})})
-    except ModelError as error:
-        raise ConfigurationError(f"in {shorten(file)}: {error.named()}") from None
     except ConfigurationError as error:
-        raise ConfigurationError(f"in {shorten(file)}: {error}") from None
+        problem = error.named() if isinstance(error, ModelError) else error
+        raise ConfigurationError(f"in {shorten(file)}: {problem}") from None
 
 
 def load_json(

@@ -32,11 +32,7 @@ _CURES = {
     "mass and inertia of moving bodies": (
         "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero"
     ),
-    "inertia must": (
-        "the inertia must be that of a body: positive, and no main value above the sum of the"
-        " other two"
-    ),
-    "inertia matrix": (
+    "inertia m": (
         "the inertia must be that of a body: positive, and no main value above the sum of the"
         " other two"
     ),

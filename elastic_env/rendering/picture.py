@@ -102,6 +102,13 @@ class ModelPicture(ABC):
         return self._caption(now, world)
 
 
+def paint(spec: mujoco.MjSpec, rgba: Rgba) -> None:
+    """Give all shapes one colour."""
+    for geom in spec.geoms:
+        geom.rgba = rgba
+        geom.material = ""
+
+
 def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
     """Size of the images [pixels], a light background, and soft light from the side of the
     camera.

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.rendering.picture import Image, renderer, set_stage
+from elastic_env.rendering.picture import Image, Rgba, paint, renderer, set_stage
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 
 ENLARGED = 8.0
@@ -37,7 +37,7 @@ class SagViews:
         self._model = shown.compile()
         self._joints = list(joints)
 
-    def drawn(self, q_ref: Array, links: Array) -> Image:
+    def draw(self, q_ref: Array, links: Array) -> Image:
         """Views in a row.
 
         Args:
@@ -61,16 +61,14 @@ class SagViews:
         return np.concatenate(views, axis=1)
 
 
-def _painted(spec: mujoco.MjSpec, rgba: Sequence[float]) -> mujoco.MjSpec:
+def _painted(spec: mujoco.MjSpec, rgba: Rgba) -> mujoco.MjSpec:
     """A copy in one colour, without floors."""
     copy = spec.copy()
     for geom in [geom for geom in copy.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         copy.delete(geom)
     if not copy.geoms:
         add_simple_bodies(copy)
-    for geom in copy.geoms:
-        geom.rgba = rgba
-        geom.material = ""
+    paint(copy, rgba)
     return copy
 
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.rendering.picture import Rgba, set_stage
+from elastic_env.rendering.picture import paint, set_stage
 
 REFERENCE, MOTOR, LINK = COPIES = ("reference_", "motor_", "link_")
 """Prefixes of the names of the three robots, from left to right."""
@@ -101,28 +101,23 @@ class SideBySide:
     def __init__(self, robot: Alone) -> None:
         spec = mujoco.MjSpec()
         set_stage(spec, _SIZE, _SIZE)
-        for name in (
-            "cone",
-            "impratio",
-            "integrator",
-        ):  # as attaching wants them; nothing is stepped
+        for name in ("cone", "impratio", "integrator"):  # as attaching wants them
             setattr(spec.option, name, getattr(robot.spec.option, name))
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         robot.dress(spec)
-        forward = np.cross(
-            [0.0, 0.0, 1.0], robot.right
-        )  # where a viewer looks who sees them from left to right
+        # where a viewer looks who sees them from left to right
+        forward = np.cross([0.0, 0.0, 1.0], robot.right)
         spec.visual.global_.azimuth = float(np.degrees(np.arctan2(forward[1], forward[0])))
         spec.visual.global_.elevation = _ELEVATION_DEG
         self._offsets = {
             copy: (number - 1) * np.array(robot.right) for number, copy in enumerate(COPIES)
         }
         for copy, rgba in zip(COPIES, (_REFERENCE_RGBA, _MOTOR_RGBA, None), strict=True):
-            spec.attach(
-                _painted(robot.spec, rgba),
-                prefix=copy,
-                frame=spec.worldbody.add_frame(pos=self._offsets[copy]),
-            )
+            own = robot.spec.copy()
+            if rgba is not None:
+                paint(own, rgba)
+            frame = spec.worldbody.add_frame(pos=self._offsets[copy])
+            spec.attach(own, prefix=copy, frame=frame)
         self.model = spec.compile()
         self._robot = robot
 
@@ -143,11 +138,3 @@ class SideBySide:
                 pose = enlarged_pose(sides.base_ref, bases[copy], factor)
                 pose[:3] += self._offsets[copy]
                 data.joint(copy + self._robot.base).qpos = pose
-
-
-def _painted(spec: mujoco.MjSpec, rgba: Rgba | None) -> mujoco.MjSpec:
-    copy = spec.copy()
-    for geom in copy.geoms if rgba is not None else []:
-        geom.rgba = rgba
-        geom.material = ""
-    return copy

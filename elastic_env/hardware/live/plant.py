@@ -5,8 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
@@ -26,13 +25,16 @@ _SHORTEST_MOVE_S = 0.5
 _SETTLE_S = 0.5
 
 
-@dataclass(frozen=True)
-class CycleTiming:
-    """How well the last control period was kept; counts are of the episode."""
+class CycleRecord(NamedTuple):
+    """The motor's torque, and how well the last control period was kept; counts are of the
+    episode.
+    """
 
-    jitter_s: float = 0.0
+    joint_torque: float = np.nan
+    """By the motor current [N·m]."""
+    jitter: float = 0.0
     """How late the reading was, or the command for it [s]."""
-    period_s: float = 0.0
+    period: float = 0.0
     """Time since the reading before [s]."""
     overruns: int = 0
     """Periods that were more than half a period late, see `Pace`."""
@@ -73,8 +75,7 @@ class ServoPlant:
         self.qvel: Array = np.full((1, model.nv), np.nan)
         self.act: Array = np.zeros((1, model.na))
         self.ctrl: Array = np.zeros((1, model.nu))
-        self.motor_torque = np.full(1, np.nan)
-        self.timing = CycleTiming()
+        self.record = CycleRecord()
         self._at = at
         self._period_s = period_s
         self._pendulum_nm = pendulum_nm
@@ -121,7 +122,7 @@ class ServoPlant:
             self._move(start, angle)
             for _ in range(round(_SETTLE_S / self._period_s)):
                 self._cycle(angle)
-            self.timing = CycleTiming()
+            self.record = CycleRecord(self.record.joint_torque)
             bus.keep(self._servo_goal(angle))
             self._is_kept = True
 
@@ -248,12 +249,14 @@ class ServoPlant:
                 break
             missed += 1
         self._read(cycle)
-        self.timing = CycleTiming(
-            jitter_s=late_s,
-            period_s=cycle.states.time_s - self._read_s,
-            overruns=self.timing.overruns + overruns,
-            missed_replies=self.timing.missed_replies + missed,
-            limited=self.timing.limited + is_limited,
+        torque = float(torque_of_current(cycle.states.current[0]))
+        self.record = CycleRecord(
+            joint_torque=self.settings.direction * torque,
+            jitter=late_s,
+            period=cycle.states.time_s - self._read_s,
+            overruns=self.record.overruns + overruns,
+            missed_replies=self.record.missed_replies + missed,
+            limited=self.record.limited + is_limited,
         )
         self._read_s = cycle.states.time_s
 
@@ -264,7 +267,6 @@ class ServoPlant:
         self._goal = settings.joint_angle(float(cycle.goals[0]))
         self.qpos[0, self._at.theta[0]] = settings.joint_angle(float(states.position[0]))
         self.qvel[0, self._at.theta_dot[0]] = settings.direction * float(states.velocity[0])
-        self.motor_torque[0] = settings.direction * float(torque_of_current(states.current[0]))
         if self._imu is not None:
             sample = self._imu.latest()
             q = sample.link_angle(settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)

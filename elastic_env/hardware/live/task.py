@@ -11,16 +11,16 @@ What differs, because a real joint does not tell it:
 | `truth()`, and with it the policy `oracle` | an error |
 
 Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies`
-and `limited`, see `elastic_env.hardware.live.plant.CycleTiming`.
+and `limited`, see `elastic_env.hardware.live.plant.CycleRecord`.
 """  # noqa: E501
 
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
-from elastic_env.core.signals import Array, BoolArray, Signals
+from elastic_env.core.signals import BoolArray, Signals
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.live.plant import ServoPlant
+from elastic_env.hardware.live.plant import CycleRecord, ServoPlant
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
@@ -38,12 +38,10 @@ TIMING_METRICS = (
     Metric("limited", "limited", "max", over="all"),
 )
 _CYCLE = record_type(
-    ("joint_torque", REAL),
-    ("jitter", REAL),
-    ("period", REAL),
-    ("overruns", WHOLE),
-    ("missed_replies", WHOLE),
-    ("limited", WHOLE),
+    *(
+        (name, REAL if kind is float else WHOLE)
+        for name, kind in get_type_hints(CycleRecord).items()
+    )
 )
 _LINK = JointTask.world_type
 
@@ -116,16 +114,7 @@ class HardwareTestbedTask(TestbedTask):
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Several where a cycle had to be repeated."""
-        return float(np.rint(max(self.plant.timing.period_s / self.config.control_period_s, 1.0)))
+        return float(np.rint(max(self.plant.record.period / self.config.control_period_s, 1.0)))
 
     def _keep_cycle(self) -> None:
-        timing = self.plant.timing
-        motor_torque: Array = self.plant.motor_torque
-        self._worlds[self._row]["cycle"] = (
-            motor_torque[0],
-            timing.jitter_s,
-            timing.period_s,
-            timing.overruns,
-            timing.missed_replies,
-            timing.limited,
-        )
+        self._worlds[self._row]["cycle"] = tuple(self.plant.record)

@@ -4,7 +4,7 @@ import contextlib
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -299,44 +299,35 @@ def emergency_stop(
         What came of it, in words.
     """
     problems: list[str] = []
-    buses: list[DynamixelBus] = []
-    with contextlib.ExitStack() as opened:
-        for number, (port, ids) in enumerate(ports.items()):
-            bus = DynamixelBus(port, baudrate)
+    buses = [DynamixelBus(port, baudrate) for port in ports]
+    try:
+        for number, (bus, ids) in enumerate(zip(buses, ports.values(), strict=True)):
             try:
                 bus.open()
-                opened.enter_context(_closing(bus))
-                known = (
-                    dict(zip(ids, models[number], strict=True))
-                    if models
-                    else _ask_models(bus, ids, problems)
-                )
-                bus.attach_known(known)
-                buses.append(bus)
+                known = models[number] if models else _ask_models(bus, ids, problems)
+                bus.attach_known({i: model for i, model in zip(ids, known, strict=True) if model})
             except HardwareError as error:
                 problems.append(f"torque could not be switched off: {error}")
-        problem = BusGroup(buses).torque_off() if buses else None
+        reached = [bus for bus in buses if bus.models]
+        problem = BusGroup(reached).torque_off() if reached else None
+    finally:
+        for bus in buses:
+            with contextlib.suppress(HardwareError):  # one that is gone cannot be closed
+                bus.close()
     if problem is not None:
         problems.append(str(problem))
-    elif any(bus.models for bus in buses):
+    elif reached:
         problems.append("torque of the others is off" if problems else "torque is off")
     return "; ".join(dict.fromkeys(problems))
 
 
-@contextlib.contextmanager
-def _closing(bus: DynamixelBus) -> Iterator[None]:
-    """Close a bus at the end; one that is gone cannot be, which has been said before."""
-    yield
-    with contextlib.suppress(HardwareError):
-        bus.close()
-
-
-def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> dict[int, int]:
-    """Model numbers of the servos that answer, by id; adds those that do not to the problems."""
-    models = {}
+def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> list[int]:
+    """Model numbers of the servos, 0 of those that do not answer, which is a problem more."""
+    models = []
     for servo_id in ids:
         try:
-            models[servo_id] = bus.ping(servo_id).model_number
+            models.append(bus.ping(servo_id).model_number)
         except ReplyError as error:
+            models.append(0)
             problems.append(f"torque could not be switched off: {error}")
     return models
