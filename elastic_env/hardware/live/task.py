@@ -37,12 +37,8 @@ TIMING_METRICS = (
     Metric("missed_replies", "missed_replies", "max", over="all"),
     Metric("limited", "limited", "max", over="all"),
 )
-_CYCLE = record_type(
-    *(
-        (name, REAL if kind is float else WHOLE)
-        for name, kind in get_type_hints(CycleRecord).items()
-    )
-)
+_KINDS = {float: REAL, int: WHOLE}
+_CYCLE = record_type(*((name, _KINDS[of]) for name, of in get_type_hints(CycleRecord).items()))
 _LINK = JointTask.world_type
 
 
