@@ -227,42 +227,30 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
 
     Args:
         file: It.
-        empty: Whether an empty file is taken, as an empty mapping.
+        empty: True to take an empty file, as an empty mapping.
 
     Raises:
         ConfigurationError: The file cannot be read, is no YAML, or holds something else.
     """
     try:
-        content = parse_yaml(_text_of(file))
+        content = parse_yaml(read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8"))
+    except ConfigurationError:
+        raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{shorten(file)} is not valid YAML: {error}") from None
+    except IsADirectoryError:
+        raise ConfigurationError(f"{shorten(file)} is a folder, a YAML file is needed") from None
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+        listing = f"; found beside it: {list_names(known)}" if known else configurations_are(file)
+        raise ConfigurationError(f"no configuration file at {shorten(file)}{listing}") from None
+    except OSError as error:
+        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None
     if content is None and empty:
-        content = {}
+        return {}
     if not isinstance(content, dict):
         got = "an empty file" if content is None else type(content).__name__
         raise ConfigurationError(
             f"{shorten(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
         )
     return content
-
-
-def _text_of(file: Path) -> str:
-    """Text of a file that is one, and no longer than a configuration is.
-
-    Raises:
-        ConfigurationError: It is missing, a folder or too long, or cannot be read.
-    """
-    try:
-        if file.is_dir():
-            raise ConfigurationError(f"{shorten(file)} is a folder, a YAML file is needed")
-        if not file.exists():
-            known = (
-                sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
-            )
-            listing = (
-                f"; found beside it: {list_names(known)}" if known else configurations_are(file)
-            )
-            raise ConfigurationError(f"no configuration file at {shorten(file)}{listing}")
-        return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None

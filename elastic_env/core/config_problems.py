@@ -121,20 +121,20 @@ def _problems(
 
 def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
     given = quote(problem["input"])
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
         case "extra_forbidden":
             return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
         case "missing":
-            field = model.model_fields.get(str(path[-1]))
             meaning = f": {field.description}" if field is not None and field.description else ""
-            return Problem(path, "missing", f"{_unit(model, path)}{meaning}")
+            return Problem(path, "missing", f"{_unit(field)}{meaning}")
         case "value_error":
             return Problem(path, "rule", str(problem["ctx"]["error"]))
         case "string_pattern_mismatch":
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
     context = problem.get("ctx", {})
-    if bounds := _bounds(model, path):
+    if bounds := _bounds(field):
         requirement = f"be {bounds}"
     elif kind := _REQUIREMENTS.get(problem["type"]):
         requirement = kind.format(
@@ -142,12 +142,9 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
         )
     else:
         requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     meaning = meaning_of(field) if field is not None else ""
     in_brackets = f" ({meaning})" if meaning else ""
-    return Problem(
-        path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}"
-    )
+    return Problem(path, "must", f"must {requirement}{_unit(field)}, got {given}{in_brackets}")
 
 
 _REQUIREMENTS = {
@@ -185,24 +182,22 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
     return tuple(path)
 
 
-def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
+def _bounds(field: FieldInfo | None) -> str:
     """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one
     without.
     """
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    if field is None:
+        return ""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     constraints = [
         f"{sign} {_number(getattr(constraint, key))}"
-        for constraint in (field.metadata if field is not None else [])
+        for constraint in field.metadata
         for key, sign in signs.items()
         if hasattr(constraint, key)
     ]
-    whole = (
-        field is not None
-        and "int" in str(field.annotation)
-        and "float" not in str(field.annotation)
-    )
-    kind = "a whole number" if whole else "a finite number"
+    annotation = str(field.annotation)
+    is_whole = "int" in annotation and "float" not in annotation
+    kind = "a whole number" if is_whole else "a finite number"
     return f"{kind} {' and '.join(constraints)}" if constraints else ""
 
 
@@ -221,7 +216,6 @@ def meaning_of(field: FieldInfo) -> str:
     return sentence.removesuffix(f" [{field.json_schema_extra['unit']}]")
 
 
-def _unit(model: type[BaseModel], path: ParameterPath) -> str:
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+def _unit(field: FieldInfo | None) -> str:
     extra = field.json_schema_extra if field is not None else None
     return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""

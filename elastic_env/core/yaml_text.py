@@ -82,12 +82,9 @@ class _Loader(Composer, yaml.CSafeLoader):
             raise _refusal(
                 node, f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}"
             )
+        is_whole = node.tag == f"{_TAG}int"
         try:
-            return (
-                self.construct_yaml_int(node)
-                if node.tag == f"{_TAG}int"
-                else self.construct_yaml_float(node)
-            )
+            return (self.construct_yaml_int if is_whole else self.construct_yaml_float)(node)
         except ValueError:
             raise _refusal(
                 node, f"{text!r} is no number; put text that looks like one in quotes"
@@ -127,9 +124,8 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
     """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an
     alias.
     """
-    lines = (
-        [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
-    )
+    is_clear = error.problem is None or error.problem.startswith("the alias")
+    lines = [] if is_clear else text.splitlines()
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
@@ -139,7 +135,7 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
             key = found["key"][:40]
             key = key if "[" in key and "]" in key else key.strip("[]")
             value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
-            return _refusal_at(mark, f'put the pattern in quotes: "{key}"{value}')
+            return _refusal(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
 
 
@@ -173,9 +169,7 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
         value: Plain data without a mapping or list in it that holds another one.
         comment: Its characters that do not print become spaces.
     """
-    flow = (
-        None if isinstance(value, dict | list) else False
-    )  # None: only what holds no mapping or list
+    flow = None if isinstance(value, dict | list) else False  # None: where it holds no mapping
     text = yaml.dump(
         {name: value},
         Dumper=_Dumper,
@@ -205,11 +199,8 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
         if key.tag == f"{_TAG}merge":
             continue
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
-            what = (
-                repr(loader.construct_object(key))
-                if isinstance(key, yaml.ScalarNode)
-                else f"a {key.id}"
-            )
+            is_scalar = isinstance(key, yaml.ScalarNode)
+            what = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
             raise _refusal(
                 key,
                 f"the name of a parameter must be text, got {what}; put it in quotes if it is"
@@ -230,9 +221,5 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
-    """An error that names the place."""
-    return _refusal_at(at.start_mark, problem)
-
-
-def _refusal_at(mark: Any, problem: str) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+    """An error that names the place, which is a node, an event or a mark."""
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=getattr(at, "start_mark", at))

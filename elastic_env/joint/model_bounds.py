@@ -28,6 +28,7 @@ MOST_PIXELS = 2**28
 MOST_ASSET_BYTES = 500_000_000
 """Of all meshes and pictures of a model together."""
 
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
@@ -110,11 +111,12 @@ class _Counts:
 
     def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
         """Count a document of MJCF; `files` are those in which it is included."""
-        for compiler in root.iter("compiler"):
-            self._folders += [
-                compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
-            ]
+        self._add_folders(root)
         self._walk(root, files, 1.0, in_world=False, depth=len(files))
+
+    def _add_folders(self, root: ET.Element) -> None:
+        for compiler in root.iter("compiler"):
+            self._folders += [compiler.get(key, "") for key in _FOLDERS]
 
     def _walk(
         self,
@@ -164,10 +166,7 @@ class _Counts:
     ) -> None:
         root, path = self._document(name, files)
         if root is not None:
-            for compiler in root.iter("compiler"):
-                self._folders += [
-                    compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
-                ]
+            self._add_folders(root)
             for part in root:
                 self._walk(part, (*files, path), copies, in_world, depth + 1)
 
