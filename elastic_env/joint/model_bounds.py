@@ -28,7 +28,8 @@ MOST_PIXELS = 2**28
 MOST_ASSET_BYTES = 500_000_000
 """Of all meshes and pictures of a model together."""
 
-_FOLDERS = ("meshdir", "texturedir", "assetdir")
+FOLDERS = ("meshdir", "texturedir", "assetdir")
+"""Attributes of <compiler> that name a folder of files."""
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
@@ -116,7 +117,7 @@ class _Counts:
 
     def _add_folders(self, root: ET.Element) -> None:
         for compiler in root.iter("compiler"):
-            self._folders += [compiler.get(key, "") for key in _FOLDERS]
+            self._folders += [compiler.get(key, "") for key in FOLDERS]
 
     def _walk(
         self,

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, quote
-from elastic_env.joint.model_bounds import require_bounds
+from elastic_env.joint.model_bounds import FOLDERS, require_bounds
 from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
 GivenModel = str | Path | mujoco.MjSpec | mujoco.MjModel
@@ -53,7 +53,6 @@ _READABLE = (".stl", ".obj")
 _PACKAGE = "package://"
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
-_OF_FILES = ("meshdir", "texturedir", "assetdir")
 
 
 @dataclass(frozen=True)
@@ -217,7 +216,7 @@ def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
     own = ET.SubElement(robot, "mujoco") if own is None else own
     compilers = own.findall("compiler") or [ET.SubElement(own, "compiler")]
     for compiler in compilers:
-        for key in _OF_FILES:
+        for key in FOLDERS:
             compiler.attrib.pop(key, None)
         compiler.attrib.update(_URDF_OPTIONS)
     text = ET.tostring(robot, encoding="unicode")

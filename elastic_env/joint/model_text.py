@@ -49,24 +49,6 @@ _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
 """Children of a robot that old files of xacro have without prefix."""
-_URDF_PARTS = {
-    "robot",
-    "link",
-    "joint",
-    "origin",
-    "mass",
-    "inertia",
-    "axis",
-    "limit",
-    "dynamics",
-    "parent",
-    "child",
-    "mimic",
-    "box",
-    "cylinder",
-    "sphere",
-    "mesh",
-}
 _PLACEHOLDER = re.compile(r"\$[{(]")
 
 
@@ -282,4 +264,4 @@ def _parts(robot: ET.Element) -> Iterator[ET.Element]:
     yield robot
     for part in robot:
         if part.tag in ("link", "joint"):
-            yield from (element for element in part.iter() if element.tag in _URDF_PARTS)
+            yield from part.iter()
