@@ -240,7 +240,7 @@ def test_a_sample_whose_writer_died_within_is_none() -> None:
     writer._memory[0] = 1  # odd: a write has begun
     _within_seconds(lambda: seen.append(reader.get()))
     writer._memory[0] = 0
-    writer.put(sample)
+    writer.write(sample)
     seen.append(reader.get())
     writer._memory[0] = 3
     _within_seconds(lambda: seen.append(reader.get()))

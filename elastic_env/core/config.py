@@ -49,8 +49,7 @@ def quantity(
 
 
 def plain_numbers(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's numbers and lists, also within lists, tuples and
-    mappings.
+    """NumPy's numbers and arrays as Python's numbers and lists, also within containers.
 
     A number of less than double precision becomes what it is written as: 1.6 and not
     1.600000023841858.
@@ -73,9 +72,7 @@ def plain_numbers(value: Any) -> Any:
 
 
 def _with_strict_numbers(schema: Any) -> Any:
-    """A schema of Pydantic's whose numbers are strict wherever they stand, and may be NumPy's;
-    lists may be arrays.
-    """
+    """Pydantic's schema with strict numbers, which may be NumPy's; lists may be arrays."""
     if isinstance(schema, list | tuple):
         return type(schema)(_with_strict_numbers(part) for part in schema)
     if not isinstance(schema, dict) or schema.get("strict"):
@@ -182,7 +179,7 @@ def load_yaml(
     try:
         return model(**{**content, **(changes or {})})
     except ConfigurationError as error:
-        problem = error.named() if isinstance(error, ModelError) else error
+        problem = error.describe() if isinstance(error, ModelError) else error
         raise ConfigurationError(f"in {shorten(file)}: {problem}") from None
 
 
@@ -219,7 +216,9 @@ def load_json(
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(f"{shorten(path)} describes no {what}: {error.named()}") from None
+        raise ConfigurationError(
+            f"{shorten(path)} describes no {what}: {error.describe()}"
+        ) from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:

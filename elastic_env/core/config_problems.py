@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
-"""Where a value stands: the keys and numbers of entries that lead to it."""
+"""Keys and numbers of entries that lead to a value."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ _LONGEST_SAID = 1900
 """Problems and characters, after which an error says how many more problems there are."""
 
 
-def dotted(path: ParameterPath) -> str:
+def join_path(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
     return ".".join(
         part if isinstance(part, str) and len(part) < 100 else quote(part) for part in path
@@ -76,11 +76,12 @@ class ModelError(ConfigurationError):
 
     def __str__(self) -> str:
         """All problems, one per line, in the words of who made the model in Python."""
-        return self.named(self.model)
+        return self.describe(self.model)
 
-    def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
-        """All problems, one per line, in the words of who wrote a file or options; arguments as
-        `Problem.sentence`.
+    def describe(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = join_path) -> str:
+        """All problems, one per line, for who wrote a file or options.
+
+        Arguments as in `Problem.sentence`.
         """
         sentences = list(
             dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems)
@@ -163,9 +164,7 @@ _REQUIREMENTS = {
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
-    """A location without what Pydantic adds to it: the member of a union that it tried, or that
-    a tag chose.
-    """
+    """A location without what Pydantic adds to it: the member of a union."""
     path: list[str | int] = []
     for number, part in enumerate(location):
         inside: Any = None
@@ -183,9 +182,7 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
 
 
 def _bounds(field: FieldInfo | None) -> str:
-    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one
-    without.
-    """
+    """Requirement of a parameter with bounds, such as "a finite number > 0", else empty."""
     if field is None:
         return ""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}

@@ -162,7 +162,7 @@ def _number(cell: str) -> float:
 
 
 def _cure_of(cell: str) -> str:
-    """What to do about a cell that is no finite number."""
+    """Cure for a cell that is no finite number."""
     if math.isnan(_number(cell.replace(",", "."))) and "nan" not in cell.lower():
         return "give a number, or delete the line"
     if "," in cell:

@@ -88,8 +88,7 @@ def quote(value: Any) -> str:
 
 
 def shorten(text: object, longest: int = _LONGEST_SHOWN) -> str:
-    """Text of a user's as an error shows it without quotes, such as a path: its begin and end,
-    where it is long.
+    """Text of a user as an error shows it without quotes: begin and end of what is long.
 
     Args:
         text: It.

@@ -41,8 +41,7 @@ def _packages_of(extra: str) -> list[str]:
 
 
 def configurations_are(file: Path) -> str:
-    """Where the configurations are, for an error about one that does not exist; empty where none of
-    them is meant.
+    """Sentence for an error about a missing file: where the configurations are, or empty.
 
     Args:
         file: The one that was named.

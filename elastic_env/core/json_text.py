@@ -1,6 +1,4 @@
-"""JSON of bounded size, with finite numbers and text that a file can hold: what others may have
-written.
-"""
+"""JSON that others may have written: of bounded size, with finite numbers and plain text."""
 
 import json
 import math

@@ -1,6 +1,4 @@
-"""Named arrays that know their units: the one description of what an observation or an action
-holds.
-"""
+"""Named arrays that know their units: the columns of observations and actions."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +20,7 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Kind: TypeAlias = Literal["measured", "reference", "command"]
 Mirrored: TypeAlias = Literal["same", "opposite", "complement"]
-"""What a value p is where left and right change places: p, −p, or 1 − p as of a share."""
+"""A value p where left and right change places: p, −p, or 1 − p as of a share."""
 
 
 @dataclass(frozen=True)
@@ -123,15 +121,14 @@ class SignalTable:
         return self.signals[self.group(name)]
 
     def columns(self, *names: str) -> slice | list[int]:
-        """Where the named columns stand, a slice if they are neighbours."""
+        """Indices of the named columns, a slice if they are neighbours."""
         indices = [self.names.index(name) for name in names]
         if indices == list(range(indices[0], indices[0] + len(indices))):
             return slice(indices[0], indices[0] + len(indices))
         return indices
 
     def group(self, name: str) -> slice:
-        """Where the signal of that name stands, or the signals whose names begin with it and a dot,
-        in order.
+        """Columns of the signal of that name, or of those whose names begin with it and a dot.
 
         Raises:
             ConfigurationError: There is none, or they are not neighbours.

@@ -1,5 +1,4 @@
-"""YAML as configurations need it: plain data of bounded size, and nothing that YAML 1.1 makes of
-text.
+"""YAML for configurations: plain data of bounded size, without YAML 1.1's guesses.
 
 What `yaml_of` and `yaml_line` write, `parse_yaml` reads.
 
@@ -29,8 +28,7 @@ NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one
-    too.
+    """PyYAML's loader with limits and the numbers of YAML 1.2 (1e3), without dates and tags.
 
     PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast
     as PyYAML's.
@@ -97,8 +95,7 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values,
-    and None.
+    """Content of a text in YAML: plain mappings with text as keys, lists and scalars.
 
     Raises:
         yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as
@@ -121,9 +118,7 @@ _PATTERN = re.compile(
 
 
 def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
-    """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an
-    alias.
-    """
+    """The error with its cure, where a pattern's star is taken for YAML's sign of an alias."""
     is_clear = error.problem is None or error.problem.startswith("the alias")
     lines = [] if is_clear else text.splitlines()
     for mark in (error.context_mark, error.problem_mark):
@@ -140,9 +135,7 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3,
-    or would fold.
-    """
+    """PyYAML's dumper with quotes around text that `parse_yaml` would read as a number or fold."""
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Text; with escapes where it holds line ends or other characters that do not print."""
@@ -154,15 +147,12 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
 
 
 def yaml_of(content: Any) -> str:
-    """Plain data as YAML that `parse_yaml` reads: mappings with text as keys, lists, text,
-    numbers and the like.
-    """
+    """Plain data as YAML that `parse_yaml` reads."""
     return yaml.dump(content, Dumper=_Dumper, allow_unicode=True, sort_keys=False)
 
 
 def yaml_line(name: str, value: Any, comment: str) -> str:
-    """An entry of a mapping with a comment behind it, on a line of its own; a long name takes two
-    lines.
+    """An entry of a mapping with a comment, on its own line; a long name takes two lines.
 
     Args:
         name: Key of the entry, any text that a file can hold.

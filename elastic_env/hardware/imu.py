@@ -116,7 +116,7 @@ class SharedSample:
         os.ftruncate(descriptor, _SIZE)
         return descriptor
 
-    def put(self, sample: Attitude) -> None:
+    def write(self, sample: Attitude) -> None:
         """Replace the sample."""
         counter = self._counter()
         _COUNTER.pack_into(self._memory, 0, counter + 1)

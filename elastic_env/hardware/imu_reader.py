@@ -33,7 +33,7 @@ def read(shared: SharedSample, port: str, baudrate: int) -> None:
         for packet in node.getDataPackets(_WAIT_MS):
             sample = _attitude(packet)
             if sample is not None and sample.time_s > begin + _STALE_AT_FIRST_S:
-                shared.put(sample)
+                shared.write(sample)
     connection.disconnect()
 
 

@@ -78,7 +78,7 @@ class HardwareSettings(Model):
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
     imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
-    """What it shows where q is 0 [rad]."""
+    """Euler angle that it shows at q = 0 [rad]."""
     largest_deflection_rad: float = quantity("rad", 0.2, ge=1e-3, le=1)
     """Bend that stops it, by the IMU [rad]."""
     approach_rad_s: float = quantity("rad/s", 0.2, ge=0.01, le=2)

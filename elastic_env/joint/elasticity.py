@@ -54,9 +54,7 @@ class Servo(Model):
 
     @property
     def integral_limit(self) -> float:
-        """Largest magnitude of the integral of the position error [rad·s]; 0 without an
-        integrator.
-        """
+        """Largest magnitude of the position error's integral [rad·s]; 0 without one."""
         if self.integral_gain == 0.0:
             return 0.0
         return (self.torque_limit + self.velocity_gain * self.speed_limit) / self.integral_gain
@@ -124,8 +122,7 @@ def joint_torque(
 
 
 def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter = 0.0) -> Array:
-    r"""Deflection at rest under a joint torque, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band
-    towards the load.
+    r"""Deflection at rest, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band towards the load.
 
     Args:
         torque: τ_J, (..., n) [N·m]; at rest the gravity torque.
@@ -152,8 +149,7 @@ def static_link_angle(
     max_iterations: int = 50,
     unique: bool = True,
 ) -> Array:
-    r"""Link angle at rest for a motor angle: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q =
-    θ.
+    r"""Link angle at rest: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q = θ.
 
     Where the load bends a spring far, Newton's steps may fail or end at another equilibrium. There
     the load grows from zero, see `follow_load`.

@@ -1,6 +1,4 @@
-"""A model of the joints that matter: all other joints are held in place, so that only named
-hinges move.
-"""
+"""Models in which only named hinges move: all other joints are held in place."""
 
 from collections.abc import Collection
 
@@ -16,8 +14,7 @@ _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
 def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
-    """A copy of a specification in which all joints but the named hinges are held where the first
-    keyframe has them.
+    """A copy in which all joints but the named hinges are held at the first keyframe.
 
     Held joints are taken out and their bodies put in place. Actuators, sensors, tendons and
     constraints of held joints go with them, and so do all keyframes and all sensors.

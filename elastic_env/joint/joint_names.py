@@ -1,6 +1,4 @@
-"""Names that an elastic joint gives to its parts, and where its angles stand in a compiled
-model.
-"""
+"""Names that an elastic joint gives to its parts, and addresses of its angles in a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ def servo_name(joint: str) -> str:
 
 @dataclass(frozen=True)
 class JointAddresses:
-    """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""
+    """Indices of motor and link angles of the elastic joints in `qpos` and `qvel`, each (n,)."""
 
     theta: IntArray
     q: IntArray

@@ -10,9 +10,7 @@ from elastic_env.joint.joint_names import JointAddresses, servo_name
 
 @dataclass(frozen=True)
 class Keyframes:
-    """The keyframes of the rigid model, and its joints and actuators in the order of their
-    vectors.
-    """
+    """The rigid model with its keyframes, and its elements in the order of their vectors."""
 
     model: mujoco.MjModel
     joints: list[mujoco.MjsJoint]
@@ -73,6 +71,6 @@ def give_keyframes(spec: mujoco.MjSpec, keyframes: Keyframes | None, joints: Seq
 
 
 def _states(model: mujoco.MjModel, actuator: int) -> slice:
-    """Where an actuator's own state stands in `act`; empty without one."""
+    """Columns of an actuator's own state in `act`; empty without one."""
     first = int(model.actuator_actadr[actuator])
     return slice(first, first + int(model.actuator_actnum[actuator]))

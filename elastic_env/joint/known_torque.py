@@ -1,5 +1,4 @@
-"""The one judgement of what a compensator can know of a model: which joints move, and what else
-acts on them.
+"""Judgement of a model for compensators: which joints move, and what else acts on them.
 
 Everything that a model has is either part of the torque at rest, held, or refused with its name.
 """
@@ -47,7 +46,7 @@ def hinges_of(model: mujoco.MjModel) -> list[str]:
 
 
 def has_nameless_hinge(model: mujoco.MjModel) -> bool:
-    """Whether a hinge has no name, by which its stiffness could be given."""
+    """True if a hinge has no name, by which its stiffness could be given."""
     return any(not model.joint(j).name for j in _hinges(model))
 
 
@@ -85,8 +84,9 @@ def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list
 def without_fingers(
     model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]
 ) -> list[str]:
-    """The joints without the fingers that the model couples and that nobody names; arguments as
-    `commanded_hinges`.
+    """The joints without the fingers that the model couples and that nobody names.
+
+    Arguments as in `commanded_hinges`.
     """
     joints = list(joints)
     fingers = [name for name in coupled_fingers(model) if name in joints and name not in named]
@@ -100,8 +100,7 @@ def without_fingers(
 
 
 def coupled_fingers(model: mujoco.MjModel) -> list[str]:
-    """Hinges of grippers whose fingers follow one another: joints that equalities couple, side by
-    side at the end.
+    """Hinges of fingers that follow one another: coupled by equalities, side by side at the end.
 
     Two fingers are on different branches, and carry no other joint. Coupled joints within the arm
     are none.
@@ -355,9 +354,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
-    """Whether coupled joints are fingers: on two branches at least, and with no other joint
-    beyond them.
-    """
+    """True if coupled joints are fingers: on two branches or more, with no joint beyond them."""
     bodies = {int(model.jnt_bodyid[j]) for j in group}
     carried = {j for j in range(model.njnt) if _chain(model, int(model.jnt_bodyid[j])) & group}
     first = [body for body in bodies if not _chain(model, int(model.body_parentid[body])) & group]

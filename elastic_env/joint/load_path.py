@@ -140,9 +140,7 @@ class _Springs:
     tolerance: float
 
     def settle(self, start: Array, load: Array, rows: BoolArray) -> tuple[Array, BoolArray]:
-        """Equilibria under shares of the load by Newton's steps, and which rows have a stable
-        one near the start.
-        """
+        """Equilibria under shares of the load by Newton's steps; rows with a stable one near."""
         C = load * self.compliance
         q = start
         is_good = rows
@@ -175,8 +173,9 @@ class _Springs:
     def others(
         self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None
     ) -> tuple[IntArray, Array]:
-        """Joints that can rest elsewhere, and where, nan for none: found along each joint alone,
-        then of all joints.
+        """Joints that can rest elsewhere, and where, nan for none.
+
+        They are found along each joint alone, then of all joints.
         """
         n = q.shape[-1]
         lowest, highest = (np.full(n, -np.inf), np.full(n, np.inf)) if within is None else within
@@ -207,9 +206,7 @@ class _Springs:
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:
-        """Angles of joint i at which its spring and its load balance stably while the others
-        stay, nan for none.
-        """
+        """Angles of joint i at which spring and load balance while the others stay, or nan."""
         moved = q.copy()
         values = []
         angles = self.theta[..., i] + np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS).reshape(

@@ -96,8 +96,7 @@ def transform_hinges(
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
 ) -> mujoco.MjSpec:
-    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at
-    their stability then.
+    """`make_elastic` without a look at stability, for a caller that sets the physics step later.
 
     The integrator and the automatic reset are those of the given specification.
     """
@@ -113,8 +112,9 @@ def transform_hinges(
 
 
 def _choose_integrator(spec: mujoco.MjSpec) -> None:
-    """Let the integrator be `implicitfast` where the model's own does not follow the joints;
-    refuse if neither does.
+    """Take `implicitfast` where the model's own integrator does not follow the joints.
+
+    Refuse the model if neither does.
     """
     model = compiled_spec(spec, "the elastic model")
     if is_stable(model):
@@ -140,9 +140,7 @@ def _choose_integrator(spec: mujoco.MjSpec) -> None:
 
 
 def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
-    """Write out springs that are given as time constants: they follow from inertias that the
-    transform changes.
-    """
+    """Write out springs that are given as time constants, which depend on the inertias."""
     given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
     if given:
         model = compiled_spec(spec, "the specification")
@@ -254,9 +252,7 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
 
 
 def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
-    """An angle of the specification, which may be written in degrees, as the compiled model has
-    it.
-    """
+    """An angle of the specification, which may be written in degrees, in radians."""
     return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
 
 

@@ -1,5 +1,6 @@
-"""Bounds of a model, counted on its XML before MuJoCo builds it: a small file must not ask for
-much time or memory.
+"""Bounds of a model, counted on its XML before MuJoCo builds it.
+
+A small file must not ask for much time or memory.
 """
 
 import math
@@ -13,7 +14,7 @@ from elastic_env.joint.model_text import (
     DEEPEST,
     LARGEST_BYTES,
     ModelText,
-    decoded,
+    decode_xml,
     name_of,
     parse_xml,
     read_bytes,
@@ -84,7 +85,7 @@ def require_bounds(model: ModelText) -> None:
 
 @dataclass
 class _Counts:
-    """What a model has, so far."""
+    """Counts of a model, so far."""
 
     model: ModelText
     elements: float = 0.0
@@ -198,12 +199,13 @@ class _Counts:
             raise ConfigurationError(
                 f"{self.model.name} includes {name_of(path)} within itself; take the circle out"
             )
-        text, _ = decoded(read_bytes(path, "included model"), name_of(path))
+        text, _ = decode_xml(read_bytes(path, "included model"), name_of(path))
         return parse_xml(text, name_of(path)), path
 
     def _add_asset(self, name: str) -> None:
-        """A mesh or picture, which has to be a regular file of bounded size; one that is missing
-        is judged later.
+        """Count a mesh or picture, which must be a regular file of bounded size.
+
+        One that is missing is judged later.
         """
         for folder in self._folders:
             path = self.model.folder / folder / name

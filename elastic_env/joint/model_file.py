@@ -1,5 +1,4 @@
-"""The one reader of rigid models that others wrote: MJCF and URDF, files and texts, specifications,
-compiled models.
+"""Reader of rigid models: MJCF and URDF, files and texts, specifications, compiled models.
 
 Whoever reads a model reads it here, so that all accept and refuse the same ones, in the same words.
 """
@@ -46,7 +45,7 @@ _CURES = {
     "range[0] should be smaller": "the lower limit must be below the upper one",
     "Could not allocate memory": "make the sizes in <size> smaller",
 }
-"""What to do about errors of MuJoCo, by a part of their text."""
+"""Cures of MuJoCo's errors, by a part of their text."""
 _LONGEST_ERROR = 400
 _SHAPES = ("visual", "collision")
 _READABLE = (".stl", ".obj")
@@ -309,8 +308,7 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
 
 
 def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
-    """A specification that compiles: without its meshes and pictures, where these are why it does
-    not.
+    """A specification that compiles, without its meshes and pictures where these prevent it.
 
     What is compiled is read for that alone: a copy of a specification hides elements whose
     references are wrong.
@@ -353,7 +351,7 @@ def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
 
 
 def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
-    """Whether a geom is a mesh, or a primitive that is fitted to one."""
+    """True if a geom is a mesh, or a primitive that is fitted to one."""
     return geom.type == _MESH or bool(geom.meshname)
 
 
@@ -367,8 +365,9 @@ def _take_meshes(spec: mujoco.MjSpec) -> None:
 
 
 def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
-    """What MuJoCo makes, in a thread of its own so that Ctrl-C reaches this one; its errors in
-    words that teach.
+    """The result of an action of MuJoCo; its errors teach.
+
+    It runs in a thread of its own, so that Ctrl-C reaches this one.
     """
     results: list[Result] = []
     errors: list[Exception] = []
@@ -395,9 +394,7 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
 
 
 def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
-    """Visual or collision shapes of a link, whichever MuJoCo reads all of; else the meshes that
-    it does not read.
-    """
+    """Visual or collision shapes of a link that MuJoCo reads, else the meshes that it does not."""
     missing: list[str] = []
     for tag in _SHAPES:
         shapes = link.findall(tag)
@@ -416,9 +413,7 @@ def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that MuJoCo reads, in the folder of the URDF, or of a package in a folder above;
-    None without one.
-    """
+    """A mesh that MuJoCo reads, in the URDF's folder or a package above it, or None."""
     if Path(name).suffix.lower() not in _READABLE:
         return None
     relative = name.removeprefix(_PACKAGE).removeprefix("file://")

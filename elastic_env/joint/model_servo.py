@@ -1,4 +1,4 @@
-"""What a model's actuators say of the drive of a joint: gains, rotor inertia, limits."""
+"""The drive of a joint by a model's actuators: gains, rotor inertia, limits."""
 
 from dataclasses import dataclass
 
@@ -85,7 +85,7 @@ def rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
 
 
 def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
-    """What a joint and its actuators can deliver [N·m]; None where the model does not say it.
+    """Torque limit of a joint and its actuators [N·m]; None where the model has none.
 
     Raises:
         ConfigurationError: A range leaves no torque in one direction.
@@ -121,9 +121,7 @@ def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
 
 
 def _braking(model: mujoco.MjModel, joint: str) -> float:
-    """Damping by the actuators of a joint but the gain of its position servo, at zero command
-    [N·m·s/rad].
-    """
+    """Damping by a joint's actuators at zero command, without its position servo [N·m·s/rad]."""
     braking = 0.0
     for i in _actuators(model, joint):
         own = float(model.actuator_damping[i])

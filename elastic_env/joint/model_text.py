@@ -1,5 +1,4 @@
-"""The XML of a model, read within bounds before MuJoCo sees it: a file of MJCF or URDF, or the text
-of one.
+"""The XML of a model in MJCF or URDF, read within bounds before MuJoCo sees it.
 
 Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded
 first (xacro, entities) is refused.
@@ -74,7 +73,7 @@ class ModelText:
 
     @property
     def is_urdf(self) -> bool:
-        """Whether it is a URDF rather than MJCF."""
+        """True for a URDF, False for MJCF."""
         return self.root.tag == "robot"
 
 
@@ -100,19 +99,17 @@ def read_model_text(model: str | Path) -> ModelText:
 
 
 def is_text(model: object) -> bool:
-    """Whether a model is given as its text rather than as a file."""
+    """True if a model is given as its text rather than as a file."""
     return isinstance(model, str) and model.lstrip(_BLANK).startswith("<")
 
 
 def without_declaration(text: str) -> str:
-    """The text of a model for a file in UTF-8: without mark, and without the encoding that it
-    had once.
-    """
+    """The text of a model for a file in UTF-8: without mark and declared encoding."""
     return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
 
 
 def is_file(path: str | Path) -> bool:
-    """Whether there is a regular file, for any path: one that no file can have is none."""
+    """True if there is a regular file, for any path: one that no file can have is none."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -192,14 +189,12 @@ def parse_xml(text: str, name: str) -> ET.Element:
 def _of_file(path: Path) -> ModelText:
     name = name_of(path)
     content = read_bytes(path)
-    text, is_utf8 = decoded(content, name)
+    text, is_utf8 = decode_xml(content, name)
     return ModelText(parse_xml(text, name), name, path.resolve().parent, path, text, is_utf8)
 
 
-def decoded(content: bytes, name: str) -> tuple[str, bool]:
-    """The text of a file by its mark, or by the encoding that it declares; and whether that is
-    UTF-8.
-    """
+def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
+    """The text of a file by its mark or declared encoding, and whether that is UTF-8."""
     encoding = next((own for mark, own in _MARKS if content.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(content)
@@ -260,7 +255,7 @@ def _require_model(found: ModelText) -> None:
 
 
 def _parts(robot: ET.Element) -> Iterator[ET.Element]:
-    """What describes the robot, not a simulator of it."""
+    """Elements that describe the robot, not a simulator of it."""
     yield robot
     for part in robot:
         if part.tag in ("link", "joint"):

@@ -1,6 +1,4 @@
-"""What all pictures share: a MuJoCo model that is only drawn, as an image with a caption or in a
-window.
-"""
+"""MuJoCo models that are only drawn, as an image with a caption or in a window."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -69,7 +67,7 @@ class ModelPicture(ABC):
         """Lines of text for the state that was posed last."""
 
     def rgb(self, signals: Signals, world: int = 0) -> Image:
-        """See `Picture`."""
+        """An image of a world, (height, width, 3)."""
         caption = self._update(signals, world)
         if self._renderer is None:
             self._renderer = renderer(self._model)
@@ -77,7 +75,7 @@ class ModelPicture(ABC):
         return with_text(self._renderer.render(), caption, self._legend)
 
     def show(self, signals: Signals) -> None:
-        """See `Picture`."""
+        """Update the window, which shows the first world."""
         caption = self._update(signals, 0)
         if self._viewer is None:
             self._viewer = _window(self._model, self._data)
@@ -87,7 +85,7 @@ class ModelPicture(ABC):
         self._viewer.sync()
 
     def close(self) -> None:
-        """See `Picture`."""
+        """Free renderer and window."""
         if self._renderer is not None:
             self._renderer.close()
         if self._viewer is not None:
@@ -110,9 +108,7 @@ def paint(spec: mujoco.MjSpec, rgba: Rgba) -> None:
 
 
 def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
-    """Size of the images [pixels], a light background, and soft light from the side of the
-    camera.
-    """
+    """Set the size of the images [pixels], a light background and soft light."""
     spec.compiler.degree = False
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height

@@ -1,6 +1,4 @@
-"""A robot that sags, in views side by side: deviations from a translucent reference are
-enlarged.
-"""
+"""A robot that sags beside its translucent reference, with enlarged deviations."""
 
 from collections.abc import Sequence
 

@@ -1,5 +1,6 @@
-"""A robot three times side by side, reference, motor side and link side, deviations from the
-reference enlarged.
+"""A robot three times side by side: reference, motor side and link side.
+
+Deviations from the reference are enlarged.
 
 What is drawn of a joint stands at q_ref + factor · (x − q_ref), where x is the angle of the motor
 or of the link. A floating base deviates from its planned pose by factor times its true deviation.
@@ -69,7 +70,7 @@ class HasSides(Protocol):
         ...
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
-        """Where it is, from the present signals of a world."""
+        """Its posture, from the present signals of a world."""
         ...
 
 

@@ -26,9 +26,7 @@ _SETTLE_S = 0.5
 
 
 class CycleRecord(NamedTuple):
-    """The motor's torque, and how well the last control period was kept; counts are of the
-    episode.
-    """
+    """Torque and timing of the last control period; counts are of the episode."""
 
     joint_torque: float = np.nan
     """By the motor current [N·m]."""

@@ -1,5 +1,6 @@
-"""The testbed task on hardware: the rules of `elastic_env/Testbed-v0`, with measurements in the
-place of the truth.
+"""The testbed task on hardware: measurements stand in the place of the truth.
+
+The rules are those of `elastic_env/Testbed-v0`.
 
 What differs, because a real joint does not tell it:
 
@@ -100,7 +101,7 @@ class HardwareTestbedTask(TestbedTask):
         return is_over
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        """See the table of the module."""
+        """Signals of a step, as in the table of the module."""
         cycle = worlds["cycle"]
         return {
             **super()._signals(joints, worlds),

@@ -44,7 +44,7 @@ class Check:
     is_good: bool = True
     """True if nothing is to be done."""
     cure: str = ""
-    """What to do otherwise."""
+    """Cure of what is not good."""
     is_vital: bool = True
     """True if nothing may move before that is done."""
 
