@@ -204,7 +204,8 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
                 measured it.
         """
         sample = self._shared.get()
-        if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
+        age_s = math.inf if sample is None else time.monotonic() - sample.time_s
+        if sample is None or is_outside(age_s, 0.0, self._oldest_s):
             raise self._silence(sample)
         problem = self._plausible.check(sample)
         if problem:

@@ -89,9 +89,8 @@ class HardwareSettings(Model):
 
     @model_validator(mode="after")
     def _ports_differ(self) -> Self:
-        if self.imu_port is not None and os.path.realpath(self.imu_port) == os.path.realpath(
-            self.port
-        ):
+        ports = [os.path.realpath(port) for port in (self.port, self.imu_port) if port is not None]
+        if len(set(ports)) < len(ports):
             raise ValueError(
                 f"servo and IMU each have a port of their own, got {self.port} for both"
             )
@@ -123,4 +122,5 @@ class HardwareSettings(Model):
         return self.limits.replace(lowest_rad=low, highest_rad=high)
 
     def _servo_range(self) -> list[float]:
-        return sorted(map(self.servo_angle, (self.limits.lowest_rad, self.limits.highest_rad)))
+        ends = (self.limits.lowest_rad, self.limits.highest_rad)
+        return sorted(map(self.servo_angle, ends))

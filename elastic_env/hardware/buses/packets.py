@@ -61,7 +61,8 @@ def require_ids(ids: Sequence[int]) -> None:
     Raises:
         ConfigurationError: None are given, one of them twice, or one that no servo can have.
     """
-    if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
+    are_ids = all(0 <= servo_id <= LARGEST_ID for servo_id in ids)
+    if not ids or len(set(ids)) != len(ids) or not are_ids:
         raise ConfigurationError(
             f"ids must be different numbers from 0 to {LARGEST_ID}, got {quote(list(ids))}"
         )
@@ -153,7 +154,7 @@ class Parser:
                 continue
             raw = bytes(self._bytes[: 7 + length])
             is_whole = len(raw) == 7 + length
-            is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
+            is_intact = is_whole and word(crc16(raw[:-2])) == raw[-2:]
             # in what is stuffed no header occurs, with the checksum behind it one may: only where
             # the packet is not intact does a header before its end mean that the rest was lost
             again = self._bytes.find(HEADER, len(HEADER))

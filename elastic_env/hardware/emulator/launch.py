@@ -113,7 +113,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise HardwareError(f"the emulator ended with exit code {self._process.wait()}")
+            code = self._process.wait()
+            raise HardwareError(f"the emulator ended with exit code {code}")
         return json.loads(line)
 
     def _take_ports(self, ports: dict[str, str]) -> None:

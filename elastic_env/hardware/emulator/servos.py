@@ -96,9 +96,8 @@ class EmulatedServo:
         """Put what it measures into its registers."""
         self["present_position"] = round(self.motor.position / self.model.position_unit)
         self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        self["present_current"] = round(
-            current_of_torque(self.motor.torque) / self.model.current_unit
-        )
+        current = current_of_torque(self.motor.torque)
+        self["present_current"] = round(current / self.model.current_unit)
 
     def heat(self, is_hot: bool) -> None:
         """Make it hot, which it shows as its temperature alone, or let it cool."""
@@ -131,7 +130,8 @@ class EmulatedServo:
         """Error number and data of the reply to an instruction."""
         match instruction:
             case packets.PING:
-                return self._alert, word(self["model_number"]) + bytes([self["firmware_version"]])
+                number = word(self["model_number"])
+                return self._alert, number + bytes([self["firmware_version"]])
             case packets.READ if len(parameters) == 4:
                 return self.read(*words(parameters))
             case packets.WRITE if len(parameters) > 2:
@@ -182,7 +182,8 @@ class EmulatedServo:
             return packets.RANGE_ERROR
         match register.name:
             case "goal_position":
-                is_within = self["min_position_limit"] <= value <= self["max_position_limit"]
+                lowest = self["min_position_limit"]
+                is_within = lowest <= value <= self["max_position_limit"]
                 return 0 if is_within else packets.LIMIT_ERROR
             case "torque_enable" if value not in (0, 1):
                 return packets.RANGE_ERROR
@@ -221,17 +222,15 @@ class EmulatedBus:
         for servo in self.servos.values():
             servo.hear(now_s)
         if not packet.is_intact:
-            return (
-                [packets.status(packet.servo_id, packets.CRC_ERROR)]
-                if packet.servo_id in self.servos
-                else []
-            )
+            reply = packets.status(packet.servo_id, packets.CRC_ERROR)
+            return [reply] if packet.servo_id in self.servos else []
         parameters = packet.parameters
         match packet.instruction:
             case packets.SYNC_READ:
                 address, length = words(parameters)
                 asked = [i for i in parameters[4:] if i in self.servos]
-                return [packets.status(i, *self.servos[i].read(address, length)) for i in asked]
+                replies = [(i, *self.servos[i].read(address, length)) for i in asked]
+                return [packets.status(*reply) for reply in replies]
             case packets.SYNC_WRITE:
                 address, length = words(parameters)
                 for at in range(4, len(parameters) - length, length + 1):
@@ -239,12 +238,12 @@ class EmulatedBus:
                         servo.write(address, parameters[at + 1 : at + 1 + length])
                 return []
             case packets.PING if packet.servo_id == packets.BROADCAST:
-                return [self._instruct(servo_id, packet) for servo_id in sorted(self.servos)]
+                return [self._instruct(i, packet) for i in sorted(self.servos)]
             case _ if packet.servo_id in self.servos:
                 return [self._instruct(packet.servo_id, packet)]
             case _:
                 return []
 
     def _instruct(self, servo_id: int, packet: Packet) -> bytes:
-        servo = self.servos[servo_id]
-        return packets.status(servo_id, *servo.answer(packet.instruction, packet.parameters))
+        answer = self.servos[servo_id].answer(packet.instruction, packet.parameters)
+        return packets.status(servo_id, *answer)

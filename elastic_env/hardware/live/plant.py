@@ -115,7 +115,8 @@ class ServoPlant:
         with self._closing_on_error():
             bus = self._open_bus()
             bus.disable()
-            start = self.settings.joint_angle(float(bus.enable(self.settings.servo_limits)[0]))
+            stands = bus.enable(self.settings.servo_limits)
+            start = self.settings.joint_angle(float(stands[0]))
             self._restart_clock()
             self._move(start, angle)
             for _ in range(round(_SETTLE_S / self._period_s)):
@@ -186,7 +187,7 @@ class ServoPlant:
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError(f"hardware has no {field!r} of MuJoCo, and cannot be varied")
+        raise HardwareError(f"hardware has no {field!r} that could be read or varied")
 
     views: Any = bind
     vary: Any = bind
@@ -195,7 +196,8 @@ class ServoPlant:
     def _open_bus(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:
-            self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
+            ports = {settings.port: [settings.servo_id]}
+            self._bus = SupervisedBus(ports, settings.baudrate)
             if settings.imu_port is not None:
                 self._imu = AttitudeStream(
                     settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s
@@ -214,10 +216,8 @@ class ServoPlant:
 
     def _move(self, start: float, end: float) -> None:
         """Move slowly from one angle to another [rad]."""
-        duration_s = max(
-            QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S
-        )
-        steps = int(np.ceil(duration_s / self._period_s))
+        way_s = QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s
+        steps = int(np.ceil(max(way_s, _SHORTEST_MOVE_S) / self._period_s))
         for share in minimum_jerk(np.arange(1, steps + 1) / steps):
             self._cycle(start + (end - start) * float(share))
 
@@ -263,8 +263,10 @@ class ServoPlant:
         settings = self.settings
         states = cycle.states
         self._goal = settings.joint_angle(float(cycle.goals[0]))
-        self.qpos[0, self._at.theta[0]] = settings.joint_angle(float(states.position[0]))
-        self.qvel[0, self._at.theta_dot[0]] = settings.direction * float(states.velocity[0])
+        theta = settings.joint_angle(float(states.position[0]))
+        self.qpos[0, self._at.theta[0]] = theta
+        theta_dot = settings.direction * float(states.velocity[0])
+        self.qvel[0, self._at.theta_dot[0]] = theta_dot
         if self._imu is not None:
             sample = self._imu.latest()
             q = sample.link_angle(settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
@@ -278,7 +280,8 @@ class ServoPlant:
         """
         settings = self.settings
         deflection = q - float(self.qpos[0, self._at.theta[0]])
-        if math.isfinite(deflection):  # of others there is no remainder, and they are too far
+        # of others there is no remainder, and they are too far
+        if math.isfinite(deflection):
             deflection = math.remainder(deflection, 2.0 * math.pi)
         moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
         if exceeds(abs(deflection), settings.largest_deflection_rad + moved):
@@ -318,4 +321,4 @@ def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: flo
     except EOFError:
         answer = ""
     if answer.strip().lower() != "yes":
-        raise HardwareError(f"nobody agreed to the motion at {settings.port}; nothing has moved")
+        raise HardwareError(f"nobody agreed to a motion at {settings.port}; nothing moved")

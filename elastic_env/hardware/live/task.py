@@ -58,12 +58,12 @@ class HardwareTestbedTask(TestbedTask):
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
         imu = AttitudeSensor(rate_hz=1.0 / config.control_period_s)
-        super().__init__(config.replace(scenario=config.scenario.replace(imu=imu)), num_worlds=1)
+        scenario = config.scenario.replace(imu=imu)
+        super().__init__(config.replace(scenario=scenario), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
-        self.plant = ServoPlant(
-            self.model, at, settings, config.control_period_s, config.pendulum.gravity_torque
-        )
+        load_nm = config.pendulum.gravity_torque
+        self.plant = ServoPlant(self.model, at, settings, config.control_period_s, load_nm)
         extent = config.reference.extent()
         limits = settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
@@ -111,7 +111,8 @@ class HardwareTestbedTask(TestbedTask):
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Several where a cycle had to be repeated."""
-        return float(np.rint(max(self.plant.record.period / self.config.control_period_s, 1.0)))
+        periods = self.plant.record.period / self.config.control_period_s
+        return float(np.rint(max(periods, 1.0)))
 
     def _keep_cycle(self) -> None:
         self._worlds[self._row]["cycle"] = tuple(self.plant.record)

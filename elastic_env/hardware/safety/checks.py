@@ -61,7 +61,8 @@ def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
         HardwareError: Its model is not known.
     """
     bus.attach(ids)
-    checks = [Check("baud rate", f"{bus.port.baudrate} bit/s"), *_check_line(bus, ids[0])]
+    checks = [Check("baud rate", f"{bus.port.baudrate} bit/s")]
+    checks += _check_line(bus, ids[0])
     for servo_id in ids:
         checks += _check_servo(bus, servo_id)
     return checks
@@ -101,7 +102,8 @@ def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
     ) -> None:
         checks.append(Check(f"{servo_id}: {what}", value, is_good, cure, is_vital))
 
-    check("model, firmware", f"{model.number} {model.name}, version {read('firmware_version')}")
+    firmware = read("firmware_version")
+    check("model, firmware", f"{model.number} {model.name}, version {firmware}")
     error = explain_errors(read("hardware_error_status"))
     restart = "remove the cause, then switch the power off and on"
     check("hardware error", error or "none", not error, restart)

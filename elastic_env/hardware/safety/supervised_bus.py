@@ -111,9 +111,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             )
         try:
             self._receive(0, _START_S)
-            self.models = self._request("attach", self._slow_s, ids=list(self._ports.values()))[
-                "models"
-            ]
+            servos = list(self._ports.values())
+            self.models = self._request("attach", self._slow_s, ids=servos)["models"]
         except BaseException:
             self.close()
             raise
@@ -204,7 +203,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan
         # as its second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
+        within_s = wait_s + self._answer_s
+        return self._request("exchange", within_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.
@@ -246,7 +246,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         with self._lock:
             self._number += 1
             try:
-                self._channel.send({"number": self._number, "do": action, "with": arguments})
+                request = {"number": self._number, "do": action, "with": arguments}
+                self._channel.send(request)
             except OSError:
                 raise self._replace_supervisor() from None
             return self._receive(self._number, within_s)
@@ -271,7 +272,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     def _replace_supervisor(self, silent_s: float | None = None) -> FaultError:
         """Switch torque off for a supervisor that died, or was silent for a time [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
+            # its end of the channel closes before its port does
+            self._process.wait(timeout=1.0)
         if silent_s is None:
             how = f"ended (exit code {self._process.poll()})"
         else:
@@ -305,14 +307,16 @@ def emergency_stop(
             try:
                 bus.open()
                 known = models[number] if models else _ask_models(bus, ids, problems)
-                bus.attach_known({i: model for i, model in zip(ids, known, strict=True) if model})
+                numbers = dict(zip(ids, known, strict=True))
+                bus.attach_known({i: number for i, number in numbers.items() if number})
             except HardwareError as error:
                 problems.append(f"torque could not be switched off: {error}")
         reached = [bus for bus in buses if bus.models]
         problem = BusGroup(reached).torque_off() if reached else None
     finally:
         for bus in buses:
-            with contextlib.suppress(HardwareError):  # one that is gone cannot be closed
+            # one that is gone cannot be closed
+            with contextlib.suppress(HardwareError):
                 bus.close()
     if problem is not None:
         problems.append(str(problem))

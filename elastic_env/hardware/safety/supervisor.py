@@ -77,7 +77,8 @@ class Supervisor:
         finally:
             try:
                 self._torque_off()
-            except BaseException:  # a signal in this very moment; after it no other comes through
+            except BaseException:
+                # a signal in this very moment; after it no other comes through
                 self._torque_off()
                 raise
 
@@ -125,14 +126,15 @@ class Supervisor:
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, servo_ids in zip(self._buses, ids, strict=True):
             problems = [
-                check for check in check_bus(bus, servo_ids) if check.is_vital and not check.is_good
+                f"{check.what} is {check.value}: {check.cure}"
+                for check in check_bus(bus, servo_ids)
+                if check.is_vital and not check.is_good
             ]
             if problems:
-                words = "; ".join(
-                    f"{check.what} is {check.value}: {check.cure}" for check in problems
-                )
+                words = "; ".join(problems)
                 raise HardwareError(f"nothing can move at {bus.name} yet: {words}")
-        return {"models": [[model.number for model in bus.models.values()] for bus in self._buses]}
+        models = [list(bus.models.values()) for bus in self._buses]
+        return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
         """Torque on, with every servo's goal where it stands."""
@@ -204,7 +206,8 @@ class Supervisor:
 
     def _read(self) -> dict[str, Any]:
         """States without any command; while torque is on this counts as none."""
-        return self._servos.read_states(max(bus.reply_timeout_s for bus in self._buses)).dump()
+        timeout_s = max(bus.reply_timeout_s for bus in self._buses)
+        return self._servos.read_states(timeout_s).dump()
 
     def _disable(self) -> dict[str, Any]:
         """Torque off, confirmed."""
@@ -226,7 +229,8 @@ class Supervisor:
         for number in np.flatnonzero(states.has_alert):
             bus, servo_id = self._servos.servos[number]
             try:
-                errors.append(f"{servo_name(bus, servo_id)}: {bus.read_condition(servo_id).error}")
+                error = bus.read_condition(servo_id).error
+                errors.append(f"{servo_name(bus, servo_id)}: {error}")
             except HardwareError as error:
                 errors.append(str(error))
         return f" ({'; '.join(errors)})" if errors else ""
@@ -277,7 +281,8 @@ def require_ready(name: str, condition: Condition, limit_c: float) -> None:
         )
     hottest = min(limit_c, condition.temperature_limit)
     if exceeds(condition.temperature, hottest):
-        raise FaultError(explain_heat(f"{name}: {condition.temperature:g}", np.array(hottest)))
+        which = f"{name}: {condition.temperature:g}"
+        raise FaultError(explain_heat(which, np.array(hottest)))
 
 
 def _end(signal_number: int, _: Any) -> None:
@@ -296,7 +301,8 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     program = os.getppid()
     for number in _SIGNALS:
         signal.signal(number, _end)
-    prefer_realtime(Priority.SUPERVISOR, with_threads=True)  # one for each of several buses
+    # a thread for each of several buses
+    prefer_realtime(Priority.SUPERVISOR, with_threads=True)
     buses = [DynamixelBus(port, baudrate) for port in ports]
     try:
         for bus in buses:
@@ -311,4 +317,5 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[3:], int(sys.argv[2]), Channel(socket.socket(fileno=int(sys.argv[1]))))
+    end = socket.socket(fileno=int(sys.argv[1]))
+    main(sys.argv[3:], int(sys.argv[2]), Channel(end))
