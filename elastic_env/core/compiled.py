@@ -55,7 +55,8 @@ class _Compilations(events.Listener):
 
     def on_start(self, event: events.Event) -> None:
         """A compilation begins, of whatever function."""
-        said = _said_of.get(getattr((event.data or {}).get("dispatcher"), "py_func", None))
+        dispatcher = (event.data or {}).get("dispatcher")
+        said = _said_of.get(getattr(dispatcher, "py_func", None))
         if said is not None:
             _LOG.info(said)
 
@@ -94,7 +95,8 @@ def compile_now(function: Callable[..., Any], *arguments: Any) -> None:
     def call() -> None:
         try:
             function(*arguments)
-        except OSError:  # compiled, and not kept: a full disk costs the next program time
+        except OSError:
+            # compiled, and not kept: a full disk costs the next program time
             function(*arguments)
 
     with ThreadPoolExecutor(max_workers=1) as beside:

@@ -117,7 +117,8 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
+            problems = problems_of(type(self), error, values)
+            raise ModelError(type(self).__name__, problems) from None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -125,8 +126,8 @@ class Model(BaseModel):
         super().__pydantic_init_subclass__(**kwargs)
         for field in cls.model_fields.values():
             if field.description is not None:
-                paragraphs = re.split(r"\n\s*\n", field.description)
-                field.description = "\n\n".join(" ".join(part.split()) for part in paragraphs)
+                parts = re.split(r"\n\s*\n", field.description)
+                field.description = "\n\n".join(" ".join(part.split()) for part in parts)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -135,9 +136,8 @@ class Model(BaseModel):
 
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
-        return type(self)(
-            **{**{name: getattr(self, name) for name in type(self).model_fields}, **changes}
-        )
+        own = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**own, **changes})
 
 
 def _is_text(value: str) -> str:
@@ -204,7 +204,8 @@ def load_json(
             model.
     """
     try:
-        content = parse_json(read_bounded(path, _BYTES * LARGEST_JSON, within).decode("utf-8"))
+        data = read_bounded(path, _BYTES * LARGEST_JSON, within)
+        content = parse_json(data.decode("utf-8"))
     except ConfigurationError:
         raise
     except OSError as error:
@@ -212,7 +213,8 @@ def load_json(
     except ValueError as error:
         raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
+        kind = type(content).__name__
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
     try:
         return model(**content)
     except ModelError as error:
@@ -236,20 +238,25 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     except ConfigurationError:
         raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{shorten(file)} is not valid YAML: {error}") from None
+        problem = f"{shorten(file)} is not valid YAML: {error}"
     except IsADirectoryError:
-        raise ConfigurationError(f"{shorten(file)} is a folder, a YAML file is needed") from None
+        problem = f"{shorten(file)} is a folder, a YAML file is needed"
     except (FileNotFoundError, NotADirectoryError, ValueError):
-        known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
-        listing = f"; found beside it: {list_names(known)}" if known else configurations_are(file)
-        raise ConfigurationError(f"no configuration file at {shorten(file)}{listing}") from None
+        problem = f"no configuration file at {shorten(file)}{_found_beside(file)}"
     except OSError as error:
-        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None
-    if content is None and empty:
-        return {}
-    if not isinstance(content, dict):
+        problem = f"{shorten(file)} cannot be read: {error.strerror}"
+    else:
+        if content is None and empty:
+            return {}
+        if isinstance(content, dict):
+            return content
         got = "an empty file" if content is None else type(content).__name__
-        raise ConfigurationError(
-            f"{shorten(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
-        )
-    return content
+        needed = "must hold a mapping of parameters, such as 'name: value'"
+        problem = f"{shorten(file)} {needed}, got {got}"
+    raise ConfigurationError(problem) from None
+
+
+def _found_beside(file: Path) -> str:
+    """Files beside one that is not there."""
+    known = sorted(map(str, file.parent.glob("*.yaml"))) if file.parent.is_dir() else []
+    return f"; found beside it: {list_names(known)}" if known else configurations_are(file)

@@ -45,7 +45,8 @@ class Problem:
         owner = spelt(self.path[:-1]) or of_all
         own = quote(self.path[-1])
         if self.form == "unknown":
-            return f"unknown parameter {f'of {owner} ' if owner else ''}{own}; {self.text}"
+            of_owner = f"of {owner} " if owner else ""
+            return f"unknown parameter {of_owner}{own}; {self.text}"
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
@@ -56,9 +57,9 @@ _LONGEST_SAID = 1900
 
 def join_path(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
-    return ".".join(
-        part if isinstance(part, str) and len(part) < 100 else quote(part) for part in path
-    )
+    is_short = [isinstance(part, str) and len(part) < 100 for part in path]
+    parts = zip(path, is_short, strict=True)
+    return ".".join(str(part) if short else quote(part) for part, short in parts)
 
 
 class ModelError(ConfigurationError):
@@ -83,14 +84,15 @@ class ModelError(ConfigurationError):
 
         Arguments as in `Problem.sentence`.
         """
-        sentences = list(
-            dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems)
-        )
+        found = [problem.sentence(of_all, spelt) for problem in self.problems]
+        sentences = list(dict.fromkeys(map(readable, found)))
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
         fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
-        said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
-        more = [f"and {len(sentences) - len(said)} more"] if len(said) < len(sentences) else []
-        return "\n".join([*said, *more])
+        fitting = min(fitting, _MOST_SAID)
+        said = [sentence[:_LONGEST_SAID] for sentence in sentences[:fitting]]
+        if fitting < len(sentences):
+            said.append(f"and {len(sentences) - fitting} more")
+        return "\n".join(said)
 
 
 def problems_of(
@@ -125,9 +127,11 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
         case "extra_forbidden":
-            return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
+            choices = choices_listed(path[-1], model.model_fields)
+            return Problem(path, "unknown", choices)
         case "missing":
-            meaning = f": {field.description}" if field is not None and field.description else ""
+            description = field.description if field is not None else None
+            meaning = f": {description}" if description else ""
             return Problem(path, "missing", f"{_unit(field)}{meaning}")
         case "value_error":
             return Problem(path, "rule", str(problem["ctx"]["error"]))
@@ -144,8 +148,8 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
     else:
         requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
     meaning = meaning_of(field) if field is not None else ""
-    in_brackets = f" ({meaning})" if meaning else ""
-    return Problem(path, "must", f"must {requirement}{_unit(field)}, got {given}{in_brackets}")
+    text = f"must {requirement}{_unit(field)}, got {given}"
+    return Problem(path, "must", f"{text} ({meaning})" if meaning else text)
 
 
 _REQUIREMENTS = {
@@ -207,7 +211,8 @@ def meaning_of(field: FieldInfo) -> str:
     """The first sentence of a quantity's description, without its unit; empty for another field."""
     if not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
-    sentence = re.split(r"\.(?: |$)", " ".join(field.description.split()), maxsplit=1)[0]
+    text = " ".join(field.description.split())
+    sentence = re.split(r"\.(?: |$)", text, maxsplit=1)[0]
     if sentence[1:2].islower():  # no symbol and no abbreviation
         sentence = sentence[0].lower() + sentence[1:]
     return sentence.removesuffix(f" [{field.json_schema_extra['unit']}]")
@@ -215,4 +220,5 @@ def meaning_of(field: FieldInfo) -> str:
 
 def _unit(field: FieldInfo | None) -> str:
     extra = field.json_schema_extra if field is not None else None
-    return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""
+    unit = extra["unit"] if isinstance(extra, dict) else "1"
+    return f" [{unit}]" if unit != "1" else ""

@@ -97,7 +97,8 @@ def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Tab
         raise ConfigurationError(
             f"{shorten(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
         )
-    return Table(names, np.frombuffer(values, dtype=np.float64).reshape(count, len(names)).copy())
+    rows = np.array(values, dtype=np.float64)
+    return Table(names, rows.reshape(count, len(names)))
 
 
 def _names(file: Path, header: list[str]) -> tuple[str, ...]:
@@ -150,7 +151,8 @@ def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) ->
 
 def _separators(cells: list[str]) -> str:
     """The name of what separates values in place of commas; empty where nothing does."""
-    return next((name for mark, name in _SEPARATORS.items() if mark in "".join(cells)), "")
+    text = "".join(cells)
+    return next((name for mark, name in _SEPARATORS.items() if mark in text), "")
 
 
 def _number(cell: str) -> float:

@@ -10,11 +10,8 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 def checkout() -> Path | None:
     """Folder of the checkout that this code runs from; None for an installed package."""
-    return (
-        _ROOT
-        if (_ROOT / "constraints.txt").is_file() and (_ROOT / "pyproject.toml").is_file()
-        else None
-    )
+    files = [_ROOT / name for name in ("constraints.txt", "pyproject.toml")]
+    return _ROOT if all(file.is_file() for file in files) else None
 
 
 def install_command(extra: str) -> str:

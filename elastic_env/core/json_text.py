@@ -38,7 +38,8 @@ _TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NEST
 
 def _whole(text: str) -> int:
     if len(text) > LONGEST_NUMBER:
-        raise ValueError(f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
+        bound = f"at most {LONGEST_NUMBER} characters"
+        raise ValueError(f"a number must have {bound}, got {len(text)}")
     return int(text)
 
 

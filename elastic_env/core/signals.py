@@ -133,11 +133,11 @@ class SignalTable:
         Raises:
             ConfigurationError: There is none, or they are not neighbours.
         """
-        found = [i for i, own in enumerate(self.names) if own == name or own.startswith(f"{name}.")]
+        start = f"{name}."
+        found = [i for i, own in enumerate(self.names) if f"{own}.".startswith(start)]
         if not found:
-            raise unknown_name(
-                "signal", name, dict.fromkeys(own.split(".")[0] for own in self.names)
-            )
+            groups = dict.fromkeys(own.split(".")[0] for own in self.names)
+            raise unknown_name("signal", name, groups)
         if found != list(range(found[0], found[-1] + 1)):
             raise ConfigurationError(
                 f"the columns of {name!r} must be neighbours, they are {found}"

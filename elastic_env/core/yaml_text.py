@@ -52,19 +52,20 @@ class _Loader(Composer, yaml.CSafeLoader):
         if isinstance(event, yaml.AliasEvent):
             node = super().compose_node(parent, index)
             if id(node) not in self._sizes:
-                raise _refusal(event, f"the alias *{event.anchor} stands within what it names")
+                problem = f"the alias *{event.anchor} stands within what it names"
+                raise _refusal(event, problem)
             return node
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            raise _refusal(
-                event, f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
-            )
+            problem = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
+            raise _refusal(event, problem)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
             _require_names(self, node)
-        self._sizes[id(node)] = size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
+        size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
+        self._sizes[id(node)] = size
         if size > MOST_VALUES:
             raise _refusal(
                 event,
@@ -77,12 +78,12 @@ class _Loader(Composer, yaml.CSafeLoader):
         """A number of bounded length."""
         text = self.construct_scalar(node)
         if len(text) > LONGEST_NUMBER:
-            raise _refusal(
-                node, f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}"
-            )
-        is_whole = node.tag == f"{_TAG}int"
+            bound = f"at most {LONGEST_NUMBER} characters"
+            raise _refusal(node, f"a number must have {bound}, got {len(text)}")
         try:
-            return (self.construct_yaml_int if is_whole else self.construct_yaml_float)(node)
+            if node.tag == f"{_TAG}int":
+                return self.construct_yaml_int(node)
+            return self.construct_yaml_float(node)
         except ValueError:
             raise _refusal(
                 node, f"{text!r} is no number; put text that looks like one in quotes"
@@ -102,7 +103,8 @@ def parse_yaml(text: str) -> Any:
             objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
-        raise yaml.YAMLError(f"it must have at most {LARGEST_TEXT} characters, got {len(text)}")
+        bound = f"at most {LARGEST_TEXT} characters"
+        raise yaml.YAMLError(f"it must have {bound}, got {len(text)}")
     loader = _Loader(text)
     try:
         return loader.get_single_data()
@@ -139,7 +141,8 @@ class _Dumper(yaml.SafeDumper):
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Text; with escapes where it holds line ends or other characters that do not print."""
-        return self.represent_scalar(f"{_TAG}str", text, style=None if text.isprintable() else '"')
+        style = None if text.isprintable() else '"'
+        return self.represent_scalar(f"{_TAG}str", text, style)
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
@@ -159,7 +162,8 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
         value: Plain data without a mapping or list in it that holds another one.
         comment: Its characters that do not print become spaces.
     """
-    flow = None if isinstance(value, dict | list) else False  # None: where it holds no mapping
+    # None: flow style for what holds no mapping or list
+    flow = None if isinstance(value, dict | list) else False
     text = yaml.dump(
         {name: value},
         Dumper=_Dumper,
@@ -197,9 +201,8 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
                 " meant",
             )
         if key.value in seen:
-            raise _refusal(
-                key, f"the key {key.value[:100]!r} stands twice in one mapping; keep one of them"
-            )
+            twice = f"the key {key.value[:100]!r} stands twice in one mapping"
+            raise _refusal(key, f"{twice}; keep one of them")
         seen.add(key.value)
 
 
@@ -212,4 +215,5 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
     """An error that names the place, which is a node, an event or a mark."""
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=getattr(at, "start_mark", at))
+    mark = getattr(at, "start_mark", at)
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)

@@ -29,12 +29,11 @@ def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.Mj
     model = compiled_spec(spec.copy(), "the model")
     require_known_torque(model, list(joints))
     held = copy_without_keys(spec)
-    of_joints = [*held.sensors, *held.equalities, *held.tendons, *held.tuples]
-    for element in [
-        *of_joints,
-        *(a for a in held.actuators if a.trntype not in _ON_JOINT or a.target not in joints),
-    ]:
+    for element in [*held.sensors, *held.equalities, *held.tendons, *held.tuples]:
         held.delete(element)
+    for actuator in list(held.actuators):
+        if actuator.trntype not in _ON_JOINT or actuator.target not in joints:
+            held.delete(actuator)
     _put_bodies_in_place(held, model, joints, home_of(model))
     return held
 

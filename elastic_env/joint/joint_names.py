@@ -39,7 +39,7 @@ class JointAddresses:
         link = [model.joint(name) for name in joints]
         known = {model.joint(i).name for i in range(model.njnt)}
         motor = [
-            model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints
+            model.joint(motor_name(name) if motor_name(name) in known else name) for name in joints
         ]
         return cls(
             theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),

@@ -20,15 +20,14 @@ cube.
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
-_WRAP_JOINT, _WRAP_SITE, _WRAP_SPHERE, _WRAP_CYLINDER = (
-    int(getattr(mujoco.mjtWrap, f"mjWRAP_{kind}"))
-    for kind in ("JOINT", "SITE", "SPHERE", "CYLINDER")
-)
+_WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
+_WRAP_SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
+_WRAP_GEOMS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
 _EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
 _EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
-_TENDON, _SITE, _SLIDERCRANK = (
-    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("TENDON", "SITE", "SLIDERCRANK")
-)
+_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
+_SITE = int(mujoco.mjtTrn.mjTRN_SITE)
+_SLIDERCRANK = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 _FLAGS = {
     int(mujoco.mjtDisableBit.mjDSBL_GRAVITY): "gravity",
     int(mujoco.mjtDisableBit.mjDSBL_SPRING): "spring",
@@ -89,7 +88,8 @@ def without_fingers(
     Arguments as in `commanded_hinges`.
     """
     joints = list(joints)
-    fingers = [name for name in coupled_fingers(model) if name in joints and name not in named]
+    coupled = [name for name in coupled_fingers(model) if name not in named]
+    fingers = [name for name in coupled if name in joints]
     if fingers:
         warnings.warn(
             f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints"
@@ -110,9 +110,11 @@ def coupled_fingers(model: mujoco.MjModel) -> list[str]:
         if model.eq_type[e] == _EQ_JOINT and model.eq_obj2id[e] >= 0:
             pair = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}
             joined = [group for group in groups if group & pair]
-            groups = [group for group in groups if not group & pair] + [pair.union(*joined)]
+            apart = [group for group in groups if not group & pair]
+            groups = [*apart, pair.union(*joined)]
     fingers = [j for group in groups if _is_gripper(model, group) for j in group]
-    return [model.joint(j).name for j in _hinges(model) if j in fingers and model.joint(j).name]
+    names = [model.joint(j).name for j in _hinges(model) if j in fingers]
+    return [name for name in names if name]
 
 
 def home_of(model: mujoco.MjModel) -> Array:
@@ -225,20 +227,20 @@ def _require_flags(model: mujoco.MjModel) -> None:
                 " bend as they do on a robot; take the flag out"
                 + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
             )
+    unknown = "are not known in advance; take it out"
     if model.nflex:
         raise ConfigurationError(
-            "the model has a deformable body (flex), whose forces on the links are not known in"
-            " advance; take it out"
+            f"the model has a deformable body (flex), whose forces on the links {unknown}"
         )
     if (model.body_plugin >= 0).any() or (model.actuator_plugin >= 0).any():
         raise ConfigurationError(
-            "the model has a plugin of a body or an actuator, whose forces are not known in"
-            " advance; take it out"
+            f"the model has a plugin of a body or an actuator, whose forces {unknown}"
         )
-    if model.opt.wind.any() and (model.opt.density > 0.0 or model.opt.viscosity > 0.0):
+    is_fluid = model.opt.density > 0.0 or model.opt.viscosity > 0.0
+    if model.opt.wind.any() and is_fluid:
         raise ConfigurationError(
-            "the model has wind, whose force on the links is not compensated; take `wind` out of"
-            " <option>"
+            "the model has wind, whose force on the links is not compensated; take `wind`"
+            " out of <option>"
         )
 
 
@@ -251,7 +253,8 @@ def _active(model: mujoco.MjModel) -> Iterator[int]:
 def _equality(model: mujoco.MjModel, equality: int) -> tuple[set[int], str]:
     """Joints that feel an equality constraint, and the names of what it couples."""
     kind = int(model.eq_type[equality])
-    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
+    both = (model.eq_obj1id[equality], model.eq_obj2id[equality])
+    ends = [int(i) for i in both if i >= 0]
     if kind == _EQ_JOINT:
         acts = set(ends)
         element = model.joint
@@ -290,20 +293,16 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     """Joints with which the length of a tendon changes."""
     joints: set[int] = set()
     bodies: list[int] = []
-    of_body = {
-        _WRAP_SITE: model.site_bodyid,
-        _WRAP_SPHERE: model.geom_bodyid,
-        _WRAP_CYLINDER: model.geom_bodyid,
-    }
-    for at in range(
-        int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon])
-    ):
+    first = int(model.tendon_adr[tendon])
+    for at in range(first, first + int(model.tendon_num[tendon])):
         kind = int(model.wrap_type[at])
         one = int(model.wrap_objid[at])
         if kind == _WRAP_JOINT:
             joints.add(one)
-        elif kind in of_body:
-            bodies.append(int(of_body[kind][one]))
+        elif kind == _WRAP_SITE:
+            bodies.append(int(model.site_bodyid[one]))
+        elif kind in _WRAP_GEOMS:
+            bodies.append(int(model.geom_bodyid[one]))
     return joints | _between(model, bodies)
 
 
@@ -325,9 +324,9 @@ def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
     if kind == _TENDON:
         return _joints_of_tendon(model, first)
     if kind in (_SITE, _SLIDERCRANK):
-        return _between(
-            model, [int(model.site_bodyid[site]) if site >= 0 else 0 for site in (first, second)]
-        )
+        sites = [site for site in (first, second) if site >= 0]
+        bodies = [int(model.site_bodyid[site]) for site in sites]
+        return _between(model, [*bodies, 0][:2])
     return set()
 
 
@@ -355,9 +354,11 @@ def _listed(names: Sequence[str]) -> str:
 
 def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
     """True if coupled joints are fingers: on two branches or more, with no joint beyond them."""
-    bodies = {int(model.jnt_bodyid[j]) for j in group}
-    carried = {j for j in range(model.njnt) if _chain(model, int(model.jnt_bodyid[j])) & group}
-    first = [body for body in bodies if not _chain(model, int(model.body_parentid[body])) & group]
+    body_of = model.jnt_bodyid.tolist()
+    parent_of = model.body_parentid.tolist()
+    bodies = {body_of[j] for j in group}
+    carried = {j for j in range(model.njnt) if _chain(model, body_of[j]) & group}
+    first = [body for body in bodies if not _chain(model, parent_of[body]) & group]
     return carried <= group and len(first) > 1 and len(group) < model.njnt
 
 

@@ -34,9 +34,8 @@ ActuatorRule = Literal["keep", "replace"]
 _JOINT = mujoco.mjtTrn.mjTRN_JOINT
 _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-_ROTOR_MASS = (
-    1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
-)
+# MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+_ROTOR_MASS = 1e-12
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -119,10 +118,8 @@ def _choose_integrator(spec: mujoco.MjSpec) -> None:
     model = compiled_spec(spec, "the elastic model")
     if is_stable(model):
         return
-    tried = [mujoco.mjtIntegrator(model.opt.integrator), _IMPLICITFAST]
-    names = " and ".join(
-        dict.fromkeys(integrator.name.removeprefix("mjINT_") for integrator in tried)
-    )
+    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    names = " and ".join(dict.fromkeys((own, "IMPLICITFAST")))
     step = f"at a physics step of {model.opt.timestep:g} s"
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
@@ -133,8 +130,8 @@ def _choose_integrator(spec: mujoco.MjSpec) -> None:
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {tried[0].name.removeprefix('mjINT_')} {step}; the"
-        " elastic model has the integrator IMPLICITFAST, which follows them",
+        f"the elastic joints explode with {own} {step}; the elastic model has the integrator"
+        " IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 
@@ -152,14 +149,10 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
 
 
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
-    hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
-    require_known("hinge", [name], hinges)
-    taken = (
-        {j.name for j in spec.joints}
-        | {t.name for t in spec.tendons}
-        | {a.name for a in spec.actuators}
-    )
-    taken |= {motor_name(name)} & {b.name for b in spec.bodies}
+    hinges = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+    require_known("hinge", [name], [hinge.name for hinge in hinges if hinge.name])
+    taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
+    taken |= {motor_name(name)} & {body.name for body in spec.bodies}
     for derived in (motor_name(name), spring_name(name), servo_name(name)):
         if derived in taken:
             raise ConfigurationError(
@@ -223,6 +216,7 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
 
     Every attribute is set: the model's default class must not leak into the rotor.
     """
+    # not enforced, so not converted; for actuators that inherit their range
     limits = _in_radians(hinge, hinge.range)
     rotor = _rotor_body(spec, hinge).add_joint(
         name=motor_name(hinge.name),
@@ -233,7 +227,7 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
         springref=hinge.ref,
         armature=joint.rotor_inertia,
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-        range=limits,  # not enforced, so not converted; for actuators that inherit their range
+        range=limits,
         actfrclimited=hinge.actfrclimited,
         actfrcrange=hinge.actfrcrange,
         frictionloss=0.0,
@@ -242,9 +236,8 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
     rotor.stiffness = rotor.damping = np.zeros(3)
     rotor.springyield = 0.0
     rotor.actgravcomp = False
-    ref = float(
-        _in_radians(hinge, hinge.ref)
-    )  # of an attached model the unit may differ from the rotor's
+    # of an attached model the unit may differ from the rotor's
+    ref = float(_in_radians(hinge, hinge.ref))
     rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
     rotor.springdamper = np.zeros(2)
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -286,7 +279,8 @@ def _drive(
     spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule
 ) -> None:
     """Put the hinge's actuators, or the servo, on the driven joint."""
-    existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
+    on_joints = [a for a in spec.actuators if a.trntype in _ON_JOINT]
+    existing = [actuator for actuator in on_joints if actuator.target == name]
     for actuator in existing:
         if rule == "replace":
             _redirect_sensors(spec, actuator.name, name, servo)
@@ -306,18 +300,17 @@ def _drive(
 
 def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
     """Sensors of the actuator torque on a hinge go where its actuators go."""
+    kind = mujoco.mjtSensor.mjSENS_JOINTACTFRC
     for sensor in spec.sensors:
-        if sensor.type == mujoco.mjtSensor.mjSENS_JOINTACTFRC and sensor.objname == name:
+        if sensor.type == kind and sensor.objname == name:
             sensor.objname = driven
 
 
 def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
-    sensors = [
-        s
-        for s in spec.sensors
-        if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator
-    ]
+    kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+    of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
+    sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
     if sensors and servo is None:
         raise ConfigurationError(
             f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"

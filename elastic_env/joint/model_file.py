@@ -120,11 +120,9 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         )
     text = read_model_text(model)
     require_bounds(text)
-    return (
-        _of_urdf(text, shapes)
-        if text.is_urdf
-        else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
-    )
+    if text.is_urdf:
+        return _of_urdf(text, shapes)
+    return _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
 
 
 def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
@@ -221,9 +219,8 @@ def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
     text = ET.tostring(robot, encoding="unicode")
     spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text), name, "read")
     for mesh in spec.meshes:
-        mesh.inertia = (
-            mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        )  # a mesh that is not closed has no volume
+        # a mesh that is not closed has no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     for geom in spec.geoms:
         geom.mass = geom.contype = geom.conaffinity = 0
     return spec
@@ -266,10 +263,8 @@ def _require_tree(text: ModelText) -> None:
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):
         name = quote(joint.get("name", ""))
-        ends = [
-            element.get("link", "") if (element := joint.find(end)) is not None else ""
-            for end in _ENDS
-        ]
+        found = [joint.find(end) for end in _ENDS]
+        ends = ["" if element is None else element.get("link", "") for element in found]
         for end, link in zip(_ENDS, ends, strict=True):
             if link not in links:
                 raise ConfigurationError(
@@ -341,12 +336,12 @@ def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadMo
 
 def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     """Bodies that have their mass from a mesh."""
-    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    rule = spec.compiler.inertiafromgeom
+    from_geoms = rule == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     return [
         body
         for body in spec.bodies[1:]
-        if any(_is_of_mesh(geom) for geom in body.geoms)
-        and (from_geoms or not body.explicitinertial)
+        if (from_geoms or not body.explicitinertial) and any(map(_is_of_mesh, body.geoms))
     ]
 
 
@@ -375,7 +370,8 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
     def work() -> None:
         try:
             results.append(action())
-        except Exception as error:  # MuJoCo raises nearly every kind, and "unknown exception"
+        except Exception as error:
+            # MuJoCo raises nearly every kind, and "unknown exception"
             errors.append(error)
 
     thread = threading.Thread(target=work, daemon=True)
@@ -389,7 +385,8 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
     finally:
         before.set()
     if errors:
-        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {_with_cure(errors[0])}") from None
+        problem = _with_cure(errors[0])
+        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {problem}") from None
     return results[0]
 
 
@@ -398,17 +395,14 @@ def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]
     missing: list[str] = []
     for tag in _SHAPES:
         shapes = link.findall(tag)
-        named = [
-            (mesh, mesh.get("filename", "")) for shape in shapes for mesh in shape.iter("mesh")
-        ]
-        found = [(mesh, _mesh_file(name, folder)) for mesh, name in named]
-        if shapes and all(path is not None for _, path in found):
-            for mesh, path in found:
+        meshes = [mesh for shape in shapes for mesh in shape.iter("mesh")]
+        files = {mesh: _mesh_file(mesh.get("filename", ""), folder) for mesh in meshes}
+        lost = [mesh.get("filename", "") for mesh, path in files.items() if path is None]
+        if shapes and not lost:
+            for mesh, path in files.items():
                 mesh.set("filename", str(path))
             return shapes, []
-        missing = missing or [
-            name for (_, name), (_, path) in zip(named, found, strict=True) if path is None
-        ]
+        missing = missing or lost
     return [], missing
 
 
@@ -417,7 +411,9 @@ def _mesh_file(name: str, folder: Path) -> Path | None:
     if Path(name).suffix.lower() not in _READABLE:
         return None
     relative = name.removeprefix(_PACKAGE).removeprefix("file://")
-    bases = [folder, *folder.resolve().parents] if name.startswith(_PACKAGE) else [folder]
+    bases = [folder]
+    if name.startswith(_PACKAGE):
+        bases += folder.resolve().parents
     return next((base / relative for base in bases if _is_mesh(base / relative)), None)
 
 
@@ -430,10 +426,8 @@ def _is_mesh(path: Path) -> bool:
 
 def _with_cure(error: Exception) -> str:
     """MuJoCo's error in one line, and what to do about it where that is known."""
-    text = (
-        ", ".join(line.strip() for line in str(error).splitlines() if line.strip())
-        or type(error).__name__
-    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    text = ", ".join(filter(None, lines)) or type(error).__name__
     cures = [cure for part, cure in _CURES.items() if part in text]
     if len(text) > _LONGEST_ERROR:
         text = f"{text[:_LONGEST_ERROR]}..."

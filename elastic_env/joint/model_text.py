@@ -232,7 +232,8 @@ def _require_model(found: ModelText) -> None:
             (key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None
         )
         if prefix in aliases or of_xacro is not None:
-            what = f"<{element.tag}>" if prefix in aliases else f"the attribute {of_xacro}"
+            is_tag = prefix in aliases
+            what = f"<{element.tag}>" if is_tag else f"the attribute {of_xacro}"
             raise ConfigurationError(
                 f"{name} is a file of xacro, it has {quote(what)[1:-1]}; {_EXPAND}"
             )
@@ -242,12 +243,10 @@ def _require_model(found: ModelText) -> None:
         )
     if found.is_urdf:
         for element in _parts(root):
-            unread = next(
-                (value for value in element.attrib.values() if _PLACEHOLDER.search(value)), None
-            )
-            if unread is not None:
+            unread = [value for value in element.attrib.values() if _PLACEHOLDER.search(value)]
+            if unread:
                 raise ConfigurationError(
-                    f"{name} has {quote(unread)} in <{element.tag}>, of xacro; {_EXPAND}"
+                    f"{name} has {quote(unread[0])} in <{element.tag}>, of xacro; {_EXPAND}"
                 )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:

@@ -49,11 +49,9 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> f
         linear.opt.timestep = timestep_s
     with _without_messages():
         A = _transition(linear)
-    return (
-        float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-        if np.isfinite(A).all()
-        else float("inf")
-    )
+    if not np.isfinite(A).all():
+        return float("inf")
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
 
 
 def largest_stable_timestep(model: mujoco.MjModel) -> float:
@@ -120,9 +118,8 @@ def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
     """
     if is_stable(model):
         return float(model.opt.timestep)
-    return control_period_s / int(
-        np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9)
-    )
+    steps = control_period_s * _ROOM / largest_stable_timestep(model)
+    return control_period_s / int(np.ceil(steps - 1e-9))
 
 
 @contextmanager
@@ -144,7 +141,8 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
-    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    middle = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    linear.tendon_lengthspring[:] = middle
     return linear
 
 

@@ -15,8 +15,9 @@ CURE = (
 
 def prefer_egl() -> None:
     """Let MuJoCo draw through EGL where there is no display. Call it before importing MuJoCo."""
-    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform == "linux" and not has_display and _VARIABLE not in os.environ and _has_egl():
+    is_told = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    is_told = is_told or _VARIABLE in os.environ
+    if sys.platform == "linux" and not is_told and _has_egl():
         os.environ[_VARIABLE] = "egl"
 
 

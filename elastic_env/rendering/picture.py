@@ -129,15 +129,16 @@ def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     try:
-        import glfw  # only here: a machine that only computes may have neither GLFW nor a display
-        import mujoco.viewer as viewers
+        # only here: a machine that only computes may have neither GLFW nor a display
+        import glfw
+        import mujoco.viewer as views
     except (ImportError, RuntimeError) as error:
         raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
     if not glfw.init():  # the viewer itself would end the process
         raise ElasticError(
             f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}"
         )
-    viewer = viewers.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    viewer = views.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     viewer.cam.fixedcamid = model.camera(CAMERA).id
     return viewer
@@ -150,7 +151,8 @@ def renderer(model: mujoco.MjModel) -> Any:
         ElasticError: The machine cannot draw.
     """
     try:
-        return mujoco.Renderer(model, model.vis.global_.offheight, model.vis.global_.offwidth)
+        size = model.vis.global_
+        return mujoco.Renderer(model, size.offheight, size.offwidth)
     except Exception as error:  # MuJoCo's OpenGL backends raise errors of many types
         raise ElasticError(f"the renderer could not start ({error}); {CURE}") from error
 
@@ -169,11 +171,7 @@ def with_text(image: Image, lines: list[str], legend: Legend = ()) -> Image:
         draw.text((_MARGIN, 10 + row * 1.25 * size), line, fill=_TEXT_RGB, font=font)
     x = float(_MARGIN)
     for word, rgba in legend:
-        draw.text(
-            (x, picture.height - 1.6 * size),
-            word,
-            fill=tuple(round(255 * c) for c in rgba[:3]),
-            font=font,
-        )
+        rgb = tuple(round(255 * share) for share in rgba[:3])
+        draw.text((x, picture.height - 1.6 * size), word, fill=rgb, font=font)
         x += draw.textlength(word, font=font) + size
     return np.asarray(picture)

@@ -50,7 +50,8 @@ class SagViews:
         with renderer(self._model) as renders:
             for wanted, q in zip(q_ref, links, strict=True):
                 enlarged = wanted + ENLARGED * (q - wanted)
-                for name, angle, reference in zip(self._joints, enlarged, wanted, strict=True):
+                angles = zip(self._joints, enlarged, wanted, strict=True)
+                for name, angle, reference in angles:
                     data.joint(name).qpos = angle
                     data.joint(_REFERENCE + name).qpos = reference
                 mujoco.mj_forward(self._model, data)
@@ -62,8 +63,9 @@ class SagViews:
 def _painted(spec: mujoco.MjSpec, rgba: Rgba) -> mujoco.MjSpec:
     """A copy in one colour, without floors."""
     copy = spec.copy()
-    for geom in [geom for geom in copy.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-        copy.delete(geom)
+    for geom in list(copy.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            copy.delete(geom)
     if not copy.geoms:
         add_simple_bodies(copy)
     paint(copy, rgba)

@@ -108,12 +108,13 @@ class SideBySide:
         robot.dress(spec)
         # where a viewer looks who sees them from left to right
         forward = np.cross([0.0, 0.0, 1.0], robot.right)
-        spec.visual.global_.azimuth = float(np.degrees(np.arctan2(forward[1], forward[0])))
+        azimuth = np.degrees(np.arctan2(forward[1], forward[0]))
+        spec.visual.global_.azimuth = float(azimuth)
         spec.visual.global_.elevation = _ELEVATION_DEG
-        self._offsets = {
-            copy: (number - 1) * np.array(robot.right) for number, copy in enumerate(COPIES)
-        }
-        for copy, rgba in zip(COPIES, (_REFERENCE_RGBA, _MOTOR_RGBA, None), strict=True):
+        right = np.array(robot.right)
+        self._offsets = {REFERENCE: -right, MOTOR: 0.0 * right, LINK: right}
+        colours = {REFERENCE: _REFERENCE_RGBA, MOTOR: _MOTOR_RGBA, LINK: None}
+        for copy, rgba in colours.items():
             own = robot.spec.copy()
             if rgba is not None:
                 paint(own, rgba)
@@ -131,7 +132,8 @@ class SideBySide:
             factor: By which deviations from the reference are enlarged.
         """
         bases = {REFERENCE: sides.base_ref, MOTOR: sides.base_ref, LINK: sides.base}
-        for copy, angles in ((REFERENCE, sides.q_ref), (MOTOR, sides.theta), (LINK, sides.q)):
+        sides_of = {REFERENCE: sides.q_ref, MOTOR: sides.theta, LINK: sides.q}
+        for copy, angles in sides_of.items():
             drawn = sides.q_ref + factor * (angles - sides.q_ref)
             for name, angle in zip(self._robot.joints, drawn, strict=True):
                 data.joint(copy + name).qpos = angle
