@@ -127,7 +127,8 @@ class Model(BaseModel):
         for field in cls.model_fields.values():
             if field.description is not None:
                 parts = re.split(r"\n\s*\n", field.description)
-                field.description = "\n\n".join(" ".join(part.split()) for part in parts)
+                lines = [" ".join(part.split()) for part in parts]
+                field.description = "\n\n".join(lines)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -259,4 +260,6 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
 def _found_beside(file: Path) -> str:
     """Files beside one that is not there."""
     known = sorted(map(str, file.parent.glob("*.yaml"))) if file.parent.is_dir() else []
-    return f"; found beside it: {list_names(known)}" if known else configurations_are(file)
+    if not known:
+        return configurations_are(file)
+    return f"; found beside it: {list_names(known)}"

@@ -176,7 +176,7 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
             if part not in values and not (is_missing and number == len(location) - 1):
                 continue
             inside = values.get(part)
-        elif isinstance(values, Sequence) and not isinstance(values, str) and isinstance(part, int):
+        elif isinstance(values, list | tuple) and isinstance(part, int):
             inside = values[part] if part < len(values) else None
         elif number > 0 and not isinstance(values, Mapping | None):
             continue

@@ -36,7 +36,7 @@ class _Loader(Composer, yaml.CSafeLoader):
 
     # dates stay text: a list of the resolvers of its own
     yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag != f"{_TAG}timestamp"]
+        first: [pair for pair in resolvers if pair[0] != f"{_TAG}timestamp"]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 

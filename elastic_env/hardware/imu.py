@@ -24,7 +24,7 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 
 Axis = Literal["roll", "pitch", "yaw"]
 
-_RANGE_RAD: dict[Axis, float] = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
+_RANGE_RAD = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
 _ROUNDING_RAD = 1e-4  # the IMU sends 32 bits
 _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")

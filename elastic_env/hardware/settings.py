@@ -89,7 +89,8 @@ class HardwareSettings(Model):
 
     @model_validator(mode="after")
     def _ports_differ(self) -> Self:
-        ports = [os.path.realpath(port) for port in (self.port, self.imu_port) if port is not None]
+        named = (self.port, self.imu_port)
+        ports = [os.path.realpath(port) for port in named if port is not None]
         if len(set(ports)) < len(ports):
             raise ValueError(
                 f"servo and IMU each have a port of their own, got {self.port} for both"

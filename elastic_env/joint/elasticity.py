@@ -57,7 +57,8 @@ class Servo(Model):
         """Largest magnitude of the position error's integral [rad·s]; 0 without one."""
         if self.integral_gain == 0.0:
             return 0.0
-        return (self.torque_limit + self.velocity_gain * self.speed_limit) / self.integral_gain
+        most = self.torque_limit + self.velocity_gain * self.speed_limit
+        return most / self.integral_gain
 
 
 class ElasticJoint(Model):
@@ -221,7 +222,8 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
             stable.
     """
     # every row by its own stiffness: the size of K says nothing about singularity
-    solution, is_singular = _solved(torque_gradient / stiffness[..., None], torque / stiffness)
+    relative_gradient = torque_gradient / stiffness[..., None]
+    solution, is_singular = _solved(relative_gradient, torque / stiffness)
     if is_singular.any():
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness (smallest K"

@@ -38,9 +38,8 @@ class JointAddresses:
         """Look the joints up by name, in a model of the tendon or the rigid form."""
         link = [model.joint(name) for name in joints]
         known = {model.joint(i).name for i in range(model.njnt)}
-        motor = [
-            model.joint(motor_name(name) if motor_name(name) in known else name) for name in joints
-        ]
+        rotors = [motor_name(n) if motor_name(n) in known else n for n in joints]
+        motor = [model.joint(name) for name in rotors]
         return cls(
             theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
             q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),

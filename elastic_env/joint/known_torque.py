@@ -222,10 +222,12 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
 def _require_flags(model: mujoco.MjModel) -> None:
     for bit, flag in _FLAGS.items():
         if int(model.opt.disableflags) & bit:
+            cure = "take the flag out"
+            if flag == "gravity":
+                cure += "; for no gravity write gravity='0 0 0'"
             raise ConfigurationError(
-                f'the model has <flag {flag}="disable"/> in <option>, with which its joints do not'
-                " bend as they do on a robot; take the flag out"
-                + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
+                f'the model has <flag {flag}="disable"/> in <option>, with which its'
+                f" joints do not bend as they do on a robot; {cure}"
             )
     unknown = "are not known in advance; take it out"
     if model.nflex:

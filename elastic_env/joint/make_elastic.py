@@ -31,6 +31,7 @@ from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with
 Form = Literal["tendon", "rigid"]
 ActuatorRule = Literal["keep", "replace"]
 
+_HINGE = mujoco.mjtJoint.mjJNT_HINGE
 _JOINT = mujoco.mjtTrn.mjTRN_JOINT
 _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -149,8 +150,8 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
 
 
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
-    hinges = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
-    require_known("hinge", [name], [hinge.name for hinge in hinges if hinge.name])
+    hinges = [joint.name for joint in spec.joints if joint.type == _HINGE and joint.name]
+    require_known("hinge", [name], hinges)
     taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
     taken |= {motor_name(name)} & {body.name for body in spec.bodies}
     for derived in (motor_name(name), spring_name(name), servo_name(name)):
@@ -220,7 +221,7 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
     limits = _in_radians(hinge, hinge.range)
     rotor = _rotor_body(spec, hinge).add_joint(
         name=motor_name(hinge.name),
-        type=mujoco.mjtJoint.mjJNT_HINGE,
+        type=_HINGE,
         pos=hinge.pos,
         axis=hinge.axis,
         ref=hinge.ref,

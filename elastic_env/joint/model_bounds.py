@@ -101,7 +101,8 @@ class _Counts:
         """Count a URDF, whose links nest in MuJoCo as they are joined."""
         self._bound("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
         self._bound("bodies", len(robot.findall("link")), MOST_BODIES)
-        moving = [joint for joint in robot.findall("joint") if joint.get("type") != "fixed"]
+        joints = robot.findall("joint")
+        moving = [joint for joint in joints if joint.get("type") != "fixed"]
         self._bound("joints", len(moving), MOST_JOINTS)
         for element in robot.iter():
             self._require_numbers(element)

@@ -397,7 +397,7 @@ def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]
         shapes = link.findall(tag)
         meshes = [mesh for shape in shapes for mesh in shape.iter("mesh")]
         files = {mesh: _mesh_file(mesh.get("filename", ""), folder) for mesh in meshes}
-        lost = [mesh.get("filename", "") for mesh, path in files.items() if path is None]
+        lost = [mesh.get("filename", "") for mesh in meshes if files[mesh] is None]
         if shapes and not lost:
             for mesh, path in files.items():
                 mesh.set("filename", str(path))

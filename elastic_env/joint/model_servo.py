@@ -86,11 +86,13 @@ def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
     limits = [(1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
     for i in _actuators(model, joint):
         gear = abs(float(model.actuator_gear[i, 0]))
-        limits.append((gear, model.actuator_forcelimited[i], model.actuator_forcerange[i]))
+        force = (model.actuator_forcelimited[i], model.actuator_forcerange[i])
+        limits.append((gear, *force))
         is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         if is_unbiased and model.actuator_dyntype[i] == 0:
             gain = gear * abs(float(model.actuator_gainprm[i, 0]))
-            limits.append((gain, model.actuator_ctrllimited[i], model.actuator_ctrlrange[i]))
+            command = (model.actuator_ctrllimited[i], model.actuator_ctrlrange[i])
+            limits.append((gain, *command))
     found = [_bound(joint, *limit) for limit in limits]
     return min((value for value in found if value is not None), default=None)
 

@@ -91,7 +91,8 @@ def read_model_text(model: str | Path) -> ModelText:
             raise ConfigurationError(
                 f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}"
             )
-        found = ModelText(parse_xml(text, name), name, Path.cwd(), None, text, is_utf8=True)
+        root = parse_xml(text, name)
+        found = ModelText(root, name, Path.cwd(), None, text, is_utf8=True)
     else:
         found = _of_file(Path(model))
     _require_model(found)
@@ -190,7 +191,8 @@ def _of_file(path: Path) -> ModelText:
     name = name_of(path)
     content = read_bytes(path)
     text, is_utf8 = decode_xml(content, name)
-    return ModelText(parse_xml(text, name), name, path.resolve().parent, path, text, is_utf8)
+    root = parse_xml(text, name)
+    return ModelText(root, name, path.resolve().parent, path, text, is_utf8)
 
 
 def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
@@ -228,9 +230,8 @@ def _require_model(found: ModelText) -> None:
     }
     for element in root.iter():
         prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
-        of_xacro = next(
-            (key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None
-        )
+        prefixed = [key for key in element.attrib if ":" in key]
+        of_xacro = next((key for key in prefixed if key.partition(":")[0] in aliases), None)
         if prefix in aliases or of_xacro is not None:
             is_tag = prefix in aliases
             what = f"<{element.tag}>" if is_tag else f"the attribute {of_xacro}"
@@ -243,7 +244,8 @@ def _require_model(found: ModelText) -> None:
         )
     if found.is_urdf:
         for element in _parts(root):
-            unread = [value for value in element.attrib.values() if _PLACEHOLDER.search(value)]
+            values = element.attrib.values()
+            unread = [value for value in values if _PLACEHOLDER.search(value)]
             if unread:
                 raise ConfigurationError(
                     f"{name} has {quote(unread[0])} in <{element.tag}>, of xacro; {_EXPAND}"

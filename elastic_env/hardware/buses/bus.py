@@ -57,7 +57,7 @@ class States:
     def join(parts: Sequence["States"]) -> "States":
         """The states of several buses; the time is that of the last reply."""
         values = [vars(part) for part in parts]
-        arrays = {name: np.concatenate([own[name] for own in values]) for name in _ARRAYS}
+        arrays = {n: np.concatenate([own[n] for own in values]) for n in _ARRAYS}
         return States(**arrays, time_s=max(part.time_s for part in parts))
 
 

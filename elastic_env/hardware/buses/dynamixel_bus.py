@@ -144,7 +144,8 @@ class DynamixelBus:
         """
         register = self.models[servo_id].table[name]
         where = word(register.address) + word(register.size)
-        return register.decode(self._request(servo_id, packets.READ, where, register.size))
+        data = self._request(servo_id, packets.READ, where, register.size)
+        return register.decode(data)
 
     def write(self, servo_id: int, name: str, value: int) -> None:
         """Write a register [count].

@@ -156,7 +156,8 @@ class ServoModel:
         degrees = math.nan
         if self.has_temperature(block):
             degrees = self._decode(_TEMPERATURE, block, data)
-        return [*(unit * count for unit, count in zip(units, counts, strict=True)), degrees]
+        motion = [unit * count for unit, count in zip(units, counts, strict=True)]
+        return [*motion, degrees]
 
     def _decode(self, name: str, block: range, data: bytes) -> int:
         register = self.table[name]

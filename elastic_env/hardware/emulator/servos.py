@@ -155,9 +155,10 @@ class EmulatedServo:
         end = address + len(data)
         while address < end:
             register = self.model.table.find(address)
-            if register is None or not register.is_writable or register.address != address:
+            if register is None or register.address != address:
                 return packets.ACCESS_ERROR | self._alert
-            if register.memory == "EEPROM" and self.is_on:
+            is_locked = register.memory == "EEPROM" and self.is_on
+            if is_locked or not register.is_writable:
                 return packets.ACCESS_ERROR | self._alert
             if register.end > end:
                 return packets.LENGTH_ERROR | self._alert
@@ -188,7 +189,8 @@ class EmulatedServo:
             case "torque_enable" if value not in (0, 1):
                 return packets.RANGE_ERROR
             case "torque_enable":
-                return packets.RESULT_FAIL if value and self["hardware_error_status"] else 0
+                has_error = self["hardware_error_status"] != 0
+                return packets.RESULT_FAIL if value and has_error else 0
             case _:
                 return 0
 

@@ -269,7 +269,8 @@ class ServoPlant:
         self.qvel[0, self._at.theta_dot[0]] = theta_dot
         if self._imu is not None:
             sample = self._imu.latest()
-            q = sample.link_angle(settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            mounting = (settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            q = sample.link_angle(*mounting)
             self._require_together(q, states.time_s - sample.time_s)
             self.qpos[0, self._at.q[0]] = q
 
@@ -321,4 +322,4 @@ def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: flo
     except EOFError:
         answer = ""
     if answer.strip().lower() != "yes":
-        raise HardwareError(f"nobody agreed to a motion at {settings.port}; nothing moved")
+        raise HardwareError(f"nobody agreed; nothing has moved at {settings.port}")

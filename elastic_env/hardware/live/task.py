@@ -57,13 +57,14 @@ class HardwareTestbedTask(TestbedTask):
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
-        imu = AttitudeSensor(rate_hz=1.0 / config.control_period_s)
+        period_s = config.control_period_s
+        imu = AttitudeSensor(rate_hz=1.0 / period_s)
         scenario = config.scenario.replace(imu=imu)
         super().__init__(config.replace(scenario=scenario), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
         load_nm = config.pendulum.gravity_torque
-        self.plant = ServoPlant(self.model, at, settings, config.control_period_s, load_nm)
+        self.plant = ServoPlant(self.model, at, settings, period_s, load_nm)
         extent = config.reference.extent()
         limits = settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
