@@ -33,19 +33,15 @@ from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 ModelT = TypeVar("ModelT", bound="Model")
 
 
-def quantity(
-    unit: str, default: Any = ..., *, description: str | None = None, **bounds: Any
-) -> Any:
-    """A physical parameter of a `Model`.
+def quantity(unit: str, default: Any = ..., **bounds: Any) -> Any:
+    """A physical parameter of a `Model`; the docstring below the field is its meaning.
 
     Args:
         unit: SI unit as it appears in error messages and tables, "1" for a pure number.
         default: Default value; without one the parameter is required.
-        description: One line for documentation; None for the docstring below the field.
         **bounds: Any of gt, ge, lt, le.
     """
-    text = None if description is None else f"{description} [{unit}]"
-    return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)
+    return Field(default, json_schema_extra={"unit": unit}, **bounds)
 
 
 def plain_numbers(value: Any) -> Any:

@@ -56,8 +56,7 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
         text = read_bounded(file, LARGEST_BYTES).decode("utf-8-sig")
         if max(map(len, io.StringIO(text)), default=0) > _LONGEST_LINE:
             raise ConfigurationError(
-                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it a"
-                " CSV file?"
+                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it CSV?"
             )
         return _parse(file, text, row, most_rows, example)
     except ConfigurationError:
@@ -118,8 +117,7 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
         )
     if "" in names:
         raise ConfigurationError(
-            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one, or take"
-            " the column out"
+            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one"
         )
     name, count = Counter(names).most_common(1)[0]
     if count > 1:

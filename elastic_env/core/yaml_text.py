@@ -69,8 +69,7 @@ class _Loader(Composer, yaml.CSafeLoader):
         if size > MOST_VALUES:
             raise _refusal(
                 event,
-                f"it must hold at most {MOST_VALUES} values, aliases counted as what they"
-                " stand for",
+                f"it must hold at most {MOST_VALUES} values, aliases counted in full",
             )
         return node
 

@@ -92,8 +92,7 @@ def without_fingers(
     fingers = [name for name in coupled if name in joints]
     if fingers:
         warnings.warn(
-            f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints"
-            " are elastic",
+            f"{_listed(fingers)} are coupled in the model (mimic), and are held, unlike all others",
             stacklevel=5,
         )
     return [name for name in joints if name not in fingers]
@@ -241,8 +240,7 @@ def _require_flags(model: mujoco.MjModel) -> None:
     is_fluid = model.opt.density > 0.0 or model.opt.viscosity > 0.0
     if model.opt.wind.any() and is_fluid:
         raise ConfigurationError(
-            "the model has wind, whose force on the links is not compensated; take `wind`"
-            " out of <option>"
+            "the model has wind, whose force on the links is not compensated; take `wind` out"
         )
 
 
@@ -383,8 +381,7 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         scaled = links / np.outer(scale, scale)
         if not np.isfinite(scaled).all():
             raise ConfigurationError(
-                "the masses and inertias of the model are too large to compute with; see their"
-                " units"
+                "the masses and inertias of the model are too large; see their units"
             )
         values, vectors = np.linalg.eigh(scaled)
         smallest.append((values[0], vectors[:, 0]))
@@ -393,6 +390,5 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         names = " and ".join(joints[int(i)] for i in np.argsort(-np.abs(vector))[:2])
         raise ConfigurationError(
             f"the links that {names} move have no inertia of their own, or two joints have one"
-            " axis; give each link between two joints its mass and inertia, and each joint its own"
-            " axis"
+            " axis; give each link its mass and inertia, and each joint its own axis"
         )

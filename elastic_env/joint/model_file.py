@@ -26,14 +26,12 @@ compiled.
 
 Result = TypeVar("Result")
 
-_SPECIFICATION = "the specification"
 _CURES = {
     "mass and inertia of moving bodies": (
         "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero"
     ),
     "inertia m": (
-        "the inertia must be that of a body: positive, and no main value above the sum of the"
-        " other two"
+        "the inertia must be that of a body: positive, no main value above the sum of the others"
     ),
     "Error opening file": (
         "put the mesh where the model names it, or take its shape out and give the link's inertia"
@@ -105,13 +103,11 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     """
     if isinstance(model, mujoco.MjSpec):
         given: Any = model
-        return _without_lost_meshes(
-            lambda: from_mujoco(given.copy, _SPECIFICATION, "copy"), _SPECIFICATION
-        )
+        name = "the specification"
+        return _without_lost_meshes(lambda: from_mujoco(given.copy, name, "copy"), name)
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
-            "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf),"
-            " or its mujoco.MjSpec"
+            "a compiled model cannot be made elastic; give its file (.xml, .urdf) or its MjSpec"
         )
     if not isinstance(model, str | Path):
         raise ConfigurationError(
@@ -273,8 +269,7 @@ def _require_tree(text: ModelText) -> None:
                 )
         if ends[1] in parents:
             raise ConfigurationError(
-                f"link {quote(ends[1])} of {text.name} is the child of two joints; a URDF is a"
-                " tree, cut the loop"
+                f"link {quote(ends[1])} of {text.name} is the child of two joints; cut the loop"
             )
         parents[ends[1]] = ends[0]
     for link in parents:

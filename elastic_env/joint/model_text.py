@@ -171,7 +171,6 @@ def parse_xml(text: str, name: str) -> ET.Element:
     def refuse_entity(entity: str, *_: Any) -> None:
         raise ConfigurationError(
             f"{name} declares the entity {quote(entity)}, which is not read; write its text out"
-            " where it is used"
         )
 
     parser = expat.ParserCreate()

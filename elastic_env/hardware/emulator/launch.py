@@ -9,7 +9,7 @@ from typing import Any, Self
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.hardware.buses.packets import HIGHEST_RATE, LOWEST_RATE, RATES, require_ids
+from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.errors import HardwareError
@@ -32,7 +32,7 @@ class EmulatorConfig(Model):
     """The joints behind them, and through its scenario the quality of the IMU."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
     """Packets of the IMU per second [Hz]."""
-    baudrate: int = quantity("bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    baudrate: int = quantity("bit/s", 3_000_000, ge=packets.LOWEST_RATE, le=packets.HIGHEST_RATE)
     """Rate of the bus; no other is heard [bit/s]."""
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0)
@@ -43,9 +43,9 @@ class EmulatorConfig(Model):
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
             raise ValueError(
-                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}"
+                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {packets.RATES}"
             )
-        require_ids(self.ids)
+        packets.require_ids(self.ids)
         return self
 
 

@@ -81,8 +81,7 @@ class HardwareTestbedTask(TestbedTask):
             HardwareError: Always.
         """
         raise HardwareError(
-            "hardware has no truth: the policy 'oracle' and scores by the true link need a"
-            " simulation"
+            "hardware has no truth: 'oracle' and scores by the true link need a simulation"
         )
 
     def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one

@@ -158,9 +158,8 @@ class Guard:
         if fast.any():
             speeds = self._list(fast, states.velocity)
             return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {speeds} rad/s"
-        behind = is_fresh & exceeds(
-            np.abs(states.position - self.goals), limits.following_error_rad
-        )
+        distance = np.abs(states.position - self.goals)
+        behind = is_fresh & exceeds(distance, limits.following_error_rad)
         if behind.any():
             return (
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, "

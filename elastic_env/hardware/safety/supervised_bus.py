@@ -11,25 +11,16 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.hardware import errors
 from elastic_env.hardware.buses.bus import BusGroup, States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
-from elastic_env.hardware.errors import (
-    BusGoneError,
-    FaultError,
-    HardwareError,
-    PortError,
-    ReplyError,
-)
+from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
 
-_ERRORS = {
-    error.__name__: error
-    for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)
-}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
 """Longest silence of a supervisor beyond what was asked for [s].
@@ -264,7 +255,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
                 end_s = time.monotonic() + within_s
             elif answer["number"] == number:
                 if "error" in answer:
-                    raise _ERRORS[answer["error"]](answer["message"])
+                    raise getattr(errors, answer["error"])(answer["message"])
                 return answer
         self._process.kill()
         raise self._replace_supervisor(within_s)

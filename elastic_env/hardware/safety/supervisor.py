@@ -183,9 +183,8 @@ class Supervisor:
         if exceeds(at - now, LONGEST_WAIT_S):
             raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
         is_held = guard.is_holding
-        allowed, is_limited = guard.command(
-            np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S)
-        )
+        elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
+        allowed, is_limited = guard.command(np.array(goals), elapsed_s)
         self._servos.write_goals(allowed)
         self._commanded_s = now
         sleep_until(at)
