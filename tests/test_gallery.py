@@ -22,7 +22,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.known_torque import hinges_of
-from elastic_env.joint.make_elastic import make_elastic, transformed
+from elastic_env.joint.make_elastic import make_elastic, transform_hinges
 from elastic_env.joint.model_file import keep_shapes, urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
@@ -142,7 +142,7 @@ def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
             )
             for hinge, joint in joints.items()
         }
-        spec = transformed(gallery_robot(name, FOLDER), scaled, form)  # type: ignore[arg-type]
+        spec = transform_hinges(gallery_robot(name, FOLDER), scaled, form)  # type: ignore[arg-type]
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
         model = spec.compile()

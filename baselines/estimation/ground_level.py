@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
-from elastic_env.core.signals import Array, renamed
+from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
 from elastic_env.world.robot_model import WalkerModel
 
@@ -70,8 +70,8 @@ class GroundLevel:
         table = model.observation_table
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
-        own = renamed(table.signals_of("imu_attitude"), "own_tilt")
-        self.signals = (*own, *renamed(table.signals_of("wrench"), "level_wrench"))
+        own = rename_group(table.signals_of("imu_attitude"), "own_tilt")
+        self.signals = (*own, *rename_group(table.signals_of("wrench"), "level_wrench"))
         """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")

@@ -157,7 +157,7 @@ def picture(name: str) -> Image:
     robot = AtRest(name)
     home = home_pose(name, robot.hinges)
     links = np.array([robot.links(theta) for theta in (home, robot.commands(home))])
-    return SagViews(_display(name), robot.hinges, _PIXELS).drawn(np.array([home, home]), links)
+    return SagViews(_display(name), robot.hinges, _PIXELS).draw(np.array([home, home]), links)
 
 
 def _display(name: str) -> mujoco.MjSpec:

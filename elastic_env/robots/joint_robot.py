@@ -22,7 +22,7 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
-from elastic_env.joint.make_elastic import transformed
+from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.motion.arm_references import (
     AnyArmReference,
     ArmMotion,
@@ -201,7 +201,7 @@ class JointRobot:
         Raises:
             ConfigurationError: A sensor has no place.
         """
-        spec = transformed(self._loaded(config), self._true_joints(config), config.form)
+        spec = transform_hinges(self._loaded(config), self._true_joints(config), config.form)
         spec.option.timestep = config.timestep_s
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode, not restart the world behind the task's back

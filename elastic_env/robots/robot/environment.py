@@ -13,7 +13,7 @@ import mujoco
 
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.joint.frozen import frozen
+from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
 from elastic_env.joint.known_torque import (
     has_nameless_hinge,
@@ -129,7 +129,7 @@ def joint_robot(
     require_fixed_base(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
-    moving = frozen(spec, settings)
+    moving = hold_other_joints(spec, settings)
     rigid = compiled_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
     elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)

@@ -10,7 +10,6 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.frozen import home_of
 from elastic_env.joint.joint_settings import (
     CURE,
     GivenJoints,
@@ -18,6 +17,7 @@ from elastic_env.joint.joint_settings import (
     ServoSettings,
     read_joints,
 )
+from elastic_env.joint.known_torque import home_of
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import quote
-from elastic_env.joint.frozen import frozen
+from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.model_file import GivenModel, compiled_spec, read_model
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 
@@ -62,7 +62,9 @@ class RigidModel:
         if self._spec is None:
             with warnings.catch_warnings():  # they were said when it was read for the first time
                 warnings.simplefilter("ignore", UserWarning)
-                self._spec = _bare(frozen(read_robot(self._model), self._joints), self._joints)
+                self._spec = _bare(
+                    hold_other_joints(read_robot(self._model), self._joints), self._joints
+                )
         return self._spec.copy()
 
     def __getstate__(self) -> dict[str, Any]:

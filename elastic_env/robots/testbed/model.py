@@ -16,7 +16,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.make_elastic import Form, transformed
+from elastic_env.joint.make_elastic import Form, transform_hinges
 
 JOINT = "joint"
 GRAVITY_M_S2 = 9.81
@@ -107,6 +107,6 @@ def elastic_spec(
     gravity: float = GRAVITY_M_S2,
 ) -> mujoco.MjSpec:
     """The testbed with its elastic joint and servo, integrated by RK4."""
-    spec = transformed(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
+    spec = transform_hinges(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
     spec.option.timestep = timestep_s
     return spec

@@ -25,7 +25,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.make_elastic import Form, transformed
+from elastic_env.joint.make_elastic import Form, transform_hinges
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry
 
@@ -154,7 +154,7 @@ def elastic_spec(
         form: "tendon", or "rigid" for what an inelastic robot would do.
         timestep_s: Physics step [s].
     """
-    spec = transformed(rigid_spec(robot), joints, form, actuators="replace")
+    spec = transform_hinges(rigid_spec(robot), joints, form, actuators="replace")
     spec.option.timestep = timestep_s
     for side in SIDES:
         for name in ("FORCE", "TORQUE"):

@@ -172,7 +172,7 @@ class WalkTask(Task):
                 f" {len(scenarios)}"
             )
         sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
-        table = OBSERVATION.extended(sensors.signals)
+        table = SignalTable((*OBSERVATION, *sensors.signals))
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         assumed = WalkerModel(
