@@ -17,8 +17,8 @@ from baselines.adaptation.estimators import EncoderEstimator, LegEstimator, Link
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
-from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import (
+    Compensated,
     Compensator,
     DynamicCompensator,
     GravityCompensator,
@@ -76,7 +76,7 @@ class NamedPolicy:
 
 
 def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return Zero(model.observation_table)
+    return Zero(model)
 
 
 def _around(
@@ -189,11 +189,10 @@ def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
 
     def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         sensors = DeflectionSensors(model, sensor, joints)
-        modelled = DynamicCompensator(model, options.output or "wrench", options.gravity)
+        output = options.output or "wrench"
+        compensator = MeasuredCompensator(model, sensors, output, options.gravity)
         controller = _controller(env, model, options)
-        policy = Compensated(
-            controller, MeasuredCompensator(modelled, sensors), options.ramp_s, corrects_policy=True
-        )
+        policy = Compensated(controller, compensator, options.ramp_s, corrects_policy=True)
         estimator = (
             LegEstimator(model, sensors)
             if sensor == TORQUE_SENSOR
@@ -204,13 +203,12 @@ def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     return build
 
 
-def _link_encoder(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+def _link_encoder(env: Any, model: RobotModel, options: PolicyOptions) -> Any:  # noqa: ARG001
     """`dynamic`, with links by their encoders and the stiffness of every joint adapted by them."""
     sensors = DeflectionSensors(model, LINK_ENCODER)
-    modelled = DynamicCompensator(model, options.output or "taylor", options.gravity)
-    policy = Compensated(
-        _zero(env, model, options), MeasuredCompensator(modelled, sensors), options.ramp_s
-    )
+    output = options.output or "taylor"
+    compensator = MeasuredCompensator(model, sensors, output, options.gravity)
+    policy = Compensated(Zero(model), compensator, options.ramp_s)
     return OnlineStiffness(policy, model, LinkEncoderEstimator(model, sensors), options.adaptation)
 
 

@@ -129,14 +129,13 @@ class DisturbanceObserver(PolicyAround):
         self,
         policy: Policy,
         model: RobotModel,
-        gains: ObserverGains | None = None,
+        gains: ObserverGains,
         ramp_s: float = STAND_S,
     ) -> None:
+        super().__init__(policy, model)
         table = model.observation_table
-        super().__init__(policy, table, model.control_period_s)
         require_sensor(table, LINK_IMU, _LINK_ANGLE)
-        self._model = model
-        self._gains = gains or ObserverGains()
+        self._gains = gains
         self._dt = model.control_period_s
         self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
@@ -179,7 +178,7 @@ class DisturbanceObserver(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
-        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self._model.stiffness
+        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self.model.stiffness
         return (action + lead).astype(np.float32), ObserverMemory(steps, joints, inner)
 
     @override
@@ -190,7 +189,7 @@ class DisturbanceObserver(PolicyAround):
     def _observe(self, rows: Array, steps: IntArray, was: JointObservation) -> JointObservation:
         """Memory of the joints after a control step."""
         gains = self._gains
-        model = self._model
+        model = self.model
         theta = self.view.theta(rows)
         imu = rows[:, self._imu].copy()
         q_ref_dot = self.view.motion(rows).q_dot

@@ -153,7 +153,7 @@ class LinkEncoderEstimator(Estimator):
     ) -> None:
         self._sensors = sensors
         self._regression = StiffnessRegression(model, prior)
-        self._view = ObservationView(model.observation_table, model.control_period_s)
+        self._view = ObservationView(model)
         self._body = make_dynamics(model, GravityCompensator(model).gravity)
         self._stiffness = model.stiffness
         self._viscous = model.viscous_friction

@@ -48,7 +48,7 @@ class LearnedOffsets(PolicyAround):
     def __init__(
         self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
+        super().__init__(policy, model)
         self._signals = signals
         self._ramp = Ramp(model, ramp_s)
         self._period_s = model.control_period_s

@@ -66,10 +66,9 @@ class OnlineStiffness(PolicyAround):
         policy: Policy,
         model: RobotModel,
         estimator: Estimator,
-        gains: AdaptationGains | None = None,
+        gains: AdaptationGains,
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
-        gains = gains or AdaptationGains()
+        super().__init__(policy, model)
         self._estimator = estimator
         self._every = max(round(gains.period_s / model.control_period_s), 1)
         self._gain = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s))

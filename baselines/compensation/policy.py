@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
+from elastic_env.world.robot_model import RobotModel
 
 Action = npt.NDArray[np.float32]
 Records: TypeAlias = npt.NDArray[Any]
@@ -78,15 +79,15 @@ class BatchPolicy(ABC):
     """A policy that commands a batch of worlds at once.
 
     Args:
-        table: Of the observations.
-        control_period_s: Time between two observations [s].
+        model: Assumed robot.
     """
 
     reads_rates = True
     """It reads the rates of the joints; if not, a compensator around it does not estimate them."""
 
-    def __init__(self, table: SignalTable, control_period_s: float) -> None:
-        self.view = ObservationView(table, control_period_s)
+    def __init__(self, model: RobotModel) -> None:
+        self.model = model
+        self.view = ObservationView(model)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -166,13 +167,12 @@ class PolicyAround(BatchPolicy):
 
     Args:
         policy: Any policy.
-        table: Of the observations.
-        control_period_s: Time between two observations [s].
+        model: Assumed robot.
     """
 
-    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
-        super().__init__(table, control_period_s)
-        self.policy = as_batch_policy(policy, table, control_period_s)
+    def __init__(self, policy: Any, model: RobotModel) -> None:
+        super().__init__(model)
+        self.policy = as_batch_policy(policy, model)
 
     @property
     @override
@@ -188,9 +188,6 @@ class Zero(BatchPolicy):
     """Plays the reference back: no offset, no memory, and it takes the encoder for the link."""
 
     reads_rates = False
-
-    def __init__(self, table: SignalTable) -> None:
-        super().__init__(table, 0.0)  # without memory it does not ask where episodes begin
 
     @override
     def predict(
@@ -231,8 +228,8 @@ class UserMemory(NamedTuple):
 class UserPolicy(BatchPolicy):
     """A policy of a user as one of ours: it gets observations of the shape that the caller gave."""
 
-    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
-        super().__init__(table, control_period_s)
+    def __init__(self, policy: Any, model: RobotModel) -> None:
+        super().__init__(model)
         self._policy = policy
         self.reads_rates = getattr(policy, "reads_rates", True)
 
@@ -258,11 +255,9 @@ class UserPolicy(BatchPolicy):
         return self._policy.link_estimate(rows, memory.state[0])
 
 
-def as_batch_policy(policy: Any, table: SignalTable, control_period_s: float) -> BatchPolicy:
+def as_batch_policy(policy: Any, model: RobotModel) -> BatchPolicy:
     """The policy itself if it is one of ours, else one around it."""
-    return (
-        policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, table, control_period_s)
-    )
+    return policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, model)
 
 
 def as_action(offsets: Array, is_single: bool) -> Action:
@@ -342,9 +337,10 @@ class Motion(NamedTuple):
 class ObservationView:
     """Columns of an observation that compensators need, by name."""
 
-    def __init__(self, table: SignalTable, control_period_s: float) -> None:
+    def __init__(self, model: RobotModel) -> None:
+        table = model.observation_table
         self._width = len(table)
-        self._period_s = control_period_s
+        self._period_s = model.control_period_s
         self._clock = table.group("clock") if "clock.time" in table.names else None
         self._theta = table.group("encoder_angle")
         self._theta_dot = table.group("encoder_rate")

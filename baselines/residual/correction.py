@@ -15,7 +15,6 @@ from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
     Action,
-    ObservationView,
     Policy,
     PolicyInputs,
     as_action,
@@ -60,10 +59,10 @@ class Corrected:
                 f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set"
                 " cautious: false"
             )
-        self.base = as_batch_policy(base, model.observation_table, model.control_period_s)
+        self.base = as_batch_policy(base, model)
         self.settings = settings
         self.model = model
-        self.view = ObservationView(model.observation_table, model.control_period_s)
+        self.view = self.base.view
         self.channels = Channels(model, settings)
         self._share = 1.0 - float(
             np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s)

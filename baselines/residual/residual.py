@@ -137,8 +137,7 @@ class ResidualPolicy(BatchPolicy):
     """
 
     def __init__(self, corrected: Corrected, network: Network) -> None:
-        model = corrected.model
-        super().__init__(model.observation_table, model.control_period_s)
+        super().__init__(corrected.model)
         self.corrected = corrected
         self._network = network
         self._features = Features(corrected)

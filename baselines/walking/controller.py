@@ -155,7 +155,7 @@ INPUTS = record_type(
     zmp=(2,),  # [m]
     com=(2,),  # [m]
     leg_length=(),  # [m]
-    hip=(2, 2),  # roll and pitch of either leg [rad]
+    hip=(2,),  # roll and pitch of both legs [rad]
     balance_gain=(),  # relative change [1]
     deflection=(2, 6),  # relative change [1]
 )
@@ -182,8 +182,8 @@ class WalkingController(BatchPolicy):
         gains: WalkingGains | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
+        super().__init__(model)
         table = model.observation_table
-        super().__init__(table, model.control_period_s)
         self._biped = model.biped
         self._walk_view = WalkView(table)
         self._attitude = table.group("imu_attitude")
@@ -307,18 +307,10 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     if inputs is NO_INPUTS or inputs is ONE_WORLD:
         return _none(num_worlds)
     dense = np.zeros(num_worlds, INPUTS)
-    if inputs.zmp is not None:
-        dense["zmp"] = inputs.zmp
-    if inputs.com is not None:
-        dense["com"] = inputs.com
-    if inputs.leg_length is not None:
-        dense["leg_length"] = inputs.leg_length[:, 0]
-    if inputs.balance_gain is not None:
-        dense["balance_gain"] = inputs.balance_gain[:, 0]
-    if inputs.hip is not None:
-        dense["hip"] = inputs.hip if inputs.hip.ndim == 3 else inputs.hip[:, None]
-    if inputs.deflection is not None:
-        dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
+    for name in INPUTS.names or ():
+        values = getattr(inputs, name)
+        if values is not None:
+            dense[name] = values.reshape(dense[name].shape)
     return dense
 
 
@@ -477,9 +469,9 @@ def offset_leg(
         wound = 1.0 + given.deflection[leg, i]
         moved = 0.0
         if i == 1:
-            moved = given.hip[leg, 0]
+            moved = given.hip[0]
         elif i == 2:
-            moved = hip + given.hip[leg, 1]
+            moved = hip + given.hip[1]
         elif i == 3:
             moved = knee
         elif i == 4:

@@ -92,11 +92,11 @@ class FootBalance(BatchPolicy):
     """
 
     def __init__(
-        self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S
+        self, model: WalkerModel, gains: FootBalanceGains, ramp_s: float = STAND_S
     ) -> None:
+        super().__init__(model)
         table = model.observation_table
-        super().__init__(table, model.control_period_s)
-        self._gains = gains or FootBalanceGains()
+        self._gains = gains
         self._biped = model.biped
         self._plan = model.plan
         self._dt = model.control_period_s

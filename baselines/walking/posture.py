@@ -97,13 +97,12 @@ class PostureFeedback(PolicyAround):
         self,
         policy: Any,
         model: WalkerModel,
-        gains: PostureGains | None = None,
+        gains: PostureGains,
         ramp_s: float = STAND_S,
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
+        super().__init__(policy, model)
         self._walk_view = WalkView(model.observation_table)
         self._ramp = Ramp(model, ramp_s).table
-        gains = gains or PostureGains()
         period_s = model.control_period_s
         self._gains: Any = np.zeros(1, POSTURE)
         for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):

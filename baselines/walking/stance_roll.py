@@ -69,11 +69,9 @@ class StanceRoll(PolicyAround):
         gains: Angle and share.
     """
 
-    def __init__(
-        self, policy: Policy, model: WalkerModel, gains: StanceRollGains | None = None
-    ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
-        self._gains = gains or StanceRollGains()
+    def __init__(self, policy: Policy, model: WalkerModel, gains: StanceRollGains) -> None:
+        super().__init__(policy, model)
+        self._gains = gains
         self._clock = model.observation_table.group("clock")
 
     @override

@@ -54,12 +54,9 @@ class ZmpOffset(PolicyAround):
         gains: Gains.
     """
 
-    def __init__(
-        self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains | None = None
-    ) -> None:
+    def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
+        super().__init__(policy, model)
         table = model.observation_table
-        super().__init__(policy, table, model.control_period_s)
-        gains = gains or ZmpOffsetGains()
         self._ankles = model.biped.ankles
         self._sensors = FootSensors.of_biped(model.biped)
         self._wrench = table.group("wrench")
