@@ -176,6 +176,15 @@ class LinkEncoderEstimator(Estimator):
         return self._regression.add(h, deflection, friction, q, memory, measured=self._sensors.has)
 
 
+def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
+    """The estimator that makes the most of a robot's sensors."""
+    if not isinstance(model, WalkerModel):
+        return LinkEncoderEstimator(model, sensors)
+    if sensors.are_torques:
+        return LegEstimator(model, sensors)
+    return EncoderEstimator(model, sensors)
+
+
 def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of
     measurements.

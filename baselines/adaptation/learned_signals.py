@@ -150,9 +150,10 @@ class JointSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        link = (
-            np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
-        )
+        if self._encoder is None:
+            link = np.reshape(info[LINK_IMU], (-1, 1))
+        else:
+            link = seen[:, self._encoder]
         return asked[:, self._reference] - link
 
     @override
@@ -162,6 +163,6 @@ class JointSignals(LearnedSignals):
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
     """Signals that are learned of a robot."""
-    return (
-        WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)
-    )
+    if isinstance(model, WalkerModel):
+        return WalkSignals(model, gains)
+    return JointSignals(model, gains)

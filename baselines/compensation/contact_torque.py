@@ -65,7 +65,12 @@ class LegTorque:
         """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns
         with its foot.
         """
-        return _block_diagonal(self.gradient_by_leg(q))
+        gradient = np.zeros((len(q), q.shape[-1], q.shape[-1]))
+        by_leg = self.gradient_by_leg(q)
+        for leg in range(_LEGS):
+            own = slice(leg * _PER_LEG, (leg + 1) * _PER_LEG)
+            gradient[:, own, own] = by_leg[:, leg]
+        return gradient
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6)
@@ -213,15 +218,6 @@ class BoundPlannedTorque(NamedTuple):
         return self.torque + (
             self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
         )
-
-
-def _block_diagonal(blocks: Array) -> Array:
-    """(..., L, J, J) to (..., L J, L J)."""
-    L, J = blocks.shape[-3:-1]
-    full = np.zeros((*blocks.shape[:-3], L * J, L * J))
-    for leg in range(L):
-        full[..., leg * J : (leg + 1) * J, leg * J : (leg + 1) * J] = blocks[..., leg, :, :]
-    return full
 
 
 @compiled

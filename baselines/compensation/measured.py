@@ -59,6 +59,7 @@ class DeflectionSensors:
 
     Attributes:
         has: Which joints have it, (n,).
+        are_torques: They measure torques, not link angles.
         modelled: 1 where δ follows from the assumed K, 0 where it does not, (n,) [1].
 
     Raises:
@@ -69,7 +70,7 @@ class DeflectionSensors:
         table = model.observation_table
         require_sensor(table, sensor)
         self._stiffness = model.stiffness
-        self._is_torque = sensor == TORQUE_SENSOR
+        self.are_torques = sensor == TORQUE_SENSOR
         self._columns = table.group(sensor)
         self._encoder = table.group("encoder_angle")
         self.has: BoolArray = np.array(
@@ -80,9 +81,9 @@ class DeflectionSensors:
     def deflection(self, rows: Array) -> Array:
         """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
         shown = rows[:, self._columns]
-        return self.has * (
-            shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown
-        )
+        if self.are_torques:
+            return self.has * (shown / self._stiffness)
+        return self.has * (rows[:, self._encoder] - shown)
 
 
 class MeasuredCompensator(DynamicCompensator):

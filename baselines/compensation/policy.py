@@ -10,7 +10,7 @@ per world; the memory of the policy inside it is one of its fields.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -301,28 +301,27 @@ def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
     """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor
     tuple stays.
     """
-    if isinstance(memory, np.ndarray):
-        changed = memory.copy()
-        changed[worlds] = rows
+
+    def put(array: Array, other: Array) -> Array:
+        changed = array.copy()
+        changed[worlds] = other
         return changed
-    if isinstance(memory, tuple):
-        return _like(
-            memory,
-            [put_rows(part, worlds, other) for part, other in zip(memory, rows, strict=True)],
-        )
-    return memory
+
+    return _map_arrays(put, memory, rows)
 
 
 def select_rows(memory: Any, worlds: BoolArray) -> Any:
     """Memory of some worlds, a (num_worlds,) mask."""
+    return _map_arrays(lambda array: array[worlds], memory)
+
+
+def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> Any:
+    """Memory of the same form whose arrays are a function of those of several memories."""
     if isinstance(memory, np.ndarray):
-        return memory[worlds]
-    if isinstance(memory, tuple):
-        return _like(memory, [select_rows(part, worlds) for part in memory])
-    return memory
-
-
-def _like(memory: tuple[Any, ...], parts: list[Any]) -> tuple[Any, ...]:
+        return function(memory, *others)
+    if not isinstance(memory, tuple):
+        return memory
+    parts = [_map_arrays(function, *own) for own in zip(memory, *others, strict=True)]
     return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
 
 
@@ -399,11 +398,7 @@ class ObservationView:
         """
         starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
         if not np.all(starts):
-            sign = (
-                "clock.time"
-                if self._clock is not None
-                else "a reference at rest, and no command yet"
-            )
+            sign = "clock.time" if self._clock else "a reference at rest, and no command yet"
             raise ElasticError(
                 "predict() was called without `state` in what looks like the middle of an episode"
                 f" (a beginning is known by {sign}): this policy has memory; pass the state that"

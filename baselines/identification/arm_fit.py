@@ -163,7 +163,7 @@ def _spread_near(model: PoseModel) -> float:
     the measurement.
     """
     start = model.start_with(_FIRST_DEFLECTION_RAD)
-    predicted, gradient = model.predicted(start)
+    predicted, gradient = model.predict(start)
     noise = _FINEST[model.log.kind]
     rows = gradient.reshape(-1, len(start)) * model.scale / noise
     residual = (model.target - predicted).ravel() / noise
@@ -203,7 +203,7 @@ class _Problem:
         if self._progress is not None:
             self._progress(self._count)
         try:
-            predicted, self._gradient = self._model.predicted(self._model.scale * x)
+            predicted, self._gradient = self._model.predict(self._model.scale * x)
         except ElasticError:
             if not len(self._at):
                 raise
@@ -262,14 +262,14 @@ def _radius(points: Array) -> float:
 
 def information_of(model: PoseModel, unknowns: Array, spread: float) -> tuple[Array, Array]:
     """Scaled derivatives of a unit of noise, (N, m, p), and JᵀJ + Λ of them, (p, p)."""
-    _, gradient = model.predicted(unknowns)
+    _, gradient = model.predict(unknowns)
     rows = gradient * model.scale / spread
     return rows, np.tensordot(rows, rows, axes=([0, 1], [0, 1])) + np.eye(len(unknowns))
 
 
 def _described(model: PoseModel, unknowns: Array, finest: float) -> ArmFit:
     """Spread and covariance at the estimates."""
-    predicted, _ = model.predicted(unknowns)
+    predicted, _ = model.predict(unknowns)
     residual = model.target - predicted
     rows, information = information_of(model, unknowns, finest)
     inverse = np.linalg.inv(information)

@@ -108,7 +108,7 @@ class ArmIdentification(Model):
         return files
 
 
-def described(
+def describe_fit(
     fit: ArmFit, within: float, assumed: float | None, planned: Array | None = None
 ) -> ArmIdentification:
     """The result of a fit.
@@ -162,8 +162,11 @@ def expected_half_width(fit: ArmFit, information: Array) -> Array:
 def reasons(fit: ArmFit, within: float) -> list[str]:
     """Why the poses do not tell each stiffness apart; empty text where they do, (k,)."""
     compliance, half = fit.estimate("compliance")
-    unloaded = _unloaded(fit)
-    unseen = _unseen(fit)
+    model = fit.model
+    unloaded = model.load < SMALLEST_LOAD * np.abs(model.arm.torque(fit.q)).max()
+    _, gradient = model.predict(fit.unknowns)
+    moved = np.abs(gradient[..., model.unknowns.slices["offset"]]).max(axis=(0, 1))
+    unseen = moved < _SHOWN * moved.max()
     alike = _alike(fit)
     names = [fit.model.log.joints[at] for at in fit.model.unknowns.elastic]
 
@@ -185,20 +188,8 @@ def reasons(fit: ArmFit, within: float) -> list[str]:
     return [reason(i) for i in range(len(names))]
 
 
-def _unloaded(fit: ArmFit) -> BoolArray:
-    """Which elastic joints carry no torque, (k,)."""
-    return fit.model.load < SMALLEST_LOAD * np.abs(fit.model.arm.torque(fit.q)).max()
-
-
-def _unseen(fit: ArmFit) -> BoolArray:
-    """Which elastic joints do not move the measurement, (k,)."""
-    _, gradient = fit.model.predicted(fit.unknowns)
-    moved = np.abs(gradient[..., fit.model.unknowns.slices["offset"]]).max(axis=(0, 1))
-    return moved < _SHOWN * moved.max()
-
-
 def _alike(fit: ArmFit) -> BoolArray:
-    """Which pairs of compliances have estimates that hardly differ in what they explain, (k, k)."""
+    """Pairs of compliances whose estimates hardly differ in what they explain, (k, k)."""
     own = fit.model.unknowns.slices["compliance"]
     spread = np.linalg.inv(fit.information)[own, own]
     correlation = spread / np.sqrt(np.outer(np.diag(spread), np.diag(spread)))

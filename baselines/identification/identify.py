@@ -202,9 +202,7 @@ def identify_points(
         )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    from scipy import stats  # here: most programs need none of it, and it loads for half a second
 
     generator = np.random.default_rng(seed)
 
@@ -272,7 +270,7 @@ def identify(
         )
         parts.append(record_points(env, seed, share))
     gravity = [make_gravity(env.unwrapped.assumed_model) for env in envs]
-    points = [StaticPoints.joined(world) for world in zip(*parts, strict=True)]
+    points = [StaticPoints.join(world) for world in zip(*parts, strict=True)]
     return [identify_points(world, gravity, seed=seed or 0) for world in points], points
 
 
@@ -284,11 +282,8 @@ def _expanded_level(positions: int, level: float = 0.95) -> float:
     Bootstrap", The American Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the
     normal quantile.
     """
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    from scipy import stats  # here: most programs need none of it, and it loads for half a second
 
-    quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf(
-        (1.0 + level) / 2.0, positions - 1
-    )
+    t = stats.t.ppf((1.0 + level) / 2.0, positions - 1)
+    quantile = np.sqrt(positions / (positions - 1)) * t
     return float(1.0 - 2.0 * stats.norm.sf(quantile))

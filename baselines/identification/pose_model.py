@@ -153,19 +153,17 @@ class PoseModel:
         if not self.unknowns.rotation:
             return np.eye(3)
         at = self.arm.attitude(self.log.theta)
-        shown = self.log.measured
-        own = at.position
         if self.log.kind == "imu":
             shown = vertical(self.log.measured)
             own = at.rotation.transpose(0, 2, 1) @ self.arm.up
-            return Rotation.align_vectors(shown, own)[0].as_matrix()
-        return Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[
-            0
-        ].as_matrix()
+        else:
+            shown = self.log.measured - self.log.measured.mean(axis=0)
+            own = at.position - at.position.mean(axis=0)
+        return Rotation.align_vectors(shown, own)[0].as_matrix()
 
     @property
     def target(self) -> Array:
-        """What `predicted` has to meet, (N, m)."""
+        """What `predict` has to meet, (N, m)."""
         return np.zeros((len(self.log), 2)) if self.log.kind == "imu" else self.log.measured
 
     def expand(self, unknowns: Array, name: str) -> Array:
@@ -240,7 +238,7 @@ class PoseModel:
             )
         return path.q
 
-    def predicted(self, unknowns: Array) -> tuple[Array, Array]:
+    def predict(self, unknowns: Array) -> tuple[Array, Array]:
         """Measurements, (N, m), and their derivatives by the unknowns, (N, m, p)."""
         q, inverse = self.link_angles(unknowns)
         dq = self._link_gradient(unknowns, q, inverse)
@@ -259,26 +257,23 @@ class PoseModel:
         elastic = self.unknowns.elastic
         compliance = self.expand(unknowns, "compliance")
         gradient = np.zeros((*q.shape, self.unknowns.size))
-        gradient[..., own["compliance"]] = -(inverse * self.torque(unknowns, q)[:, None])[
-            ..., elastic
-        ]
+        by_torque = inverse * self.torque(unknowns, q)[:, None]
+        gradient[..., own["compliance"]] = -by_torque[..., elastic]
         gradient[..., own["offset"]] = -inverse[..., elastic]
         if self.log.direction is not None:
-            gradient[..., own["friction"]] = -(
-                inverse * (compliance * self.log.direction)[:, None]
-            )[..., elastic]
+            by_friction = inverse * (compliance * self.log.direction)[:, None]
+            gradient[..., own["friction"]] = -by_friction[..., elastic]
         if self.unknowns.payload:
-            gradient[..., own["payload"]] = (
-                -inverse @ (compliance * self.arm.payload_torque(q))[..., None]
-            )
+            bend = compliance * self.arm.payload_torque(q)
+            gradient[..., own["payload"]] = -inverse @ bend[..., None]
         return gradient
 
     def _turned(self, unknowns: Array) -> Array:
         """Rotation from the model's to the measurement's frame, (3, 3)."""
         turn = unknowns[self.unknowns.slices["rotation"]]
-        return (
-            Rotation.from_rotvec(turn).as_matrix() @ self._aligned if len(turn) else self._aligned
-        )
+        if not len(turn):
+            return self._aligned
+        return Rotation.from_rotvec(turn).as_matrix() @ self._aligned
 
     def _positions(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
         """What a tracker shows [m]."""
@@ -315,9 +310,8 @@ class PoseModel:
         elastic = self.unknowns.elastic
         gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns)) @ dq
         if self.log.direction is not None:
-            gradient[..., own["friction"]] += (np.eye(q.shape[1]) * self.log.direction[:, None])[
-                ..., elastic
-            ]
+            sides = np.eye(q.shape[1]) * self.log.direction[:, None]
+            gradient[..., own["friction"]] += sides[..., elastic]
         if self.unknowns.payload:
             gradient[..., own["payload"]] += self.arm.payload_torque(q)[..., None]
         return self.torque(unknowns, q)[:, at], gradient[:, at]

@@ -3,7 +3,7 @@ sides.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -38,27 +38,21 @@ class StaticPoints:
 
     def rows(self, chosen: IntArray) -> "StaticPoints":
         """Some of the points, in the given order."""
-        return StaticPoints(
-            self.theta[chosen],
-            self.q[chosen],
-            self.direction[chosen],
-            self.position[chosen],
-            self.load[chosen],
-        )
+        columns = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return StaticPoints(**columns)
 
     @staticmethod
-    def joined(parts: "Sequence[StaticPoints]") -> "StaticPoints":
+    def join(parts: "Sequence[StaticPoints]") -> "StaticPoints":
         """The points of several loads together, positions numbered through."""
-        first = np.concatenate([[0], np.cumsum([part.position.max() + 1 for part in parts])[:-1]])
-        return StaticPoints(
-            theta=np.concatenate([part.theta for part in parts]),
-            q=np.concatenate([part.q for part in parts]),
-            direction=np.concatenate([part.direction for part in parts]),
-            position=np.concatenate(
-                [part.position + start for part, start in zip(parts, first, strict=True)]
-            ),
-            load=np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)]),
-        )
+        numbered: list[StaticPoints] = []
+        first = 0
+        for load, part in enumerate(parts):
+            own = replace(part, position=part.position + first, load=np.full(len(part), load))
+            first += part.position.max() + 1
+            numbered.append(own)
+        names = [field.name for field in fields(StaticPoints)]
+        columns = {name: [getattr(part, name) for part in numbered] for name in names}
+        return StaticPoints(**{name: np.concatenate(own) for name, own in columns.items()})
 
 
 class HoldRecorder:
@@ -85,7 +79,7 @@ class HoldRecorder:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every window has been visited."""
+        """True when every window has been visited."""
         return bool(self._counts.all())
 
     def points(self) -> list[StaticPoints]:

@@ -21,7 +21,6 @@ import numpy as np
 from baselines.adaptation.estimators import mean_load
 from baselines.compensation.policy import Records
 from baselines.estimation.bending import BendingObserver
-from baselines.residual.correction import Corrected
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import WalkerModel
 
@@ -71,17 +70,6 @@ class Evidence:
         excess_load, loads = mean_load(memory.loads, seen[:, [_LOAD]], self._prior_loads)
         g = evidence(seen[:, _ERROR], seen[:, _UNCERTAINTY], excess_load[:, 0])
         return g[:, None], EvidenceMemory(loads, bending)
-
-
-def caution(corrected: Corrected) -> Evidence | None:
-    """Judge of how far a residual may act; None for one that is not cautious."""
-    model = corrected.model
-    settings = corrected.settings
-    if settings.cautious and isinstance(
-        model, WalkerModel
-    ):  # `Corrected` refuses it for other robots
-        return Evidence(model, settings.decision_period * model.control_period_s)
-    return None
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:

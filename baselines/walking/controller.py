@@ -26,7 +26,6 @@ Tracking", IROS.
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -92,11 +91,6 @@ class LocalFrame:
 
     com: Array
     soles: Array
-
-    @property
-    def com_from_soles(self) -> Array:
-        """Center of mass relative to each sole, (num_worlds, 2, 3) [m]."""
-        return self.com[:, None] - self.soles
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
@@ -304,20 +298,14 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     """Inputs as rows of `INPUTS`, (num_worlds,)."""
-    if inputs is NO_INPUTS or inputs is ONE_WORLD:
-        return _none(num_worlds)
     dense = np.zeros(num_worlds, INPUTS)
+    if inputs is NO_INPUTS or inputs is ONE_WORLD:
+        return dense
     for name in INPUTS.names or ():
         values = getattr(inputs, name)
         if values is not None:
             dense[name] = values.reshape(dense[name].shape)
     return dense
-
-
-@lru_cache
-def _none(num_worlds: int) -> Records:
-    """No inputs, which the kernel does not change."""
-    return np.zeros(num_worlds, INPUTS)
 
 
 def _share(period_s: float, time_constant_s: float) -> float:
