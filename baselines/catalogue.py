@@ -1,5 +1,4 @@
-"""The named policies: how each is built, which options it has, and what it needs beyond the
-standard sensors.
+"""The named policies: how each is built, its options, and the sensors that it needs.
 
 Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the
 command of a policy and shows it compensated encoder readings. The named policies are such
@@ -93,14 +92,14 @@ _friction = _around(_zero, partial(DynamicCompensator, friction=True))
 
 
 def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    build = _friction if options.observer.friction else _around(_zero, DynamicCompensator)
-    return DisturbanceObserver(build(env, model, options), model, options.observer, options.ramp_s)
+    gains = options.observer
+    build = _friction if gains.friction else _around(_zero, DynamicCompensator)
+    inner = build(env, model, options)
+    return DisturbanceObserver(inner, model, gains, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return WalkingController(
-        model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s
-    )
+    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
 
 
 def _without_feedback(build: Builder) -> Builder:
@@ -138,9 +137,8 @@ def _weighing(build: Builder) -> Builder:
 
 
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    return OnlineStiffness(
-        _base(env, model, options), model, LegEstimator(model), options.adaptation
-    )
+    base = _base(env, model, options)
+    return OnlineStiffness(base, model, LegEstimator(model), options.adaptation)
 
 
 def _with_posture(build: Builder) -> Builder:
@@ -179,9 +177,7 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
 
 
 def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
-    """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by
-    them.
-    """
+    """`dynamic` with the deflections of some joints by sensors, which also adapt the stiffness."""
 
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
         is_walker = isinstance(model, WalkerModel)

@@ -40,8 +40,9 @@ def policy_names() -> list[str]:
 
 
 def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """A baseline by its name, on a walker or on another robot; None for a policy that is no
-    baseline.
+    """A baseline by its name, on a walker or on another robot.
+
+    None for a policy that is no baseline.
     """
     return policies_of(is_walker).get(name)
 
@@ -57,8 +58,9 @@ def track(name: str, is_walker: bool = True) -> Track:
 
 
 def best_analytic(is_walker: bool = True) -> str | None:
-    """The best policy without learning that reads the standard sensors, by its name; None where
-    none is named.
+    """The best policy without learning that reads the standard sensors, by its name.
+
+    None where none is named.
     """
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 

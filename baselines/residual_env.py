@@ -58,8 +58,9 @@ class _Deciding:
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
-        """Features of the coming decision; the measurements count for some worlds only, or for
-        all.
+        """Features of the coming decision.
+
+        The measurements count for some worlds only, or for all.
         """
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
         if worlds is not None and self._past is not None:
@@ -248,8 +249,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
-        """Hold a residual for a decision period in the worlds that are alive; the observation is
-        of features.
+        """Hold a residual for a decision period in the worlds that are alive.
+
+        The observation is of features.
         """
         n = self.num_envs
         reward = np.zeros(n)

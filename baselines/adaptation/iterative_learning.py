@@ -1,5 +1,4 @@
-r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at
-the same time.
+r"""Iterative learning control: the errors of a trial correct the offsets of the next one.
 
 .. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
 
@@ -70,7 +69,8 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
         cutoff_hz: Where the amplitude is halved [Hz].
         period_s: Time between rows [s].
     """
-    from scipy import signal  # here: most programs need none of it, and it loads for half a second
+    # here: most programs need none of it, and it loads for half a second
+    from scipy import signal
 
     sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
     longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends

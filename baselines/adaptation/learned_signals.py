@@ -1,5 +1,4 @@
-r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the
-joints correct them.
+r"""Signals that are learned from trial to trial: errors, and the offsets that correct them.
 
 | robot | error, by sensors alone | correction |
 |---|---|---|

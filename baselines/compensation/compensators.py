@@ -1,5 +1,4 @@
-r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and from the full joint
-torque.
+r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), full joint torque.
 
 An input compensator says by how much the motor side has to lead so that the link is where it should
 be; an output compensator says where the link is when the motor encoder shows θ. All work on (...,
@@ -47,8 +46,9 @@ OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 def input_offset(
     q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0
 ) -> Array:
-    r"""Eq. 9, θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way: the offset that
-    brings the link to θ_d.
+    r"""Eq. 9: the offset that brings the link to θ_d.
+
+    It is θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way.
 
     .. math:: u - q = \left(K^{-1} + k_p^{-1}\right) \tau_g(q)
 
@@ -88,15 +88,17 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
 
 
 def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
-    """Eq. 10 solved by Newton-Raphson from q = θ; arguments and errors as `taylor_link_angle`,
-    residual below 1e-12.
+    """Eq. 10 solved by Newton-Raphson from q = θ, to a residual below 1e-12.
+
+    Arguments and errors are those of `taylor_link_angle`.
     """
     return static_link_angle(theta, stiffness, gravity.gravity_torque, gravity.gravity_gradient)
 
 
 class Compensator(Protocol):
-    """An input offset for a motion, and a link angle for an encoder angle: what
-    `baselines.Compensated` needs.
+    """An input offset for a motion, and a link angle for an encoder angle.
+
+    `baselines.Compensated` needs both.
 
     `memory` has one row per world: an array, or a named tuple of arrays.
     """
@@ -117,15 +119,11 @@ class Compensator(Protocol):
 
     @abstractmethod
     def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
-        """Command offset for the coming control period, (num_worlds, n) [rad], and the new
-        memory.
-        """
+        """Command offset for the coming control period, (num_worlds, n) [rad], and new memory."""
 
     @abstractmethod
     def deflection(self, offset: Array, memory: Any) -> Array:
-        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n)
-        [rad].
-        """
+        """Deflection δ that an offset leads by, as `offset` returned it, (num_worlds, n) [rad]."""
 
     @abstractmethod
     def link_angle(self, theta: Array, memory: Any) -> Array:
@@ -208,8 +206,9 @@ class GravityCompensator(Compensator):
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """The derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇, at the estimated link angle,
-        (num_worlds, n) [rad/s].
+        """Rate at the estimated link angle, (num_worlds, n) [rad/s].
+
+        It is the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇.
         """
         if self._output == "none":
             return theta_dot
@@ -297,15 +296,12 @@ class DynamicCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: DriveMemory) -> tuple[Array, DriveMemory]:
-        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the memory for the
-        next step.
+        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the new memory.
 
         The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
         """
-        torque = (
-            self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
-            + self._viscous * motion.q_dot
-        )
+        torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
+        torque = torque + self._viscous * motion.q_dot
         friction = memory.friction
         if self._coulomb is not None:
             friction = presliding_friction(friction, motion.q_dot * self._dt, self._coulomb)
@@ -328,10 +324,10 @@ class DynamicCompensator(Compensator):
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
-        """Link angle by the deflection of the desired motion, or by the measured wrenches,
-        (num_worlds, n) [rad].
-        """
-        return self._static.link_angle(theta) if self._measures else theta - memory.deflection
+        """Link angle by the desired motion's deflection, or by the measured wrenches [rad]."""
+        if self._measures:
+            return self._static.link_angle(theta)
+        return theta - memory.deflection
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
@@ -375,8 +371,9 @@ def settle(
 def servo_error(
     theta_dot: Array, theta_ddot: Array, torque: Array, windup: Array, drives: Any, period_s: float
 ) -> tuple[Array, Array]:
-    """Errors that servos need to move rotors under their loads, [rad], and their integrals after a
-    control period.
+    """Errors that servos need to move rotors under loads [rad], and their integrals [rad·s].
+
+    The integrals are those after a control period.
 
     Args:
         theta_dot: Rates of the motor sides, (worlds, n) [rad/s].
@@ -398,16 +395,16 @@ def servo_error(
                 integrals[world, i] = follow_lag(
                     windup[world, i], effort / drive.integral_gain, time_s, period_s
                 )
-            errors[world, i] = (
-                effort - drive.integral_gain * integrals[world, i]
-            ) / drive.position_gain
+            effort -= drive.integral_gain * integrals[world, i]
+            errors[world, i] = effort / drive.position_gain
     return errors, integrals
 
 
 @compiled
 def follow_lag(state: float, target: float, time_constant_s: float, period_s: float) -> float:
-    """State of a first-order lag after one period towards a constant target; no lag for a time
-    constant of zero.
+    """State of a first-order lag after one period towards a constant target.
+
+    There is no lag for a time constant of zero.
     """
     return target + math.exp(-period_s / time_constant_s) * (state - target)
 
@@ -417,8 +414,9 @@ PRESLIDING_RAD = 1e-3
 
 
 def presliding_friction(friction: Array, displacement: Array, coulomb: Array) -> Array:
-    r"""Coulomb friction with presliding: it turns round over a displacement, and stays at rest
-    [Dahl1968].
+    r"""Coulomb friction with presliding [Dahl1968].
+
+    It turns round over a displacement, and stays at rest.
 
     .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
 
@@ -524,7 +522,7 @@ class Compensated(PolicyAround):
         if self._plan is not None and (shift := inputs.zmp_shift) is not None:
             view, foot_spacing = self._plan
             rows = rows.copy()
-            shift_plan(view.fields(rows), shift=np.ascontiguousarray(shift), spacing=foot_spacing)
+            shift_plan(view.fields(rows), np.ascontiguousarray(shift), foot_spacing)
             own = self._begin_shifted(rows, memory)
         compensator = self.compensator.at(rows)
         theta = rows[:, self._theta]
@@ -533,19 +531,15 @@ class Compensated(PolicyAround):
             links = links - compensator.modelled * correction * (theta - links)
             if not self._corrects_policy:
                 inputs = inputs._replace(deflection=None)
-        rates = (
-            compensator.link_rate(theta, self.view.theta_dot(rows))
-            if self.policy.reads_rates
-            else None
-        )
-        action, inner = self.policy.act(
-            self.view.with_links(rows, links, rates), memory.inner, inputs
-        )
+        rates = None
+        if self.policy.reads_rates:
+            rates = compensator.link_rate(theta, self.view.theta_dot(rows))
+        seen = self.view.with_links(rows, links, rates)
+        action, inner = self.policy.act(seen, memory.inner, inputs)
         wanted = action.astype(np.float64)
         motion = self.view.motion(rows)
-        offset, own = compensator.offset(
-            Motion(motion.q + wanted, motion.q_dot, motion.q_ddot), own
-        )
+        desired = Motion(motion.q + wanted, motion.q_dot, motion.q_ddot)
+        offset, own = compensator.offset(desired, own)
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, own)
         steps = memory.steps + 1

@@ -48,8 +48,7 @@ class FixedTorque:
 
 
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
-    """The gravity torque of a robot model by a chosen method; a `GravityModel` after
-    `at(observations)`.
+    """The gravity torque of a robot by a chosen method; a `GravityModel` after `at(observations)`.
 
     A robot on a fixed base has "hinge" (default for one joint) and "tree" (default for several),
     and is a `GravityModel` at once; a walker has the methods of
@@ -77,10 +76,10 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
 
 
 def make_dynamics(model: RobotModel, gravity: Any) -> Any:
-    """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a
-    walker.
-    """
-    return PlannedTorque(model, gravity) if isinstance(model, WalkerModel) else make_gravity(model)
+    """Inverse dynamics: of any motion on a fixed base, of the planned one for a walker."""
+    if isinstance(model, WalkerModel):
+        return PlannedTorque(model, gravity)
+    return make_gravity(model)
 
 
 class HingeTorque:
@@ -117,7 +116,5 @@ class HingeTorque:
         return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
-        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to (...,
-        1) [N·m].
-        """
+        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to [N·m]."""
         return self._inertia * q_ddot + self.gravity_torque(q)

@@ -1,5 +1,4 @@
-"""Named inputs of a base policy: the quantities of its own in which something outside, such as a
-residual, may act.
+"""Named inputs of a base policy: its own quantities in which a residual may act.
 
 Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the
 base to the last bit. An input acts on the quantity that the base itself plans or feeds back, so

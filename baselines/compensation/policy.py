@@ -41,8 +41,7 @@ class Policy(Protocol):
 
 
 class PolicyInputs(NamedTuple):
-    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is
-    not used.
+    """Values of a policy's inputs, (num_worlds, columns) each; None for one that is not used.
 
     A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what
     each input is. `command` is no field: it is added to whatever a policy commands. The last two
@@ -91,9 +90,7 @@ class BatchPolicy(ABC):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs that it has beside `command`: its own, and those of the policies
-        inside it.
-        """
+        """Names of its inputs beside `command`, and of those of the policies inside it."""
         return ()
 
     def predict(
@@ -127,8 +124,7 @@ class BatchPolicy(ABC):
         return as_action(action, is_single), memory
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw in the place of an observation's encoders, (..., n)
-        [rad].
+        """Link angles that the policy saw in the place of the encoders', (..., n) [rad].
 
         Args:
             observation: As in `predict`.
@@ -198,9 +194,7 @@ class Zero(BatchPolicy):
         deterministic: bool = True,
         inputs: PolicyInputs = NO_INPUTS,
     ) -> tuple[Action, Any]:
-        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of
-        it.
-        """
+        """Zero offset, (..., n) [rad], whatever the observation holds."""
         return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
 
     @override
@@ -282,9 +276,10 @@ def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> A
         if memory is not None:
             policy.view.require_start(rows, episode_start)
         return memory
-    if (number := count_rows(state)) != len(rows):
+    number = count_rows(state)
+    if number != len(rows):
         raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {number}")
-    if episode_start is None or episode_start is False or np.count_nonzero(episode_start) == 0:
+    if episode_start is None or np.count_nonzero(episode_start) == 0:
         return state
     fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
     return put_rows(state, fresh, select_rows(policy.begin(rows), fresh))
@@ -298,8 +293,9 @@ def count_rows(memory: Any) -> int:
 
 
 def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
-    """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor
-    tuple stays.
+    """Memory with other rows in some worlds, a (num_worlds,) mask.
+
+    What is neither array nor tuple stays.
     """
 
     def put(array: Array, other: Array) -> Array:
@@ -362,9 +358,7 @@ class ObservationView:
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
 
     def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
-        """A copy of the observation with link angles in place of the encoders', and rates if
-        they are given.
-        """
+        """A copy with link angles in the encoders' place, and rates if they are given."""
         seen = rows.copy()
         seen[:, self._theta] = q
         if q_dot is not None:
@@ -398,7 +392,9 @@ class ObservationView:
         """
         starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
         if not np.all(starts):
-            sign = "clock.time" if self._clock else "a reference at rest, and no command yet"
+            sign = "a reference at rest, and no command yet"
+            if self._clock is not None:
+                sign = "clock.time"
             raise ElasticError(
                 "predict() was called without `state` in what looks like the middle of an episode"
                 f" (a beginning is known by {sign}): this policy has memory; pass the state that"
@@ -406,8 +402,9 @@ class ObservationView:
             )
 
     def is_start(self, rows: Array) -> BoolArray:
-        """True for an observation that can be the first of an episode: by its clock, or at rest
-        without a command.
+        """True for an observation that can be the first of an episode.
+
+        It is known by its clock, or at rest without a command.
 
         Nothing is commanded where the last command is the reference, or zero, as an environment may
         begin with.

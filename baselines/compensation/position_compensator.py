@@ -75,9 +75,8 @@ _TRIES = 33
 _JUMP_RAD = 1e-3
 _CALM_RAD_S = 0.02
 """Jump of a command that is worth a word, and a rate of the command that is not [rad], [rad/s]."""
-_factored, _solved = get_lapack_funcs(
-    ("getrf", "getrs")
-)  # without the checks of lu_factor, which take longer
+# without the checks of lu_factor, which take longer
+_factored, _solved = get_lapack_funcs(("getrf", "getrs"))
 
 
 class PositionCompensator:
@@ -155,8 +154,9 @@ class PositionCompensator:
     def from_model(
         cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any
     ) -> Self:
-        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as
-        of the class.
+        """From a file of MJCF or URDF, its text, or what MuJoCo made of one.
+
+        Further arguments are those of the class.
 
         `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
         Hinges that such a file does not name are rigid, as those are that were not identified.
@@ -186,8 +186,9 @@ class PositionCompensator:
     def set_payload(
         self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None
     ) -> None:
-        """Let the robot carry another point mass; commands take it over within the time of the
-        ramp.
+        """Let the robot carry another point mass.
+
+        Commands take it over within the time of the ramp.
 
         In another place or on another body it is taken over from zero: the command lets go of the
         last one at once.
@@ -286,9 +287,8 @@ class PositionCompensator:
         shown_angle = self._checked("theta", theta, "rad")
         gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
         size = gradient.ravel()
-        is_soft = (
-            size.dot(size) >= 1.0
-        )  # by the Frobenius norm, which is fast: there may be other equilibria
+        # by the Frobenius norm, which is fast: there may be other equilibria
+        is_soft = size.dot(size) >= 1.0
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at
         # θ alone, for speed;
@@ -304,11 +304,9 @@ class PositionCompensator:
             missing = residual.dot(residual)
             if missing < _LAST_STEP_RAD**2:
                 way = q - shown_angle
-                return (
-                    self._soft_link_angle(shown_angle, q)
-                    if is_soft or way.dot(way) > _FAR_RAD**2
-                    else q
-                )
+                if is_soft or way.dot(way) > _FAR_RAD**2:
+                    return self._soft_link_angle(shown_angle, q)
+                return q
             if not missing < _LARGEST_STEP_RAD**2:
                 break
         return self._soft_link_angle(shown_angle, None)
@@ -329,7 +327,9 @@ class PositionCompensator:
             raise ElasticError(
                 f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
             )
-        return guess if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD else found.q
+        if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD:
+            return guess
+        return found.q
 
     def _heaviest(self) -> Array:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
@@ -381,10 +381,8 @@ class PositionCompensator:
         size = float(np.abs(jump[worst]))
         if size <= _JUMP_RAD:
             return
-        cure = (
-            f"ramp_s={max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5):.3g} takes it over in"
-            " that time"
-        )
+        calm_s = max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5)
+        cure = f"ramp_s={calm_s:.3g} takes it over in that time"
         if self._ramp > 0.0:
             cure = (
                 "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"

@@ -118,10 +118,8 @@ class GroundLevel:
         lean = mean * self._certainty(number)[:, None]
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
-        added = over_ankles * (upright - force)[..., :2]
-        turned = moment + np.stack(
-            [-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1
-        )
+        x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
+        turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
 
@@ -142,12 +140,15 @@ class GroundLevel:
         return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
-        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
-        one, (n, 2).
+        """Center of mass on the ankles: height [m], and velocity against the loaded one [m/s].
+
+        Shapes are (n, 2, 1) and (n, 2).
         """
         n = len(rows)
-        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
-        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
+        theta = rows[:, self._theta].reshape(n, 2, -1)
+        rate = rows[:, self._rate].reshape(n, 2, -1)
+        angles = np.stack([theta, theta + _DIFFERENCE_S * rate])
+        com, ankles = self._carried.com_and_feet(angles)
         now, soon = com[:, :, None] - ankles
         velocity = (soon - now)[..., :2] / _DIFFERENCE_S
         return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]

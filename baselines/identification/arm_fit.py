@@ -1,5 +1,4 @@
-r"""Stiffness of every joint of an arm from static poses: least squares over all poses, with 95 %
-intervals.
+r"""Stiffness of every joint of an arm by least squares over static poses, with 95 % intervals.
 
 The unknowns x of `PoseModel` minimise the squared residuals of the measurement. A weak prior,
 Gaussian with the scales of the model, keeps unknowns near zero that the poses say nothing about; on
@@ -159,9 +158,7 @@ def _least_squares(problem: "_Problem", start: Array, evaluations: int, **option
 
 
 def _spread_near(model: PoseModel) -> float:
-    """Spread of the residuals of poses to first order about small deflections, in the unit of
-    the measurement.
-    """
+    """Spread of the residuals to first order about small deflections, in the measurement's unit."""
     start = model.start_with(_FIRST_DEFLECTION_RAD)
     predicted, gradient = model.predict(start)
     noise = _FINEST[model.log.kind]
@@ -172,8 +169,7 @@ def _spread_near(model: PoseModel) -> float:
 
 
 class _Problem:
-    """Residuals of the poses and of the prior, and their derivatives, in units of noise and of the
-    scales.
+    """Residuals of poses and prior, and their derivatives, in units of noise and of the scales.
 
     Args:
         model: The poses.
@@ -193,8 +189,9 @@ class _Problem:
         self._size = model.target.size + model.unknowns.size
 
     def residual(self, x: Array) -> Array:
-        """Predicted less measured, then the prior, (N m + p,); infinite where a load overcomes a
-        spring.
+        """Predicted less measured, then the prior, (N m + p,).
+
+        Infinite where a load overcomes a spring.
 
         Raises:
             ElasticError: It does so at the start.
@@ -212,8 +209,9 @@ class _Problem:
         return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
 
     def jacobian(self, x: Array) -> Array:
-        """Its derivatives, (N m + p, p); `least_squares` asks for them where it has asked for
-        the residual.
+        """Its derivatives, (N m + p, p).
+
+        `least_squares` asks for them where it has asked for the residual.
         """
         if not np.array_equal(x, self._at):
             self.residual(x)
@@ -240,9 +238,7 @@ def require_poses(model: PoseModel) -> None:
 
 
 def _require_reach(model: PoseModel) -> None:
-    """Refuse positions that spread far more or less than those of the model, such as
-    millimetres.
-    """
+    """Refuse positions that spread far more or less than the model's, such as millimetres."""
     own, measured = (
         _radius(points)
         for points in (model.arm.attitude(model.log.theta).position, model.log.measured)

@@ -1,6 +1,4 @@
-"""What an identification of an arm found, as files hold it: intervals in JSON, stiffness in
-YAML.
-"""
+"""Result of an identification of an arm: intervals in JSON, stiffness in YAML."""
 
 import math
 from pathlib import Path
@@ -30,7 +28,8 @@ _OFFSET_KNOWN_RAD = 0.05
 """Half-width of an offset's interval above which the poses do not tell the offset."""
 _KNOWN = 0.5
 """The same for friction and payload, as a share of their plausible size."""
-_SHOWN = 0.05  # of the largest derivative by a joint: gravity couples the others by less
+_SHOWN = 0.05
+"""Share of the largest derivative by a joint: gravity couples the others by less."""
 UNLOADED = "gravity does not load it in these poses"
 UNSEEN = "the measurement does not show its angle"
 NEGATIVE = "stiffer than the log can tell; the estimate is negative"
@@ -229,9 +228,7 @@ def _joint(
 
 
 def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float | None) -> Source:
-    """Origin of the stiffness of a joint with the compliance c and the half-width h of its
-    interval.
-    """
+    """Origin of a stiffness, from the compliance c and the half-width h of its interval."""
     if c > h and not is_rigid:
         return "told apart" if h <= within * c else "wide interval"
     if assumed is not None:
@@ -260,9 +257,7 @@ def bounded_compliance(fit: ArmFit) -> Array:
 
 
 def _first_known(fit: ArmFit, name: str, i: int = 0) -> tuple[float | None, float | None]:
-    """An estimate, None where the poses do not tell it, and its half-width, None where it is not
-    sought.
-    """
+    """An estimate, None where the poses do not tell it, and its half-width, None if not sought."""
     values, half = fit.estimate(name)
     if not len(values):
         return None, None

@@ -1,6 +1,4 @@
-"""Signs of a log that contradict the model: encoders that are swapped, and joints that turn the
-other way.
-"""
+"""Signs of a log that contradict the model: swapped encoders, joints that turn the other way."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -122,8 +122,7 @@ def read_log(
 
 
 def average_poses(log: PoseLog) -> PoseLog:
-    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as
-    their mean.
+    """The log with the mean of consecutive rows whose encoders and sides of approach agree.
 
     Their friction and the errors of the model are the same, so that they do not count as
     independent.
@@ -211,9 +210,7 @@ def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
 
 
 def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> None:
-    """Refuse axes that are missing or unknown, and measurements of joints without a motor
-    encoder.
-    """
+    """Refuse axes that are missing or unknown, and joints without a motor encoder."""
     if kind in AXES and sorted(given) != sorted(AXES[kind]):
         raise ConfigurationError(
             f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"

@@ -139,9 +139,7 @@ class PoseModel:
         return scale
 
     def start_with(self, deflection_rad: float) -> Array:
-        """Unknowns to begin with, (p,): joints that bend by as much under their largest torque,
-        and zeros.
-        """
+        """Unknowns to begin with, (p,): a deflection under each largest torque, and zeros."""
         values = np.zeros(self.unknowns.size)
         compliance = self.unknowns.slices["compliance"]
         values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
@@ -164,7 +162,9 @@ class PoseModel:
     @property
     def target(self) -> Array:
         """What `predict` has to meet, (N, m)."""
-        return np.zeros((len(self.log), 2)) if self.log.kind == "imu" else self.log.measured
+        if self.log.kind == "imu":
+            return np.zeros((len(self.log), 2))
+        return self.log.measured
 
     def expand(self, unknowns: Array, name: str) -> Array:
         """One of c, o, F of all joints, zero where it is not sought, (n,)."""

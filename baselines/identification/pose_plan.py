@@ -89,8 +89,9 @@ def plan_further(fit: ArmFit, candidates: PoseLog, count: int) -> PosePlan:
 def candidate_poses(
     arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, generator: np.random.Generator
 ) -> PoseLog:
-    """Random poses within limits and without contacts; pairs of bodies that touch in all poses of
-    the log do not count.
+    """Random poses within limits and without contacts.
+
+    Pairs of bodies that touch in all poses of the log do not count.
 
     Args:
         arm: The arm.
@@ -121,10 +122,11 @@ def candidate_poses(
                 " ranges and shapes of the model, or give a model without shapes"
             )
     theta = np.array(poses)
-    sides = None if like.direction is None else generator.choice([-1.0, 1.0], size=theta.shape)
-    return PoseLog(
-        arm.joints, theta, like.kind, like.columns, _rigid_measurement(arm, like, theta), sides
-    )
+    sides = None
+    if like.direction is not None:
+        sides = generator.choice([-1.0, 1.0], size=theta.shape)
+    measured = _rigid_measurement(arm, like, theta)
+    return replace(like, theta=theta, measured=measured, direction=sides)
 
 
 def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
@@ -135,8 +137,9 @@ def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
 
 
 def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
-    """What a sensor in the model's own frame would show of rigid joints; only its directions
-    matter, (N, m).
+    """What a sensor in the model's own frame would show of rigid joints.
+
+    Only its directions matter, (N, m).
     """
     if like.kind == "end_effector":
         return arm.attitude(theta).position

@@ -193,7 +193,7 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
     bounds = np.zeros(len(names))
     for wanted, value in bound.items():
         bounds[fit_columns(wanted, names, kind)] = value
-    missing = [column for column, acts in zip(names, chosen & (bounds == 0.0), strict=True) if acts]
+    missing = np.array(names)[chosen & (bounds == 0.0)].tolist()
     if missing and kind.axes is None and settings.joints is not None:
         raise ConfigurationError(
             f"{name} must have a bound for every joint of `joints`, none fits {missing}"

@@ -40,9 +40,7 @@ _LOAD = _SEEN.names.index("excess_load")
 
 
 class EvidenceMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the
-    observer.
-    """
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the observer's memory."""
 
     loads: Array
     bending: Records

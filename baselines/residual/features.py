@@ -33,8 +33,9 @@ BASE_ACTION = "base_action"
 
 
 class FeaturesMemory(NamedTuple):
-    """Measurements of the last decisions, (num_worlds, history · k), the latest first; memory of
-    the sources.
+    """Measurements of the last decisions, (num_worlds, history · k), the latest first.
+
+    Memory of the sources.
     """
 
     past: Array
@@ -42,8 +43,9 @@ class FeaturesMemory(NamedTuple):
 
 
 class Features:
-    """Features that decide a residual, in the order of the settings; the base's action and earlier
-    measurements last.
+    """Features that decide a residual, in the order of the settings.
+
+    The base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -115,8 +117,9 @@ class Features:
         return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself
-        without one.
+        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k).
+
+        Itself without one.
 
         Args:
             rows: Observations of the decision.
@@ -215,8 +218,7 @@ class _ContactError:
         table = model.observation_table
         biped = model.biped
         self._level = GroundLevel(model, period_s)
-        self._share = table.group("load_share")
-        self._zmp = table.group("zmp_reference")
+        self._planned = table.columns("zmp_reference.x", "zmp_reference.y", "load_share")
         self._sensors = FootSensors.of_biped(biped)
         self._ankles = biped.ankles
 
@@ -229,10 +231,8 @@ class _ContactError:
         force, moment = self._sensors.ground_wrench(
             wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
         )
-        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
+        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N)
         vertical = force[:, :, 2].sum(axis=1)
-        share = (
-            force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
-            - rows[:, self._share][:, 0]
-        )
-        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0), memory
+        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
+        error = np.column_stack([zmp, share]) - rows[:, self._planned]
+        return np.nan_to_num(error, nan=0.0), memory

@@ -117,8 +117,9 @@ class Network:
 
 @compiled
 def affine(rows: Single, W: Single, b: Single) -> Single:
-    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up
-    in the same order.
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m).
+
+    All rows are added up in the same order.
     """
     out = np.empty((len(rows), len(b)), dtype=np.float32)
     for row in range(len(rows)):

@@ -93,8 +93,10 @@ class ResidualPolicy(BatchPolicy):
     ) -> tuple[Array, ResidualMemory]:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
-            memory = put_rows(memory, due, select_rows(self._decide(rows, memory, due), due))
-        action, inner = self.corrected.correct(rows, memory.residual, memory.inner, inputs)
+            decided = self._decide(rows, memory, due)
+            memory = put_rows(memory, due, select_rows(decided, due))
+        residual = memory.residual
+        action, inner = self.corrected.correct(rows, residual, memory.inner, inputs)
         return action, memory._replace(wait=memory.wait - 1, inner=inner)
 
     @override

@@ -248,8 +248,9 @@ class WalkingController(BatchPolicy):
         return com, soles
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for
-        those of the plan.
+        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1].
+
+        (0,) for those of the plan.
         """
         if shift is None:
             return _NO_SHARES
@@ -381,8 +382,9 @@ def control(
 
 @compiled
 def follow_zmp(center: float, zmp: float, share: float) -> float:
-    """The center of mass a period later, under a ZMP shift that stays as it is; see
-    `baselines.walking.zmp_shift`.
+    """The center of mass a period later, under a ZMP shift that stays as it is.
+
+    See `baselines.walking.zmp_shift`.
     """
     return center + share * (zmp - center)
 
@@ -434,7 +436,8 @@ def follow_com(
                 deviating - last.velocity[i]
             )
             error = deviation + own.velocity[i] / controller.omega
-            wanted = within((1.0 + change) * controller.dcm * error, controller.zmp_limit_m)
+            gain = (1.0 + change) * controller.dcm
+            wanted = within(gain * error, controller.zmp_limit_m)
             own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
 
 

@@ -60,8 +60,9 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
 
 
 class StanceRoll(PolicyAround):
-    """Any policy of a walker with the hip roll feedforward added, see the module; it has no memory
-    of its own.
+    """Any policy of a walker with the hip roll feedforward added, see the module.
+
+    It has no memory of its own.
 
     Args:
         policy: What commands the robot.

@@ -138,7 +138,8 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     stances = Stances.of(model)
     offsets = np.zeros((len(zmp), len(model.joint_names)))
     shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
-    move_pelvis(stances.legs, stances.rows, steps=np.arange(len(zmp)), shift=shift, offset=offsets)
+    steps = np.arange(len(zmp))
+    move_pelvis(*stances, steps=steps, shift=shift, offset=offsets)
     return offsets
 
 
@@ -161,9 +162,11 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
             continue
         stance = stances[steps[row]]
         for side in range(2):
-            x = stance.ankles[side, 0] - (stance.pelvis[0] + shift[row, 0]) - leg.hips[side, 0]
-            y = stance.ankles[side, 1] - (stance.pelvis[1] + shift[row, 1]) - leg.hips[side, 1]
-            z = stance.ankles[side, 2] - stance.pelvis[2] - leg.hips[side, 2]
+            ankle = stance.ankles[side]
+            hip = leg.hips[side]
+            x = ankle[0] - (stance.pelvis[0] + shift[row, 0]) - hip[0]
+            y = ankle[1] - (stance.pelvis[1] + shift[row, 1]) - hip[1]
+            z = ankle[2] - stance.pelvis[2] - hip[2]
             pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
             roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
             first = 6 * side
@@ -188,7 +191,6 @@ def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, fl
     shank = legs.shank
     cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = math.acos(min(max(cosine, -1.0), 1.0))
-    of_shank = math.atan2(
-        thigh * math.sin(knee), shank + thigh * math.cos(knee)
-    )  # from the line of hip and ankle
+    # from the line of hip and ankle
+    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
     return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee
