@@ -142,9 +142,7 @@ def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _with_posture(build: Builder) -> Builder:
-    """With posture feedback, and with the planned ZMP shifted against its mean error where that
-    is asked for.
-    """
+    """With posture feedback, and the planned ZMP shifted against its mean error if asked for."""
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         inner = build(env, model, options)

@@ -66,9 +66,7 @@ def best_analytic(is_walker: bool = True) -> str | None:
 
 
 def sensors_needed(name: str) -> tuple[str, ...]:
-    """Sensors beyond the standard set that a policy reads, for `gymnasium.make(...,
-    sensors=[...])`.
-    """
+    """Sensors beyond the standard set that a policy reads, for the argument `sensors`."""
     known = named_policy(name, is_walker=True) or named_policy(name, is_walker=False)
     return () if known is None else known.sensors
 

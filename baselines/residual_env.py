@@ -76,9 +76,7 @@ class _Deciding:
         return action
 
     def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
-        """A residual for the observations of its decision as numbers within [−1, 1], out of the
-        mirror.
-        """
+        """A residual for the observations of its decision, clipped and out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(
@@ -208,8 +206,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their length, in an order drawn
-        from a generator.
+        """Cut the first episodes at decisions spread evenly over their length, in random order.
 
         Call it after `reset`. From the end of the first whole episode on the worlds are all over
         it; learning that saw all worlds in the same phase would see one phase at a time. What is

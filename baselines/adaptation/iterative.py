@@ -132,8 +132,7 @@ class IterativeLearner(LearnedOffsets):
         self.trials = trials
 
     def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] | None = None) -> None:
-        """Learn in an environment, on the robots that its `reset(seed=seed)` draws; what was
-        learned before is dropped.
+        """Learn on the robots that `env.reset(seed=seed)` draws; earlier learning is dropped.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.

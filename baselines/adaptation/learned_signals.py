@@ -106,9 +106,7 @@ class WalkSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        """Tilt, and error of the ZMP as if the feet were flat where they are planned,
-        (num_worlds, 4).
-        """
+        """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
         return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
 
     def measured_zmp(self, seen: Array) -> Array:

@@ -152,9 +152,7 @@ class BatchPolicy(ABC):
         """
 
     def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002
-        """`link_estimate` of rows, (num_worlds, n) [rad]: the encoder angles of a policy that
-        estimates nothing.
-        """
+        """`link_estimate` of rows, (num_worlds, n) [rad]: without one the encoder angles."""
         return self.view.theta(rows)
 
 

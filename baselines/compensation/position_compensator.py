@@ -271,7 +271,7 @@ class PositionCompensator:
         return command
 
     def link_angle(self, theta: npt.ArrayLike) -> Array:
-        """Where the links are when the motor encoders show θ, at rest: Eq. 10.
+        """Link angles for motor encoders that show θ, at rest: Eq. 10.
 
         Args:
             theta: Motor side, (n,) [rad].
@@ -312,9 +312,7 @@ class PositionCompensator:
         return self._soft_link_angle(shown_angle, None)
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
-        """The same where the load bends a spring far: by a load that grows; the guess if it is
-        the same pose.
-        """
+        """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
         found = follow_load(
             theta,
             self._compliance,
@@ -407,7 +405,7 @@ class PositionCompensator:
         )
 
     def _checked(self, name: str, given: Any, unit: str) -> Array:
-        """What a robot is asked for, as (n,)."""
+        """An argument of a public method, as (n,)."""
         n = len(self.joints)
         values = _array(given)
         if values.shape != (n,):
@@ -453,7 +451,7 @@ def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
 
 
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
-    """What a file says of joints, in which the hinges that it leaves out are rigid."""
+    """Content of a file of joints, in which the hinges that it leaves out are rigid."""
     mapping = read_mapping(file)
     names = [
         model.joint(j).name
@@ -637,7 +635,7 @@ def _joint_names(model: mujoco.MjModel) -> list[str]:
 
 
 def _array(given: Any) -> Array:
-    """What was given as an array; empty where it is none of numbers."""
+    """The argument as an array; empty where it is none of numbers."""
     try:
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):

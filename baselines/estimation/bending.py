@@ -114,9 +114,7 @@ class BendingObserver:
         return theta - self._compensator.at(rows).link_angle(theta)
 
     def expected_tilt(self, rows: Array) -> Array:
-        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds,
-        2 legs, 2) [rad].
-        """
+        """Tilt of the pelvis over each flat foot by the bending, s, (num_worlds, 2, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]
 
     def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:

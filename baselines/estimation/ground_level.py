@@ -106,9 +106,7 @@ class GroundLevel:
         return np.hstack([own, wrenches]), memory
 
     def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
-        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12),
-        and the new memory.
-        """
+        """Tilt of the ground [rad], level foot wrenches, (num_worlds, 12), and new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
         force = wrench[:, :, 0]

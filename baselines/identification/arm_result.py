@@ -50,12 +50,12 @@ class JointStiffness(Model):
     reason: str
     """Why the poses do not tell the stiffness apart; empty where they do."""
     is_negative: bool = False
-    """Whether the estimate of 1/K is negative: the joint is stiffer than the log can tell."""
+    """True if the estimate of 1/K is negative: the joint is stiffer than the log can tell."""
     friction_nm: float | None
     """Friction on the link side of the spring; None where the poses do not tell it."""
     friction_half_width_nm: float | None
     offset_rad: float | None
-    """What the motor encoder reads beyond θ; None where the poses do not tell it."""
+    """Reading of the motor encoder beyond θ; None where the poses do not tell it."""
     offset_half_width_rad: float
     largest_torque_nm: float
     """Largest gravity torque in the poses."""
@@ -77,7 +77,7 @@ class ArmIdentification(Model):
     residual_spread: float
     """Standard deviation of the residuals [m], [rad] or [N·m]."""
     friction_is_noise: bool
-    """Whether the log has no sides of approach, so that friction widens the intervals."""
+    """True if the log has no sides of approach, so that friction widens the intervals."""
     rigid_joints: tuple[str, ...] = ()
     """Joints of the log that were taken as rigid."""
     held_joints: tuple[str, ...] = ()

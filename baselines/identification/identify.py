@@ -56,7 +56,7 @@ class Identification(Model):
     residual_rad: float
     """Standard deviation of the residuals."""
     hysteresis: bool
-    """Whether the two directions of approach differ: the 95 % interval of the friction excludes
+    """True if the two directions of approach differ: the 95 % interval of the friction excludes
     zero, and the difference 2 F/K exceeds `HYSTERESIS_RESOLUTION_RAD`."""
     friction_low_nm: float
     friction_high_nm: float
@@ -91,7 +91,7 @@ class Fit:
     coefficients: Array
     residuals: Array
     is_determined: bool
-    """Whether the points tell all coefficients apart."""
+    """True if the points tell all coefficients apart."""
 
     @property
     def offset(self) -> float:

@@ -18,7 +18,7 @@ from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array
 
 Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
-"""What a log has besides the motor encoders."""
+"""Measurements of a log besides the motor encoders."""
 
 KINDS: dict[str, tuple[Kind, str]] = {
     "q": ("link_encoders", "rad"),

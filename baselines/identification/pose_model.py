@@ -1,4 +1,4 @@
-r"""What static poses show of an arm with elastic joints, and how that changes with the unknowns.
+r"""Measurements of an arm with elastic joints at rest, and their derivatives by the unknowns.
 
 The encoders read θ + o. At rest the transmissions carry
 
@@ -28,7 +28,7 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.joint.load_path import follow_load
 
 Frame = Literal["known", "offset", "pose"]
-"""What is known of the measurement's frame: all, its directions, or nothing."""
+"""Knowledge of the measurement's frame: all, its directions, or nothing."""
 
 LARGEST_DEFLECTION_RAD = 0.3
 """Scale of the unknown compliances: the largest torque of a joint bends it by about as much, or
@@ -51,7 +51,7 @@ _FARTHEST_RAD = 1e3
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Where the unknowns stand in one vector: c, o, F of the elastic joints, m, then the frame.
+    """Places of the unknowns in one vector: c, o, F of the elastic joints, m, then the frame.
 
     Attributes:
         elastic: Positions of the joints whose stiffness is sought, (k,).
@@ -161,7 +161,7 @@ class PoseModel:
 
     @property
     def target(self) -> Array:
-        """What `predict` has to meet, (N, m)."""
+        """Measurements that `predict` has to meet, (N, m)."""
         if self.log.kind == "imu":
             return np.zeros((len(self.log), 2))
         return self.log.measured
@@ -178,7 +178,7 @@ class PoseModel:
         return float(unknowns[self.unknowns.slices["payload"]].sum())
 
     def torque(self, unknowns: Array, q: Array) -> Array:
-        """What the transmissions carry at link angles, (N, n) [N·m]."""
+        """Torques that the transmissions carry at link angles, (N, n) [N·m]."""
         torque = self.arm.torque(q)
         if self.unknowns.payload:
             torque = torque + self.payload_kg(unknowns) * self.arm.payload_torque(q)
@@ -276,7 +276,7 @@ class PoseModel:
         return Rotation.from_rotvec(turn).as_matrix() @ self._aligned
 
     def _positions(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
-        """What a tracker shows [m]."""
+        """Positions that a tracker shows [m]."""
         own = self.unknowns.slices
         R = self._turned(unknowns)
         at = self.arm.attitude(q)
@@ -289,9 +289,7 @@ class PoseModel:
         return turned + (shift if len(shift) else 0.0), gradient
 
     def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
-        """Tilt between the vertical that the IMU should see and the one that it saw, about two
-        axes [rad].
-        """
+        """Tilt between the verticals that the IMU should see and saw, about two axes [rad]."""
         own = self.unknowns.slices
         R = self._turned(unknowns)
         at = self.arm.attitude(q)
@@ -305,7 +303,7 @@ class PoseModel:
         return (across @ seen[..., None])[..., 0], across @ gradient
 
     def _torques(self, unknowns: Array, q: Array, dq: Array, at: list[int]) -> tuple[Array, Array]:
-        """What torque sensors show [N·m]."""
+        """Torques that sensors show [N·m]."""
         own = self.unknowns.slices
         elastic = self.unknowns.elastic
         gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns)) @ dq
@@ -318,8 +316,7 @@ class PoseModel:
 
 
 def vertical(attitude: Array) -> Array:
-    """Unit vector against gravity in the frame of an IMU, from roll and pitch, (N, 2) [rad] to (N,
-    3).
+    """Unit vector against gravity in an IMU's frame from roll and pitch, (N, 2) [rad] to (N, 3).
 
     Of R = R_z(yaw) R_y(pitch) R_x(roll), from the IMU's to the world's frame, it is the last row.
     """

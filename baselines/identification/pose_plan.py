@@ -1,5 +1,4 @@
-r"""Which further poses would tell the stiffness of joints apart: a D_s-optimal choice from random
-poses.
+r"""Further poses that tell stiffness apart: a D_s-optimal choice from random poses.
 
 Poses are drawn within the joint ranges. Those in which parts of the arm touch are dropped, where
 the model has shapes. Of the rest those are chosen that shrink the joint confidence region of the
@@ -137,7 +136,7 @@ def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
 
 
 def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
-    """What a sensor in the model's own frame would show of rigid joints.
+    """Measurement of a sensor in the model's own frame, of rigid joints.
 
     Only its directions matter, (N, m).
     """
@@ -149,7 +148,7 @@ def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
 
 
 class _Contacts:
-    """Which pairs of bodies touch.
+    """Pairs of bodies that touch.
 
     Args:
         model: The arm with its shapes.
@@ -199,7 +198,7 @@ def _best(rows: Array, information: Array, taken: list[int], sought: int) -> tup
 
 
 def _gain(rows: Array, information: Array) -> Array:
-    """What each pose adds to log det M, (candidates,), by the determinant lemma."""
+    """Gain of each pose in log det M, (candidates,), by the determinant lemma."""
     if not len(information):
         return np.zeros(len(rows))
     inner = rows @ np.linalg.solve(information, rows.transpose(0, 2, 1))

@@ -1,6 +1,4 @@
-"""Static points of a joint: encoder and IMU averaged at rest, at positions approached from both
-sides.
-"""
+"""Static points of a joint: encoder and IMU at rest, approached from both sides."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -56,8 +54,7 @@ class StaticPoints:
 
 
 class HoldRecorder:
-    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations
-    and infos alone.
+    """Averages encoder and IMU over the windows at rest of a `hold` reference.
 
     Args:
         directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
@@ -70,9 +67,7 @@ class HoldRecorder:
         self._counts = np.zeros(len(directions), dtype=np.int64)
 
     def take(self, encoder: Array, imu: Array, rest: int) -> None:
-        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window,
-        -1 outside.
-        """
+        """Take in encoder and IMU, (num_worlds,) [rad], and the number of the window, -1 outside."""
         if rest >= 0:
             self._sums[rest] += np.stack([encoder, imu], axis=-1)
             self._counts[rest] += 1
@@ -140,9 +135,7 @@ def record_points(
 
 
 def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], q: Array) -> Array:
-    """Gravity torque at link angles q, each under the load of its point, (len(points),) [rad] to
-    [N·m].
-    """
+    """Gravity torque at link angles q [rad], each under its point's load, (len(points),) [N·m]."""
     torque = np.empty(len(points))
     for load, model in enumerate(gravity):
         rows = points.load == load

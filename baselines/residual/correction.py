@@ -118,15 +118,12 @@ class Corrected:
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Estimated link angle for an observation and the state that `act` returned for it,
-        (..., n) [rad].
-        """
+        """Estimated link angle for an observation and the state after it, (..., n) [rad]."""
         return self.base.link_estimate(observation, state.inner)
 
 
 class Channels:
-    """Columns on which a residual acts, by its settings: those of all its inputs, one input after
-    the other.
+    """Columns on which a residual acts, those of one input after the other.
 
     Args:
         model: What may be known of the robot.
@@ -165,8 +162,7 @@ class Channels:
         )
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
-        """Values of all columns after a share of their way to what a residual wants, (num_worlds,
-        width).
+        """Values of all columns after a share of their way to a residual, (num_worlds, width).
 
         Args:
             values: Before.

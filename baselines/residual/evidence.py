@@ -71,9 +71,7 @@ class Evidence:
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:
-    """g, (...), from ρ of the legs and its uncertainty, (..., 2), and the mean excess μ of the
-    load, (...) [1].
-    """
+    """g, (...), from ρ of the legs and its uncertainty, (..., 2), and the mean load μ, (...) [1]."""
     bending = model_error**2 / (ERROR_SCALE**2 + (2.0 * uncertainty) ** 2)
     squared = (np.mean(bending, axis=-1) + (excess_load / LOAD_SCALE) ** 2) ** 2
     return squared / (1.0 + squared)

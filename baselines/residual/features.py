@@ -1,5 +1,4 @@
-"""Features that decide a residual: groups of the observation, and what can be said from it, the
-plan and the model.
+"""Features that decide a residual: from the observation, the plan and the model.
 
 | name | what it is |
 |---|---|
@@ -147,8 +146,10 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
 
 
 def _source(name: str, model: RobotModel, period_s: float) -> Any:
-    """Some features from observations: it has `signals`, `begin(num_worlds)` makes its memory,
-    and `observe(rows, memory)` returns features and the new memory.
+    """A source of features.
+
+    It has `signals`, `begin(num_worlds)` makes its memory, and `observe(rows, memory)` returns
+    features and the new memory.
     """
     table = model.observation_table
     groups = _groups(model)
@@ -195,8 +196,7 @@ _ERRORS = {
 
 
 class _ContactError:
-    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less
-    the planned ones.
+    """ZMP [m] and load share by the foot wrenches of flat feet, less the planned ones.
 
     The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too
     little for a ZMP.

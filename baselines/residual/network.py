@@ -68,8 +68,7 @@ def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
 
 
 class Network:
-    """Feed-forward network in single precision, as it was trained: the mean action of normalised
-    features.
+    """Feed-forward network in single precision: the mean action of normalised features.
 
     A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant.
     They would also keep threads in the way of the physics.

@@ -1,5 +1,4 @@
-"""Trained residuals as policies: a NumPy forward pass of weights from a folder, on top of the base
-they belong to.
+"""Trained residuals as policies: a network from a folder corrects the base it belongs to.
 
 A folder holds `residual.json` (base, settings, network, how it was trained) and
 `weights.safetensors`. Loading it runs no code from it and needs no torch. The observation is
@@ -143,9 +142,7 @@ def shipped_names() -> list[str]:
 
 
 def find_folder(folder: Path) -> Path:
-    """A residual's folder: the path itself, or where nothing lies there, the one of that name in
-    the package.
-    """
+    """A residual's folder: the path itself, or the one of that name in the package."""
     own = _SHIPPED / folder
     try:
         return own if not folder.exists() and own.exists() else folder

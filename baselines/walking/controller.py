@@ -1,5 +1,4 @@
-r"""The walking controller: foot force difference control, and feedback of the center of mass from
-joint angles.
+r"""The walking controller: foot forces, and feedback of the center of mass from joint angles.
 
 * Foot force difference control [Kajita2010]: the leg that carries too little grows,
   ż = k ((F_l − F_r)_ref − (F_l − F_r)) − z/T, half of z on each side.
@@ -81,8 +80,7 @@ class WalkingGains(Model):
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Center of mass and feet as a controller sees them, level and relative to the pelvis, one row
-    per world.
+    """Center of mass and feet for a controller, level and relative to the pelvis, a row per world.
 
     Attributes:
         com: Center of mass, (num_worlds, 3) [m].
@@ -94,9 +92,7 @@ class LocalFrame:
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
-    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2)
-    [rad].
-    """
+    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch [rad]."""
     return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), _sole(biped), attitude))
 
 
@@ -208,9 +204,7 @@ class WalkingController(BatchPolicy):
 
     @override
     def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> tuple[Array, Records]:
-        """A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as
-        much.
-        """
+        """With a `deflection` r, handed on by a compensator, springs are wound by 1 + r as much."""
         observed = self._walk_view.fields(rows)
         com, soles = self._local_frame(rows)
         action = np.empty((len(rows), 12))
@@ -237,9 +231,7 @@ class WalkingController(BatchPolicy):
         return action.astype(np.float32), now
 
     def _local_frame(self, rows: Array) -> tuple[Array, Array]:
-        """Center of mass, (num_worlds, 3), and soles, (num_worlds, 2, 3), level and relative to
-        the pelvis [m].
-        """
+        """Center of mass and soles, level and relative to the pelvis, (num_worlds, ...) [m]."""
         q = np.ascontiguousarray(rows[:, self._theta]).reshape(-1, 2, 6)
         com = np.empty((len(rows), 3))
         soles = np.empty((len(rows), 2, 3))
@@ -445,8 +437,9 @@ def follow_com(
 def offset_leg(
     controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array
 ) -> None:
-    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added,
-    and friction [rad].
+    """Offsets of a leg's joints [rad].
+
+    They hold its length, the torque of the ZMP shift, what is added, and friction.
     """
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
@@ -478,8 +471,7 @@ def offset_leg(
 def lengthening(
     controller: Any, knee: float, difference: float, sign: float
 ) -> tuple[float, float, float]:
-    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or
-    shorten it [rad].
+    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference [rad].
 
     The ankle stays on the line from the hip, and the sole keeps its attitude.
     """

@@ -1,5 +1,4 @@
-r"""A constant lift of the pelvis in single support: the published hip roll feedforward of
-THORMANG3.
+r"""The published hip roll feedforward of THORMANG3: it lifts the pelvis in single support.
 
 In single support the stance hip is commanded φ(t) further, so that the swing side of the pelvis
 rises. The swing hip gets −0.35 φ(t) about the same axis, which takes the swing foot outwards. φ

@@ -37,9 +37,7 @@ class ZmpOffsetGains(Model):
 
 
 class ZmpOffsetMemory(NamedTuple):
-    """The shift of the ZMP forward and to the left, (num_worlds, 2) [m], and the memory of the
-    policy.
-    """
+    """Shift of the ZMP forward and left, (num_worlds, 2) [m], and the memory of the policy."""
 
     shift: Array
     inner: Any

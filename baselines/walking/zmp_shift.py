@@ -56,8 +56,7 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
 
 
 def following_share(omega: float, period_s: float) -> float:
-    """Share of its way that the c of a ZMP shift goes in a period, where the shift stays as it is
-    [1].
+    """Share of its way that the c of a constant ZMP shift goes in a period [1].
 
     Args:
         omega: Natural frequency of the pendulum [rad/s].
@@ -67,8 +66,7 @@ def following_share(omega: float, period_s: float) -> float:
 
 
 def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
-    """Motion of the center of mass per motion of the standing pelvis over its feet, x and y, (2,)
-    [1].
+    """Motion of the center of mass per motion of the standing pelvis, x and y, (2,) [1].
 
     The legs follow the pelvis by half on average: it is the share of the weight that the pelvis
     carries along.
@@ -99,9 +97,7 @@ STANCE = record_type(
 
 
 class Stances(NamedTuple):
-    """The legs, a row of `LEGS`, and the planned stances, rows of `STANCE`, over which the
-    pelvis is moved.
-    """
+    """The legs, a row of `LEGS`, and planned stances, rows of `STANCE`, to move the pelvis over."""
 
     legs: Any
     rows: Any
@@ -181,8 +177,9 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
 
 @compiled
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle
-    less hip [m].
+    """Hip roll, hip pitch and knee of a leg whose sole is parallel to the pelvis [rad].
+
+    The arguments are the ankle less the hip [m].
 
     `elastic_env.rigid.leg_kinematics.leg_angles` has soles of every attitude.
     """
