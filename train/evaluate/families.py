@@ -16,7 +16,8 @@ from typing import Any
 
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
-from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
+from baselines.residual.residual_policy import DESCRIPTION, read_description, shipped_names
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
@@ -134,7 +135,7 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
     folders = [Path(pattern)]
     if is_family:
         folders = sorted(
-            _matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural
+            _matching(pattern) or map(Path, fnmatch.filter(shipped_names(), pattern)), key=_natural
         )
         if not folders:
             raise ConfigurationError(
@@ -202,7 +203,7 @@ def _nearest(pattern: Path) -> str:
     near = difflib.get_close_matches(
         pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0
     )
-    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())
+    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped_names())
     where = "this folder" if there == Path() else str(there)
     return (
         f"{where} has {', '.join(near) or 'no folders'}; with the package come"

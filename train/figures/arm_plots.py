@@ -55,7 +55,7 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
     predicted = compliance * model.torque(fit.unknowns, fit.q)[:, elastic]
     # an offset turns a joint as a deflection does, so that its derivative is the lever of the
     # deflection
-    lever = model.predicted(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
+    lever = model.predict(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
     size = np.sum(lever**2, axis=1)
     largest = size.max(axis=0)
     seen = size > np.maximum(_LEAST_LEVER**2 * largest, _LEAST_SEEN**2 * largest.max())

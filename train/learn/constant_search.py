@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from cmaes import CMA
 
-from baselines.residual.residual import ResidualDescription
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.learn.finite import require_finite

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from baselines.residual.residual import ResidualDescription, save_residual
+from baselines.residual.residual_policy import save_residual
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import read_bounded, write_whole
 from elastic_env.core.signals import Array, BoolArray

@@ -6,8 +6,7 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 import baselines
-from baselines.residual.residual import ResidualDescription, require_plain_base
-from baselines.residual.settings import ResidualSettings
+from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote

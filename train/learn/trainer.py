@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from baselines.residual.residual import ResidualDescription
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ElasticError, shorten
 from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
 from train.learn.finite import DivergedError

@@ -22,7 +22,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from baselines.residual.residual import ResidualDescription
+from baselines.residual.settings import ResidualDescription
 from train.learn.algorithms import algorithm_class, options_named
 from train.learn.curves import Curves
 from train.learn.export import network_of
