@@ -25,8 +25,9 @@ from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blend, panels
-from train.report import Results, write_report
 from train.report.change_tables import write_maps
+from train.report.report_text import Results
+from train.report.write import write_report
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"

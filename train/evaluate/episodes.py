@@ -52,12 +52,9 @@ class Evaluation:
         """A metric over the episodes that did not fail, or over those that did, (n,); empty
         where none has it.
         """
-        found = [
-            episode.get(metric)
-            for episode in self.episodes
-            if bool(episode["termination"]) == failed
-        ]
-        return np.array([value for value in found if value is not None], dtype=np.float64)
+        shown = [own for own in self.episodes if bool(own["termination"]) == failed]
+        found = [own[metric] for own in shown if own.get(metric) is not None]
+        return np.array(found, dtype=np.float64)
 
     @property
     def num_failed(self) -> int:
@@ -127,9 +124,8 @@ def evaluate_together(
     at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), at_once):
         batch = episodes[first : first + at_once]
-        with closing(
-            make_shared_env([result.condition for result, _ in batch], num_threads)
-        ) as env:
+        conditions = [result.condition for result, _ in batch]
+        with closing(make_shared_env(conditions, num_threads)) as env:
             _play(env, batch, progress or (lambda _: None))
     return results
 
@@ -151,14 +147,11 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
         for world in np.flatnonzero(step.is_over).tolist():
             if world not in records:
                 result, number = episodes[world]
-                metrics = {
-                    name: values[world].item()
-                    for name, values in step.info["episode_metrics"].items()
-                }
+                metrics = step.info["episode_metrics"]
                 records[world] = {
                     **episode_labels(result.condition, number),
                     "termination": str(step.info["termination"][world]),
-                    **metrics,
+                    **{name: values[world].item() for name, values in metrics.items()},
                     **observers.metrics(world),
                 }
                 observers.end(world, step.observation, step.info)
@@ -204,8 +197,9 @@ class _Observers:
         self._env = env
         self._policy = policy
         self._task = task
-        self._estimates = _Estimates(task, len(episodes)) if has_estimate else None
-        self._imu = _ImuError(task, len(episodes)) if walks else None
+        self._estimate = _Rms(task, len(episodes)) if has_estimate else None
+        self._changes = SupportChanges(task.assumed_model) if has_estimate and walks else None
+        self._imu = _Rms(task, len(episodes)) if walks else None
         self._traces = {
             world: _Trace(task, environment.traced, world)
             for world, (_, number) in enumerate(episodes)
@@ -219,16 +213,25 @@ class _Observers:
             if world not in self._ended:
                 trace.take(observation, info)
         if self._imu is not None:
-            self._imu.take(observation, info)
-        if self._estimates is not None:
+            attitude = observation[:, self._task.observation_table.group("imu_attitude")]
+            truth = np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+            self._imu.take(np.square(attitude - truth).sum(axis=1))
+        if self._estimate is not None:
             estimate = self._policy.link_estimate(observation, memory)
-            self._estimates.take(step, estimate, observation, self._env.unwrapped.truth())
+            truth = self._env.unwrapped.truth()
+            self._estimate.take(np.square(estimate - truth.q).mean(axis=1))
+            if self._changes is not None:
+                self._changes.take(step, estimate, observation, truth)
 
     def metrics(self, world: int) -> dict[str, float]:
         """Figures of a world over its episode so far."""
         found: dict[str, float] = {}
-        for observer in (self._estimates, self._imu):
-            found |= {} if observer is None else observer.metrics(world)
+        if self._estimate is not None:
+            found["link_estimate_error_rms_rad"] = self._estimate.of(world)
+        if self._changes is not None:
+            found |= self._changes.metrics(world)
+        if self._imu is not None:
+            found["imu_error_rms_rad"] = self._imu.of(world)
         if hasattr(self._task, "robot_record"):  # of the robots that a walker draws from ranges
             found |= self._task.robot_record(world)
         return found
@@ -266,48 +269,6 @@ class _Rms:
         return float(np.sqrt(self._sum[world] / count)) if count else float("nan")
 
 
-class _ImuError:
-    """Roll and pitch by a walker's IMU, as old as they are shown, against the truth."""
-
-    def __init__(self, task: Any, worlds: int) -> None:
-        self._rms = _Rms(task, worlds)
-        self._attitude = task.observation_table.group("imu_attitude")
-
-    def take(self, observation: Array, info: dict[str, Any]) -> None:
-        error = observation[:, self._attitude] - np.stack(
-            [info["pelvis_roll"], info["pelvis_pitch"]], axis=1
-        )
-        self._rms.take(np.square(error).sum(axis=1))
-
-    def metrics(self, world: int) -> dict[str, float]:
-        """RMS of the angle by which the shown vertical is off."""
-        return {"imu_error_rms_rad": self._rms.of(world)}
-
-
-class _Estimates:
-    """A policy's estimate of the link angles against the truth, and on a walker what it makes of
-    the local frame.
-    """
-
-    def __init__(self, task: Any, worlds: int) -> None:
-        self._rms = _Rms(task, worlds)
-        self._changes = (
-            SupportChanges(task.assumed_model)
-            if isinstance(task.assumed_model, WalkerModel)
-            else None
-        )
-
-    def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
-        self._rms.take(np.square(estimate - truth.q).mean(axis=1))
-        if self._changes is not None:
-            self._changes.take(step, estimate, observation, truth)
-
-    def metrics(self, world: int) -> dict[str, float]:
-        """RMS over the scored steps, and the figures of the support changes."""
-        changes = self._changes.metrics(world) if self._changes is not None else {}
-        return {"link_estimate_error_rms_rad": self._rms.of(world), **changes}
-
-
 class _Trace:
     """Time series and static points of the first episode of a condition, that of a world."""
 
@@ -318,9 +279,8 @@ class _Trace:
         self.references = np.zeros(0)
         self._recorder: HoldRecorder | None = None
         visits = getattr(getattr(task.config, "reference", None), "visits", None)
-        if (
-            visits is not None and "link_angle_imu" in traced
-        ):  # static points need the IMU of the only link
+        # static points need the IMU of the only link
+        if visits is not None and "link_angle_imu" in traced:
             self.references, directions = visits
             self._recorder = HoldRecorder(directions)
         self._rows: list[tuple[float, ...]] = []
@@ -331,9 +291,8 @@ class _Trace:
         self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
         if self._recorder is not None:
             encoder = observation[own, self._encoder][:, 0]
-            self._recorder.take(
-                encoder, info["link_angle_imu"][own], int(info["rest"][self._world])
-            )
+            rest = int(info["rest"][self._world])
+            self._recorder.take(encoder, info["link_angle_imu"][own], rest)
 
     def signals(self) -> dict[str, Array]:
         """Time series by name."""

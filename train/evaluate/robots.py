@@ -62,44 +62,36 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
         for cell in table.cells_of(policy):
             condition = table.conditions[policy, cell]
             rows = table.of(policy, cell)
-            if (
-                condition.swept
-                or len(set(rows["seed"])) < FEWEST_ROBOTS
-                or not _draws_robots(condition)
-            ):
+            is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
+            if condition.swept or is_small or not _draws_robots(condition):
                 continue
-            failed, episodes = failures(rows)
-            against = {
-                other: table.of(other, cell)
-                for other in others
-                if (other, cell) in table.conditions
-            }
+            against = [other for other in others if (other, cell) in table.conditions]
             found += [
-                RobotScores(
-                    policy=policy,
-                    reference=condition.reference_name,
-                    scenario=condition.scenario,
-                    column=column,
-                    mean=score(rows, column),
-                    middle=score(rows, column, _middle),
-                    worst=score(
-                        rows, column, lambda values: worst_share_mean(values.dropna().to_numpy())
-                    ),
-                    failed=failed,
-                    episodes=episodes,
-                    better={
-                        other: _better(rows, theirs, column) for other, theirs in against.items()
-                    },
-                    failure=table.environment.failures,
-                )
+                _robot_scores(table, cell, policy, against, column)
                 for column in table.environment.judged
             ]
     return found
 
 
-def _middle(values: pd.Series) -> float:
-    known = values.dropna().to_numpy()
-    return float(interquartile_mean(known)) if len(known) else float("nan")
+def _robot_scores(
+    table: EpisodeTable, cell: int, policy: str, others: Sequence[str], column: Column
+) -> RobotScores:
+    condition = table.conditions[policy, cell]
+    rows = table.of(policy, cell)
+    failed, episodes = failures(rows)
+    return RobotScores(
+        policy=policy,
+        reference=condition.reference_name,
+        scenario=condition.scenario,
+        column=column,
+        mean=score(rows, column),
+        middle=score(rows, column, interquartile_mean),
+        worst=score(rows, column, worst_share_mean),
+        failed=failed,
+        episodes=episodes,
+        better={other: _better(rows, table.of(other, cell), column) for other in others},
+        failure=table.environment.failures,
+    )
 
 
 def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:

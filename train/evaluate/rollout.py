@@ -181,8 +181,16 @@ def make_vector_env(
     num_envs: int,
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+    **others: Any,
 ) -> Any:
     """The vector environment of a condition.
+
+    Args:
+        condition: The condition.
+        num_envs: Worlds.
+        num_threads: Threads of the physics, 0 for all cores.
+        autoreset_mode: When worlds begin anew.
+        **others: Arguments of the environment in place of the condition's.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
@@ -193,7 +201,7 @@ def make_vector_env(
         vectorization_mode="vector_entry_point",
         num_threads=num_threads,
         autoreset_mode=autoreset_mode,
-        **condition.arguments,
+        **{**condition.arguments, **others},
     )
 
 
@@ -208,18 +216,11 @@ def make_shared_env(
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
     """
-    first = conditions[0]
-    scenarios = [condition.scenario_played for condition in conditions]
-    if all(scenario == scenarios[0] for scenario in scenarios):
-        return make_vector_env(first, len(conditions), num_threads, autoreset_mode)
-    return gymnasium.make_vec(
-        first.environment.id,
-        num_envs=len(conditions),
-        vectorization_mode="vector_entry_point",
-        num_threads=num_threads,
-        autoreset_mode=autoreset_mode,
-        **{**first.arguments, "scenario": scenarios},
-    )
+    scenarios: list[Any] = [condition.scenario_played for condition in conditions]
+    is_one = all(scenario == scenarios[0] for scenario in scenarios)
+    scenario = scenarios[0] if is_one else scenarios
+    count = len(conditions)
+    return make_vector_env(conditions[0], count, num_threads, autoreset_mode, scenario=scenario)
 
 
 def shared_settings(condition: Condition) -> str:

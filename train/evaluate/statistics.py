@@ -57,14 +57,11 @@ class Estimate:
             return self.value, self.value
         return self.low, self.high
 
-    @property
-    def cells(self) -> tuple[object, object, object]:
-        """Value and ends of the interval for a CSV file; empty where there is none."""
-        return (
-            self.value,
-            "" if self.low is None else self.low,
-            "" if self.high is None else self.high,
-        )
+    def record(self, name: str) -> dict[str, object]:
+        """Columns of a CSV file: the value, and the ends of the interval, empty without one."""
+        low = "" if self.low is None else self.low
+        high = "" if self.high is None else self.high
+        return {name: self.value, f"{name}_low": low, f"{name}_high": high}
 
     def times(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""

@@ -5,7 +5,7 @@ Pictures and the page of a report draw the same charts.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation
 from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
-from train.figures.colours import REFERENCE, is_dashed
+from train.figures.colours import REFERENCE, dash_of
 
 Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
@@ -161,7 +161,7 @@ def _median_curve(
         colour,
         time_s[:length:stride],
         middle,
-        dash="dash" if is_dashed(title) else "solid",
+        dash=dash_of(title),
         band=(low, high) if len(own) > 1 else None,
         fails=len(own) == 1 and own[0].first_failed,
     )
@@ -220,27 +220,22 @@ def sweep_chart(
         curves = []
         for title, own in cells.items():
             is_level = None in own
-            x = np.array(
-                [values[0], values[-1]] if is_level else [value for value in values if value in own]
-            )
-            found = [
-                statistic(own[None if is_level else value], column).times(column.scale)
-                for value in x.tolist()
-            ]
-            ends = np.array([estimate.ends for estimate in found]).T
+            x = [values[0], values[-1]] if is_level else [value for value in values if value in own]
+            keys = [None, None] if is_level else x
+            found = [statistic(own[key], column).times(column.scale) for key in keys]
+            low, high = np.array([estimate.ends for estimate in found]).T
+            has_band = not is_level and any(estimate.has_interval for estimate in found)
             curve = Curve(
                 title,
                 colours[title],
-                x,
+                np.array(x),
                 np.array([estimate.value for estimate in found]),
+                dash="dot" if is_level else dash_of(title),
+                band=(low, high) if has_band else None,
                 width=1.6,
+                has_points=not is_level,
             )
-            if is_level:
-                curves.append(replace(curve, dash="dot"))
-                continue
-            band = (ends[0], ends[1]) if any(estimate.has_interval for estimate in found) else None
-            dash = "dash" if is_dashed(title) else "solid"
-            curves.append(replace(curve, dash=dash, band=band, has_points=True))
+            curves.append(curve)
         panels.append(Panel(column.label, curves, is_log=True, height=2.2))
     failing = [_failing(title, colours[title], own, values) for title, own in cells.items()]
     failing = [policy for policy in failing if policy.x]
@@ -285,21 +280,19 @@ def learning_chart(
     for column in columns:
         curves = []
         for title, found in learning.items():
-            low, middle, high = spread(found.ratios[column.metric])
-            x = found.decisions
-            band = (low, high) if len(found.ratios[column.metric]) > 1 else None
-            curves.append(
-                Curve(title, colours[title], x, middle, band=band, width=2.0, has_points=True)
-            )
+            ratios = found.ratios[column.metric]
+            low, middle, high = spread(ratios)
+            band = (low, high) if len(ratios) > 1 else None
+            line = {"band": band, "width": 2.0, "has_points": True}
+            curves.append(Curve(title, colours[title], found.decisions, middle, **line))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
-        top = max(
-            float(np.nanmax(found.ratios[column.metric], initial=1.0))
-            for found in learning.values()
+        all_ratios = np.concatenate(
+            [own.ratios[column.metric].ravel() for own in learning.values()]
         )
+        top = float(np.nanmax(all_ratios, initial=1.0))
         curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
-        panels.append(
-            Panel(f"{column.title}, share of the base's", curves, (0.0, 1.08 * min(top, 2.0)))
-        )
+        limits = (0.0, 1.08 * min(float(top), 2.0))
+        panels.append(Panel(f"{column.title}, share of the base's", curves, limits))
     return Chart("", "decisions of all worlds", panels, panel_height=260)
 
 
@@ -316,15 +309,13 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
     failed = np.array([trial.failed for trial in trials])
     panels = []
     for column in columns:
-        values = column.scale * np.array(
-            [[own[column.metric] for own in trial.metrics] for trial in trials]
-        )
+        found = [[own[column.metric] for own in trial.metrics] for trial in trials]
+        values = column.scale * np.array(found)
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
         means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
         curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
-        panels.append(
-            Panel(column.label, curves, (0.0, 1.05 * float(np.nanmax(values, initial=1e-9))))
-        )
+        limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
+        panels.append(Panel(column.label, curves, limits))
     return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))

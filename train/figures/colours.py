@@ -65,6 +65,6 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
     }
 
 
-def is_dashed(policy: str) -> bool:
-    """True if the line of a policy is dashed: no center of mass is fed back."""
-    return policy in _DASHED
+def dash_of(policy: str) -> str:
+    """Dash of a policy's line: no center of mass is fed back where it is not solid."""
+    return "dash" if policy in _DASHED else "solid"

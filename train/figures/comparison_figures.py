@@ -24,21 +24,16 @@ _MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
 _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
-_PAPER_FIGURES = {
-    ("pelvis", "24 s"): 7,
-    ("pelvis", "3 s"): 8,
-    ("zmp", "24 s"): 9,
-    ("zmp", "3 s"): 10,
-}
+_PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
-_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad", 1e3) for name in ("roll", "pitch"))
+_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad") for name in ("roll", "pitch"))
 _ZMP = (
-    TracedSignal("x, forward", "zmp_x", "mm", 1e3, reference="zmp_reference_x"),
-    TracedSignal("y, to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+    TracedSignal("x, forward", "zmp_x", "mm", reference="zmp_reference_x"),
+    TracedSignal("y, to the left", "zmp_y", "mm", reference="zmp_reference_y"),
 )
 _LINK = (
-    TracedSignal("q_ref", "reference_angle", "rad", 1.0),
-    TracedSignal("link error q_ref − q", "link_error", "mrad", 1e3),
+    TracedSignal("q_ref", "reference_angle", "rad"),
+    TracedSignal("link error q_ref − q", "link_error", "mrad"),
 )
 
 
@@ -58,10 +53,8 @@ def draw_figures(
     """
     cells = cells_together(evaluations)
     if swept is not None:
-        return [
-            draw_sweep(own, by_option(own), swept, folder / f"sweep_{_stem(own[0])}.png")
-            for own in cells
-        ]
+        paths = {folder / f"sweep_{_stem(own[0])}.png": own for own in cells}
+        return [draw_sweep(own, by_option(own), swept, path) for path, own in paths.items()]
     known = evaluations[0].condition.environment
     files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
     for scenario in swept_scenarios(evaluations):
@@ -105,14 +98,14 @@ def figure_name(name: str, evaluation: Evaluation) -> str:
 def paper_figure(name: str, condition: Condition) -> int | None:
     """Number of the paper's figure that a picture of a condition stands beside, if there is one."""
     is_like_the_paper = condition.scenario in _PAPER_SCENARIOS
-    return _PAPER_FIGURES.get((name, condition.reference_name)) if is_like_the_paper else None
+    numbers = _PAPER_FIGURES.get(name, {}) if is_like_the_paper else {}
+    return numbers.get(condition.reference_name)
 
 
 def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    return list(
-        group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values()
-    )
+    cells = group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario))
+    return list(cells.values())
 
 
 def by_option(evaluations: Sequence[Evaluation]) -> Cells:
@@ -196,9 +189,8 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
-    return draw_chart(
-        _over_time(evaluations, _ZMP, _walk_title(evaluations, "zmp", "Zero moment point")), path
-    )
+    title = _walk_title(evaluations, "zmp", "Zero moment point")
+    return draw_chart(_over_time(evaluations, _ZMP, title), path)
 
 
 def _over_time(

@@ -17,8 +17,7 @@ from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
 
 MRAD = 1e3
-MM = 1e3
-"""Factors from rad and m to what figures show."""
+"""Factor from rad to what figures show."""
 
 
 def require_matplotlib() -> Any:
@@ -131,28 +130,18 @@ def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> 
     if curve.fails:
         last = curve.y[np.isfinite(curve.y)][-1:]
         y = last if limits is None else np.clip(last, *limits)
-        style = {
-            "marker": "X",
-            "s": 70,
-            "edgecolors": "white",
-            "lw": 0.8,
-            "zorder": 6,
-            "clip_on": False,
-        }
-        axis.scatter(curve.x[-1:], y, color=curve.colour, **style)
+        cross = {"marker": "X", "s": 70, "edgecolors": "white", "lw": 0.8, "zorder": 6}
+        axis.scatter(curve.x[-1:], y, color=curve.colour, clip_on=False, **cross)
 
 
 def _draw_failing(axis: Any, chart: Chart) -> None:
     """A row of crosses per policy that fails somewhere."""
     for row, policy in enumerate(reversed(chart.failing)):
         faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
-        places = np.full(len(policy.x), row)
-        axis.scatter(
-            policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0
-        )
-    axis.set_yticks(
-        range(len(chart.failing)), [policy.name for policy in reversed(chart.failing)], fontsize=8
-    )
+        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": policy.colour}
+        axis.scatter(policy.x, np.full(len(policy.x), row), lw=1.0, **style)
+    names = [policy.name for policy in reversed(chart.failing)]
+    axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.set_ylim(-0.7, len(chart.failing) - 0.3)
     axis.set_ylabel(chart.failure)
     axis.tick_params(axis="x", length=0)
@@ -178,17 +167,14 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
     policies = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    is_one_scenario = len({e.condition.scenario for e in evaluations}) == 1
     panels: dict[str, dict[str, list[Evaluation]]] = {}
-    for evaluation in evaluations:
-        reference = evaluation.condition.reference_name
-        scenario = evaluation.condition.scenario
-        outer, inner = (
-            (f"scenario {scenario}", reference)
-            if len(scenarios) == 1
-            else (known.title(reference), scenario)
-        )
-        panels.setdefault(outer, {}).setdefault(inner, []).append(evaluation)
+    for e in evaluations:
+        reference = e.condition.reference_name
+        outer, inner = known.title(reference), e.condition.scenario
+        if is_one_scenario:
+            outer, inner = f"scenario {inner}", reference
+        panels.setdefault(outer, {}).setdefault(inner, []).append(e)
     width = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * max(map(len, panels.values())))
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
@@ -206,7 +192,7 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
         axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
-    if len(scenarios) == 1 and known.quantity:
+    if is_one_scenario and known.quantity:
         axes[-1][0].set_xlabel(known.quantity)
     _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * width / 1.7), 2))
     return save(figure, path)
@@ -224,26 +210,22 @@ def _draw_bars(
     """A bar per policy in every group."""
     width = 0.84 / len(policies)
     shades = policy_colours(policies)
-    for place, evaluation in (
-        (place, e) for place, group in enumerate(groups.values()) for e in group
-    ):
-        policy = evaluation.condition.policy.title
-        index = policies.index(policy)
-        x = place + (index - (len(policies) - 1) / 2) * width
-        values = column.scale * evaluation.values(column.metric)
-        shade = shades[policy]
-        axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
-        if len(evaluation.episodes) > 1:
-            axis.scatter(
-                np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3
-            )
-        if evaluation.num_failed:
-            shown = {
-                "color": shade if len(values) == 0 else FAILED,
-                "zorder": 4,
-                "transform": axis.get_xaxis_transform(),
-            }
-            axis.scatter(x, 0.035, marker="X", s=26, edgecolors="white", lw=0.5, **shown)
+    for place, group in enumerate(groups.values()):
+        for e in group:
+            index = policies.index(e.condition.policy.title)
+            x = place + (index - (len(policies) - 1) / 2) * width
+            values = column.scale * e.values(column.metric)
+            shade = shades[e.condition.policy.title]
+            height = np.median(values) if len(values) else 0.0
+            axis.bar(x, height, width=0.9 * width, color=shade)
+            if len(e.episodes) > 1:
+                dots = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
+                axis.scatter(np.full(len(values), x), values, **dots)
+            if e.num_failed:
+                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5, "zorder": 4}
+                colour = FAILED if len(values) else shade
+                bottom = axis.get_xaxis_transform()
+                axis.scatter(x, 0.035, color=colour, transform=bottom, **cross)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
     axis.set_xticks(range(len(groups)), list(groups), **slanted)

@@ -6,7 +6,7 @@ from typing import Any
 
 import stable_baselines3
 
-from elastic_env.core.errors import ConfigurationError, quote, unknown_name
+from elastic_env.core.errors import ConfigurationError, ElasticError, quote, unknown_name
 from train.learn.algorithm_options import CONSTANTS
 from train.runs.user_code import named_object
 
@@ -29,19 +29,6 @@ def algorithm_class(name: str) -> Any:
     return getattr(stable_baselines3, name)
 
 
-_BAD_OPTIONS = (
-    TypeError,
-    ValueError,
-    AssertionError,
-    AttributeError,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    RuntimeError,
-)
-"""What algorithms raise for options that they cannot take, such as arrays beyond the memory."""
-
-
 @contextmanager
 def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """Name algorithm and options in what it raises while it is built from them.
@@ -51,9 +38,9 @@ def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """
     try:
         yield
-    except ConfigurationError:
+    except (ElasticError, OSError):
         raise
-    except _BAD_OPTIONS as error:
+    except Exception as error:
         raise ConfigurationError(
             f"{algorithm} cannot be built with algorithm_options {quote(dict(options))}: "
             f"{error or type(error).__name__}"
