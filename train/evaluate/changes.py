@@ -1,8 +1,7 @@
-"""Paired changes of a comparison: every residual against its base and against the best policy
-without learning.
+"""Paired changes of a comparison: residuals against bases and rivals, baselines against bases.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first
-policy.
+A residual is compared with its base and with the best policy without learning. A baseline is
+compared with the base of the residuals, or without residuals with the first policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -110,6 +109,11 @@ class Change:
     is_rival: bool = False
 
     @property
+    def line(self) -> tuple[object, ...]:
+        """What rows of the same policy, base and cell have in common."""
+        return (self.policy, self.base, self.reference, self.scope, *self.swept.items())
+
+    @property
     def num_seeds(self) -> int:
         """Training seeds; 0 of a baseline."""
         return len(self.per_seed) if self.is_family else 0
@@ -121,9 +125,7 @@ class Change:
 
     @property
     def verdict(self) -> Verdict:
-        """lower, higher, none (the interval includes zero), or unclear (too few training seeds
-        to say).
-        """
+        """lower, higher, none (the interval includes zero), or unclear (too few training seeds)."""
         low = self.relative.low
         high = self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
@@ -203,17 +205,13 @@ def _hundredths(share: float, signed: bool, is_fine: bool) -> str:
 
 
 def signed_interval(estimate: Estimate, verdict: str) -> str:
-    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *; - where
-    there is none.
-    """
+    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *."""
     text = percent_interval(estimate)
     return signed_off(text, verdict) if np.isfinite(estimate.value) else text
 
 
 def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-    """Cells with the training seeds of a family put together: all of their episodes, the trace
-    of the first.
-    """
+    """Cells with all training seeds of a family in one: all episodes, the trace of the first."""
     together: dict[tuple[object, ...], Evaluation] = {}
     for number, e in enumerate(evaluations):
         c = e.condition
@@ -226,24 +224,24 @@ def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def opponents(table: EpisodeTable) -> dict[str, list[str]]:
-    """Titles of those whom each policy is compared with: base and rival, or of a baseline the
-    bases, or the first.
+    """Titles of the policies that each policy is compared with.
+
+    A residual has a base and a rival. A baseline has the bases of the residuals, or the first
+    policy.
     """
-    members = {title: next(reversed(own.values())) for title, own in table.members.items()}
-    default = list(dict.fromkeys(member.base for member in members.values())) or table.policies[:1]
     found = {}
+    bases = dict.fromkeys(m.base for own in table.members.values() for m in own.values())
     for title in table.policies:
-        member = members.get(title)
-        if member is None:
-            found[title] = [base for base in default if base != title]
-        else:
+        if title in table.members:
+            member = next(reversed(table.members[title].values()))
             found[title] = [other for other in (member.base, member.rival) if other is not None]
+        else:
+            found[title] = [base for base in bases or table.policies[:1] if base != title]
     return found
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
-    """All paired changes: residuals against bases and rivals, baselines against bases or, without
-    residuals, the first.
+    """All paired changes of a comparison.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -271,8 +269,9 @@ class Pairings:
         self._pairs: dict[tuple[str, str, int, str], Array] = {}
 
     def cells(self, policy: str, base: str) -> dict[int, int]:
-        """Number of the base's cell by that of the policy's; where the base is not swept, of the
-        one of its level.
+        """Number of the base's cell, by that of the policy's.
+
+        A base that is not swept has one cell for all values, its level.
         """
         found = {}
         for own in self.table.cells_of(policy):
@@ -341,9 +340,7 @@ class Pairings:
         )
 
     def _figures(self, policy: str, base: str, cell: int, metric: str) -> Array:
-        """Means of the policy and of its base over the pairs of a cell, how many there are, and
-        how many it wins, (4, seeds).
-        """
+        """Figures of a cell: means of policy and base, number of pairs, number won, (4, seeds)."""
         key = (policy, base, cell, metric)
         if key not in self._pairs:
             mine = self.table.of(policy, cell)
@@ -361,8 +358,7 @@ class Pairings:
 
 
 def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Episodes of two policies in one cell with the same seed, in which neither failed: `member`,
-    `mine`, `base`.
+    """Episodes of two policies with equal seeds, in which neither failed.
 
     Args:
         mine: Rows of a policy, with `member`, `seed`, `failed` and the metric.
@@ -377,18 +373,13 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
             raise ValueError(
                 f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
             )
-    own = mine.sort_values("seed", kind="stable")
-    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(
-        own["seed"].to_numpy()
-    )
-    figures = {"member": own["member"], "mine": own[metric], "base": others}
-    return pd.DataFrame({name: column.to_numpy() for name, column in figures.items()}).dropna()
+    own = mine.sort_values("seed", kind="stable")[["member", "seed", metric]]
+    both = own.merge(base[["seed", metric]], on="seed", suffixes=("", "_base")).dropna()
+    return both.rename(columns={metric: "mine", f"{metric}_base": "base"})
 
 
 def _against(pairings: Pairings, policy: str, base: str, groups: Groups) -> list[Change]:
-    """Rows of one policy and one base: every cell, and every group behind the last one of its
-    scenarios.
-    """
+    """Rows of a policy and a base: every cell, and every group behind the last of its scenarios."""
     table = pairings.table
     cells = list(pairings.cells(policy, base))
     conditions = {cell: table.conditions[policy, cell] for cell in cells}
@@ -416,9 +407,7 @@ def _apart_from_scenario(condition: Condition) -> tuple[object, ...]:
 
 
 def _mean(values: Array) -> float:
-    """Interquartile mean, over the training seeds that have all, of means over scenarios and
-    episodes.
-    """
+    """Interquartile mean over training seeds of means over scenarios and episodes."""
     means = np.mean(values, axis=-1)
     means = means[np.isfinite(means)]
     return float(interquartile_mean(means)) if len(means) else float("nan")
@@ -431,7 +420,9 @@ def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str
     if trained.scenarios is None:
         return ("training condition unknown",)
     known = conditions[0].environment
-    motion: Any = known.default_reference if trained.reference is None else trained.reference
+    motion: Any = trained.reference
+    if motion is None:
+        motion = known.default_reference
     seen = _motion(known, motion) == _motion(known, conditions[0].reference)
     quantity = known.quantity or "reference"
     scenarios = [_seen_as(condition, trained) for condition in conditions]
@@ -453,9 +444,7 @@ def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str
 
 
 def _seen_as(condition: Condition, trained: Origin) -> str:
-    """The scenario of a condition; one whose fields are varied by the name under which training
-    has seen the same.
-    """
+    """The scenario of a condition, by the name under which training has seen the same."""
     played = condition.scenario_played
     seen = trained.scenarios or ()
     if isinstance(played, str) and not trained.ranges:
@@ -477,7 +466,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(
-        rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items())
-    )
+    lines = group_by(rows, lambda row: row.line)
     return list(lines.values())

@@ -1,6 +1,4 @@
-"""The environments as the commands know them: how it is made, what of it is kept, and how its
-figures are shown.
-"""
+"""The environments as the commands know them: their arguments, figures and tables."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -180,9 +178,7 @@ class Environment:
         return str(reference.get("kind") if isinstance(reference, dict) else reference)
 
     def abscissa(self, reference: Reference) -> dict[str, float]:  # noqa: ARG002
-        """Number of a reference that sweeps can be drawn against, by name with unit; empty
-        without one.
-        """
+        """Number of a reference that sweeps can be drawn against, by name; empty without one."""
         return {}
 
     def draws(self, reference: Reference) -> bool:

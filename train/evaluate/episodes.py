@@ -1,6 +1,4 @@
-"""Episodes of a policy under a condition: metrics of each, one time series, and the static
-points.
-"""
+"""Episodes of a policy under a condition: metrics, one time series, and static points."""
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import closing
@@ -49,9 +47,7 @@ class Evaluation:
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
     def values(self, metric: str, failed: bool = False) -> Array:
-        """A metric over the episodes that did not fail, or over those that did, (n,); empty
-        where none has it.
-        """
+        """A metric over the episodes that did not fail, or over those that did, (n,)."""
         shown = [own for own in self.episodes if bool(own["termination"]) == failed]
         found = [own[metric] for own in shown if own.get(metric) is not None]
         return np.array(found, dtype=np.float64)
@@ -68,17 +64,14 @@ class Evaluation:
 
     @property
     def is_steady(self) -> BoolArray:
-        """Samples of the trace that a figure's range goes by: all but those shortly before a
-        fall.
-        """
+        """Samples of the trace that set a figure's range: all but those shortly before a fall."""
         time_s = self.trace["time_s"]
-        return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
+        end = time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0)
+        return time_s <= max(end, 0.0)
 
 
 def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
-    """Items such as evaluations by what they have in common, in the order in which it first
-    occurs.
-    """
+    """Items by a key, in the order in which it first occurs."""
     groups: dict[KeyT, list[ItemT]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
@@ -108,8 +101,7 @@ def evaluate(
 def evaluate_together(
     conditions: Sequence[Condition], progress: Progress | None = None, num_threads: int = 0
 ) -> list[Evaluation]:
-    """Play conditions of one policy side by side, which costs less; their results are those of
-    `evaluate`.
+    """Play conditions of one policy side by side, which is faster; results are those of `evaluate`.
 
     Args:
         conditions: What to play: one, or several with the same `shared_settings` that can share
@@ -118,9 +110,7 @@ def evaluate_together(
         num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
-    episodes = [
-        (result, number) for result in results for number in range(result.condition.episodes)
-    ]
+    episodes = [(own, number) for own in results for number in range(own.condition.episodes)]
     at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), at_once):
         batch = episodes[first : first + at_once]
@@ -131,9 +121,7 @@ def evaluate_together(
 
 
 def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress) -> None:
-    """Episodes of conditions, by their numbers, a world each; in every world the first episode
-    counts.
-    """
+    """Play numbered episodes of conditions, a world each; the first episode of a world counts."""
     condition = episodes[0][0].condition
     seeds = [result.condition.seed + number for result, number in episodes]
     policy = make_policy(condition.policy, env, condition.policy_options)
@@ -167,9 +155,7 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
 
 
 def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
-    """The part of a record that is known before the episode: cell, training seed, and seed of
-    the episode.
-    """
+    """The part of a record that is known before the episode: cell, training seed, seed."""
     member = condition.member
     seed = None if member is None else member.training_seed
     return {
@@ -185,9 +171,7 @@ def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
 
 
 class _Observers:
-    """Figures that no environment keeps: of the IMU, of a policy's estimate, and the trace of
-    first episodes.
-    """
+    """Figures that no environment keeps: of the IMU, of a policy's estimate, and traces."""
 
     def __init__(self, env: Any, policy: Any, episodes: Sequence[tuple[Evaluation, int]]) -> None:
         task = env.unwrapped.task
@@ -213,7 +197,8 @@ class _Observers:
             if world not in self._ended:
                 trace.take(observation, info)
         if self._imu is not None:
-            attitude = observation[:, self._task.observation_table.group("imu_attitude")]
+            shown = self._task.observation_table.group("imu_attitude")
+            attitude = observation[:, shown]
             truth = np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
             self._imu.take(np.square(attitude - truth).sum(axis=1))
         if self._estimate is not None:
@@ -232,7 +217,8 @@ class _Observers:
             found |= self._changes.metrics(world)
         if self._imu is not None:
             found["imu_error_rms_rad"] = self._imu.of(world)
-        if hasattr(self._task, "robot_record"):  # of the robots that a walker draws from ranges
+        # of the robots that a walker draws from ranges
+        if hasattr(self._task, "robot_record"):
             found |= self._task.robot_record(world)
         return found
 

@@ -1,5 +1,4 @@
-"""Policies of a comparison with all training seeds of a residual, and with whom each residual is
-compared.
+"""Policies of a comparison with all training seeds of each residual, and their opponents.
 
 A residual is compared with its base, and with the best policy without learning that reads the same
 sensors.
@@ -62,8 +61,7 @@ class Origin:
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
-    """All who play: a residual's pattern as one entrant per folder, and bases and rivals that
-    nobody named.
+    """All who play: residuals with a folder each, and bases and rivals that nobody named.
 
     Args:
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
@@ -179,9 +177,7 @@ def _matching(pattern: str) -> list[Path]:
 
 
 def _require_motion(member: _Folder) -> None:
-    """Refuse a residual whose training names a motion that its environment cannot read: the
-    report would need it.
-    """
+    """Refuse a residual trained on a motion that its environment cannot read."""
     known = ENVIRONMENTS.get(member.description.robot)
     reference = member.description.origin.config.reference
     if known is None or reference is None:
@@ -194,9 +190,7 @@ def _require_motion(member: _Folder) -> None:
 
 
 def _nearest(pattern: Path) -> str:
-    """The folders beside a pattern that matches none, the most similar names first, and those
-    that are shipped.
-    """
+    """The folders beside a pattern that matches none, the most similar first, and shipped ones."""
     there = next(
         path
         for path in pattern.parents
@@ -248,10 +242,9 @@ _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_ev
 def _kin(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
-    trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
-    return trained | {
-        name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")
-    }
+    trained = {f"the trained {name}": config[name] for name in config if name not in _OWN}
+    names = ("robot", "base", "base_options", "settings")
+    return trained | {name: getattr(description, name) for name in names}
 
 
 @dataclass(frozen=True)
@@ -269,8 +262,9 @@ class _Opponents:
     def base(self, taken: Sequence[PolicySpec]) -> PolicySpec:
         """The base: one of the policies with the same options, or one of its own."""
         name = self.description.base
-        for known in taken:
-            if self._is_beside(known, name) and _set_options(known.options) == self._options:
+        beside = [known for known in taken if self._is_beside(known, name)]
+        for known in beside:
+            if _set_options(known.options) == self._options:
                 return known
         return self._new(name, f"base of {self.residual.title}", self._options, taken)
 
@@ -287,10 +281,10 @@ class _Opponents:
             return None
         is_base = name == self.description.base
         assumed = _assumed(self._options)
-        for known in taken:
+        for known in (known for known in taken if self._is_beside(known, name)):
             own = _set_options(known.options)
-            if self._is_beside(known, name) and (own if is_base else _assumed(own)) == assumed:
-                return known if not is_base or self._options != assumed else None
+            if (own if is_base else _assumed(own)) == assumed:
+                return None if is_base and self._options == assumed else known
         return None if is_base else self._new(name, "best analytic", assumed, taken)
 
     @property

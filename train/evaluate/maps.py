@@ -1,5 +1,4 @@
-"""Maps over two axes: which policy is best where, and how far learning is ahead of the best policy
-without it.
+"""Maps over two axes: which policy is best where, and what learning adds to the best.
 
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
@@ -50,7 +49,8 @@ class Axis(Model):
         if self.label is not None:
             return self.label
         if self.is_motion:
-            return self.what.replace("_", " ") + (" [s]" if self.what == "step_period" else "")
+            unit = " [s]" if self.what == "step_period" else ""
+            return f"{self.what.replace('_', ' ')}{unit}"
         description, unit = scenario_fields()[self.what]
         return f"{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
 
@@ -68,7 +68,8 @@ class Axis(Model):
         if not self.is_motion:
             return self.values.index(condition.swept[self.what])
         arguments = condition.environment.arguments
-        return [arguments(value) for value in self.values].index(arguments(condition.reference))
+        values = [arguments(value) for value in self.values]
+        return values.index(arguments(condition.reference))
 
 
 class MapConfig(Model):
@@ -129,11 +130,8 @@ class MapConfig(Model):
 
 def _choices(what: str, known: Environment) -> str:
     """Names that an axis can have."""
-    hint = (
-        "; an option of the policies is varied by sweep, not by a map"
-        if what in PolicyOptions.model_fields
-        else ""
-    )
+    is_option = what in PolicyOptions.model_fields
+    hint = "; an option of the policies is varied by sweep, not by a map" if is_option else ""
     return choices_listed(what, [known.motion, *scenario_fields()]) + hint
 
 

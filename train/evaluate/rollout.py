@@ -1,6 +1,4 @@
-"""The rollout of a policy: how its environment and the policy are made, and one generator of
-control steps.
-"""
+"""The rollout of a policy: its environment, the policy, and one generator of control steps."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -210,8 +208,7 @@ def make_shared_env(
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> Any:
-    """A vector environment with a world of each condition, whose scenarios may differ, see
-    `shared_settings`.
+    """A vector environment with a world of each condition, see `shared_settings`.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
@@ -230,8 +227,9 @@ def shared_settings(condition: Condition) -> str:
     rate of the IMU.
     """
     scenario = make_scenario(condition.scenario_played)
-    walks = condition.environment.walks
-    known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz) if walks else scenario
+    known: Any = scenario
+    if condition.environment.walks:
+        known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz)
     return repr((condition.env, {**condition.arguments, "scenario": known}))
 
 
@@ -248,9 +246,7 @@ def can_share_worlds(condition: Condition) -> bool:
 
 
 def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
-    """Conditions, each with an environment of one world, which those that differ by their policy
-    share.
-    """
+    """Conditions with an environment of one world, shared by those that differ by the policy."""
     made: dict[str, Any] = {}
     for condition in conditions:
         key = repr((condition.env, condition.arguments))

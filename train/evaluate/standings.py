@@ -1,6 +1,4 @@
-"""The leaderboard of a comparison: scores of policies over groups of scenarios, in tracks by
-what a policy needs.
-"""
+"""The leaderboard of a comparison: scores over groups of scenarios, in tracks by needs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -163,9 +161,7 @@ class _Scope:
 
 
 def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
-    """Scenarios and whole groups of every policy and motion, in the order of policies and
-    motions.
-    """
+    """Scenarios and whole groups of every policy and motion, in their order."""
     found = []
     for policy in table.policies:
         for reference in table.references:
@@ -185,9 +181,7 @@ def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
 def _against_the_best(
     pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]
 ) -> Paired | None:
-    """A residual against the best of some policies in this scope and metric; None where none has
-    a score.
-    """
+    """A residual against the best of some policies; None where none has a score."""
     played = {rival.policy: pairings.table.of(rival.policy, *rival.cells) for rival in rivals}
     best = best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
     if best is None:

@@ -1,5 +1,4 @@
-"""Statistics over training seeds: paired changes, interquartile means, bootstrap intervals,
-probability of improvement.
+"""Statistics over training seeds: changes, interquartile means, bootstrap intervals.
 
 What is drawn at random in learning is the training seed, so intervals are over training seeds and
 never over the episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its
@@ -134,8 +133,7 @@ def over_seeds(values: Sequence[float] | Array) -> Estimate:
 
 
 def improvement(won: Array, played: Array) -> Estimate:
-    """Probability that an episode with the policy is better (lower) than the same with the base;
-    ties count half.
+    """Probability that an episode is better (lower) than the same with the base; ties count half.
 
     Args:
         won: Pairs of episodes in which the policy is better, (seeds, scenarios).
@@ -159,9 +157,7 @@ def improvement(won: Array, played: Array) -> Estimate:
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Percentile bootstrap over training seeds; the same samples, sorted, give the same
-    interval.
-    """
+    """Percentile bootstrap over training seeds; the same sorted samples give the same interval."""
     from scipy import (
         stats,
     )  # here: it takes half a second to load, and most programs need none of it

@@ -101,9 +101,7 @@ class EpisodeTable:
     def cells_of(
         self, policy: str, reference: str | None = None, scenario: str | None = None
     ) -> list[int]:
-        """Numbers of the cells that a policy plays, with a motion and in a scenario where these
-        are given.
-        """
+        """Numbers of the cells of a policy, of one motion or scenario where these are given."""
         return [
             cell
             for (title, cell), c in self.conditions.items()
@@ -126,9 +124,7 @@ class EpisodeTable:
 def per_seed(
     rows: pd.DataFrame, metric: str, statistic: Callable[[Array], float] = np.mean
 ) -> Array:
-    """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of
-    the rows; nan where no episode has a figure.
-    """
+    """A statistic for each training seed and cell, (seeds, cells); nan without a figure."""
     parts: Any = rows.groupby(["member", "cell"])[metric]
     known = {key: own.dropna().to_numpy() for key, own in parts}
     found = {key: float(statistic(values)) for key, values in known.items() if len(values)}
@@ -140,8 +136,7 @@ def per_seed(
 def score(
     rows: pd.DataFrame, column: Column, statistic: Callable[[Array], float] = np.mean
 ) -> Estimate:
-    """Mean over cells of a metric of one policy [SI]; of several training seeds the interquartile
-    mean.
+    """Mean over cells of a metric of one policy [SI]; over training seeds the interquartile mean.
 
     Args:
         rows: Rows of one policy in one or several cells.
@@ -152,9 +147,7 @@ def score(
 
 
 def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
-    """An estimate from one value per training seed; of a policy that was not trained it is the
-    value.
-    """
+    """An estimate from one value per training seed; without training the value itself."""
     return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
 
 

@@ -1,6 +1,4 @@
-"""Figure of an arm's identification: measured and predicted deflections, joint by joint, and the
-residuals.
-"""
+"""Figure of an arm's identification: measured and predicted deflections, and residuals."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,7 @@ _LINE = "#888888"
 
 
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
-    """A panel per joint with measured against predicted deflection, and one with the residual of
-    every pose.
+    """A panel per joint with measured against predicted deflection, and one with the residuals.
 
     Measured is the predicted deflection and the part of the residual that a deflection of this
     joint alone explains.
@@ -46,9 +43,7 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
 
 
 def deflections(fit: ArmFit) -> tuple[Array, Array]:
-    """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose
-    does not show one.
-    """
+    """Deflections of the joints, predicted and measured, (N, k) [rad]; nan where not seen."""
     model = fit.model
     elastic = fit.model.unknowns.elastic
     compliance, _ = fit.estimate("compliance")

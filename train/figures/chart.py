@@ -112,8 +112,7 @@ def time_chart(
     colours: Mapping[str, str],
     most_points: int | None = None,
 ) -> Chart:
-    """Signals of the first episodes over time; of several training seeds the median and the band
-    around all.
+    """Signals of the first episodes over time; over training seeds the median with its band.
 
     The scale is that of the walks that go on: what happens shortly before a fall leaves the chart.
 
@@ -204,8 +203,7 @@ def sweep_chart(
     colours: Mapping[str, str],
     statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
 ) -> Chart:
-    """Scores over what is swept, a curve per policy with its interval, or a level; on top, who
-    fails where.
+    """Scores over a swept value, a curve or a level per policy; on top, who fails where.
 
     Args:
         cells: Evaluations by policy and value.
@@ -273,9 +271,7 @@ def _failing(
 def learning_chart(
     learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]
 ) -> Chart:
-    """Share of the base's score on the way of a training: median over training seeds, band from
-    least to most.
-    """
+    """Share of the base's score during a training: median over training seeds with its band."""
     panels = []
     for column in columns:
         curves = []
@@ -297,8 +293,7 @@ def learning_chart(
 
 
 def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
-    """Metrics over the trials of a policy that learns on the robot: a thin line per robot, and
-    their mean.
+    """Metrics over the trials of a policy that learns on the robot: each robot, and the mean.
 
     Args:
         trials: `baselines.adaptation.iterative.Trial`, in order, the first without offsets.

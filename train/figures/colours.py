@@ -1,6 +1,4 @@
-"""Colours of policies and of the parts of charts, the same in pictures and on the page of a
-report.
-"""
+"""Colours of policies and of the parts of charts, for pictures and for the page of a report."""
 
 from collections.abc import Sequence
 
@@ -55,9 +53,7 @@ _DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
-    """A colour for every policy of a comparison: those that have none of their own take the
-    others in turn.
-    """
+    """A colour for every policy: those without one of their own take the others in turn."""
     unnamed = [policy for policy in policies if policy not in COLOURS]
     return {
         policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)]

@@ -1,6 +1,4 @@
-"""The pictures of a comparison: which are drawn, what they show, and what their files are
-called.
-"""
+"""The pictures of a comparison: which are drawn, what they show, and names of their files."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -109,9 +107,7 @@ def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
 
 
 def by_option(evaluations: Sequence[Evaluation]) -> Cells:
-    """Evaluations of every policy by the value of the swept option; None for a policy that was
-    not swept.
-    """
+    """Evaluations of every policy by the swept value; None for a policy that was not swept."""
     return {
         title: group_by(own, lambda e: next(iter(e.condition.swept.values()), None))
         for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()
@@ -134,9 +130,7 @@ def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
-    """True if the references are points of one axis: enough of them have a number, and each one
-    of its own.
-    """
+    """True if enough references have a number, and each one of its own: points of one axis."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
@@ -165,9 +159,7 @@ def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 
 def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Roll and pitch of the pelvis, which should be level, one line per policy, as Figs. 7 and 8
-    of the paper.
-    """
+    """Roll and pitch of the pelvis, one line per policy, as Figs. 7 and 8 of the paper."""
     chart = _over_time(evaluations, _PELVIS, _walk_title(evaluations, "pelvis", "Pelvis error"))
     if paper_figure("pelvis", evaluations[0].condition) is None:
         return draw_chart(chart, path)

@@ -1,6 +1,4 @@
-"""Heat maps as panels of coloured squares with text: the same for the report's page and for
-pictures.
-"""
+"""Heat maps as panels of coloured squares with text, for the page and for pictures."""
 
 import math
 import textwrap
@@ -75,9 +73,7 @@ class Panel:
 
 
 def panels(heat_map: HeatMap) -> list[Panel]:
-    """Who is best, every residual against the best policy without learning, and the score of
-    every policy.
-    """
+    """Who is best, every residual against the best without learning, and every policy's score."""
     column = heat_map.column
     policies = heat_map.policies
     shades = policy_colours(policies)

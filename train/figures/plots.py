@@ -1,6 +1,4 @@
-"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a whole
-comparison.
-"""
+"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
 from collections.abc import Sequence
@@ -158,8 +156,7 @@ def _show_numbers(axis: Any) -> None:
 
 
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
-    """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel
-    with all references.
+    """A metric of every policy: a panel per reference, or of one scenario one with all of them.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
     failed.

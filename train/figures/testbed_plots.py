@@ -25,9 +25,7 @@ _BLUE = "#2a6f97"
 def draw_identification(
     result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path
 ) -> Path:
-    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the
-    residuals.
-    """
+    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper."""
     plt = require_matplotlib()
     gravities = [make_gravity(model) for model in models]
     torque = link_torque(points, gravities, result.link_angles(points))
@@ -103,9 +101,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
 
 
 def static_errors(evaluation: Evaluation) -> Array:
-    """Link error by the IMU, averaged over each window at rest of the first episode, (visits,)
-    [rad].
-    """
+    """Link error by the IMU, averaged over each window at rest, (visits,) [rad]."""
     points = evaluation.points
     assert points is not None
     references = evaluation.rest_references

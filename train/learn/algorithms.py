@@ -12,8 +12,7 @@ from train.runs.user_code import named_object
 
 
 def algorithm_class(name: str) -> Any:
-    """Class of an algorithm: A2C, PPO or SAC of stable_baselines3, "module:Class" or
-    "FILE.py:Class".
+    """Class of an algorithm: A2C, PPO or SAC of SB3, "module:Class" or "FILE.py:Class".
 
     Raises:
         ConfigurationError: It does not exist.

@@ -1,6 +1,4 @@
-"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable at
-any moment.
-"""
+"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -208,9 +206,7 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
 
 
 def _table(config: TrainConfig, folder: Path) -> Table:
-    """Scores of the last policies against their base, on the episodes of the evaluation on the
-    way.
-    """
+    """Scores of the last policies against their base, on the episodes of the evaluations."""
     columns = environment(config.env).judged
     metrics = [column.metric for column in columns]
     head = ["seed", "scenario", *(column.label for column in columns), "failed"]

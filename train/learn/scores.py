@@ -1,6 +1,4 @@
-"""A training on its way: scores against the base on episodes that it never learns from, best and
-last policy.
-"""
+"""Evaluations during a training, on episodes that it never learns from; best and last policy."""
 
 import shutil
 from collections.abc import Sequence
@@ -23,6 +21,7 @@ from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
 
+_Policy = tuple[dict[str, Any], ResidualDescription]
 _Scored = tuple[Array, Array]
 """Means of metrics over the episodes that did not fail, (scenarios, metrics), and how many did,
 (scenarios,).
@@ -45,12 +44,10 @@ class Scores:
         self._threads = threads
         self._provenance = provenance(seed)
         self._base: _Scored | None = None
-        self.best = np.inf
+        self.best: float | None = None
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
-    def evaluate(
-        self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
-    ) -> dict[str, float]:
+    def evaluate(self, decisions: int, policy: _Policy) -> dict[str, float]:
         """Score a policy after some decisions, and keep it where it is the best so far.
 
         A residual begins as its base, within a hundredth of its range: before the first decision
@@ -69,14 +66,16 @@ class Scores:
         mine, failed = self._base
         if decisions > 0:
             mine, failed = self._play(f"residual:{current}", columns)
-        table = pd.DataFrame({"decisions": decisions, "scenario": self._config.scenarios})
+        names = self._config.scenarios
+        table = pd.DataFrame({"decisions": decisions, "scenario": names})
         table[columns] = mine
         table[[f"base_{name}" for name in columns]] = base
-        _append(table.assign(failed=failed, base_failed=base_failed), self._folder / PROGRESS)
+        table = table.assign(failed=failed, base_failed=base_failed)
+        _append(table, self._folder / PROGRESS)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios = mine / base
         score = float((np.nan_to_num(ratios, nan=10.0).mean(axis=1) + failed).mean())
-        if score < self.best:
+        if self.best is None or score < self.best:
             self.best = score
             self.keep("best", decisions, policy)
         shutil.rmtree(current)
@@ -84,9 +83,7 @@ class Scores:
         known = {f"{name}_change": change for name, change in found.items() if np.isfinite(change)}
         return {**known, "failed": float(failed.sum())}
 
-    def keep(
-        self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
-    ) -> Path:
+    def keep(self, name: str, decisions: int, policy: _Policy) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
         tensors, description = policy
         training = {
@@ -101,18 +98,14 @@ class Scores:
         return fresh.rename(self._folder / name)
 
     def forget_after(self, decisions: int) -> None:
-        """Drop evaluations that were made after the checkpoint that is gone on with; they will
-        be made again.
-        """
+        """Drop evaluations that were made after a checkpoint; they will be made again."""
         path = self._folder / PROGRESS
         lines = _text_of(path).splitlines(keepends=True)
         whole = [line for line in lines[1:] if line.endswith("\n")]
         try:
             kept = [line for line in whole if int(line.split(",")[0]) <= decisions]
         except ValueError as error:
-            raise ConfigurationError(
-                f"{path} is no table of evaluations ({error}); remove it"
-            ) from None
+            raise _no_table(path, error) from None
         if decisions == 0 or not lines:
             path.unlink(missing_ok=True)
             return
@@ -147,16 +140,17 @@ def _text_of(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            f"{path} is no table of evaluations ({error}); remove it"
-        ) from None
+        raise _no_table(path, error) from None
+
+
+def _no_table(path: Path, error: object) -> ConfigurationError:
+    return ConfigurationError(f"{path} is no table of evaluations ({error}); remove it")
 
 
 def played_together(
     conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
 ) -> list[tuple[Array, BoolArray]]:
-    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time
-    series.
+    """Play the episodes of several conditions at once: scores as of `evaluate`, without traces.
 
     Args:
         conditions: Cells of one environment, motion and policy.

@@ -1,6 +1,4 @@
-"""Paired changes as tables: a line per cell for the terminal, every figure for the report, and
-as CSV.
-"""
+"""Paired changes as tables: a line per cell for the terminal, all for the report, and CSV."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -30,9 +28,7 @@ _SIGNS = {"°": HELD_OUT, "(°)": PARTLY, "†": CEILING, "‡": SAME_ROBOT}
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; first against bases, then against
-    rivals.
-    """
+    """Print the changes of the residuals, a line per cell: against bases, then against rivals."""
     shown = [row for row in rows if row.is_family and row.is_judged]
     for is_rival in (False, True):
         own = [row for row in shown if row.is_rival == is_rival]
@@ -41,8 +37,7 @@ def print_changes(rows: Sequence[Change], console: Console) -> None:
 
 
 def cells_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against their bases, or against their rivals, a line per cell with all
-    metrics.
+    """Changes of residuals against one kind of opponent, a line per cell with all metrics.
 
     Args:
         rows: Changes of families, of one environment, all against bases or all against rivals.
@@ -77,8 +72,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
 
 
 def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
-    """All figures of paired changes, a row per cell and metric, under a heading per policy and
-    base.
+    """All figures of paired changes, a row per cell and metric, with headings.
 
     Args:
         rows: Changes of residuals, or of policies without training seeds.
@@ -121,9 +115,7 @@ def _swept(row: Change, names: Sequence[str]) -> list[str]:
 
 
 def _means(row: Change) -> str:
-    """Means of base and policy in the unit in which they are shown; - where there is nothing to
-    compare.
-    """
+    """Means of base and policy in the shown unit; - where there is nothing to compare."""
     if not np.isfinite(row.mine):
         return "-"
     shown = (row.column.scale * value for value in (row.theirs, row.mine))
@@ -151,9 +143,7 @@ def _signs(marks: Sequence[str]) -> list[str]:
 
 
 def failed_and_base(row: Change) -> str:
-    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are
-    more.
-    """
+    """Failed episodes of all, the base's in brackets; an exclamation mark where there are more."""
     return (
         f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes}"
         f" ({row.base_falls}/{row.base_episodes})"
@@ -195,9 +185,7 @@ def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
 
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
-    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as
-    they are shown.
-    """
+    """One row per cell, metric and policy; scores in SI units, changes as shares of one."""
     return write_records([record for found in maps for record in _map_records(found)], path)
 
 

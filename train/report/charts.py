@@ -105,9 +105,7 @@ def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
 
 
 def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> PageChart:
-    """Every policy in every scenario: its mean over the episodes that did not fail; of families
-    with interval.
-    """
+    """Every policy in every scenario: its mean over the episodes that did not fail."""
     rungs: list[tuple[float, str, Any]] = []
     headings: dict[str, float] = {}
     place = 0.0

@@ -146,9 +146,7 @@ def claims_table(found: Sequence[Standing]) -> Table:
 
 
 def _change(paired: Paired | None) -> str:
-    """A paired change: its value, its interval, a sign where nothing is shown, and whom it
-    compares with.
-    """
+    """A paired change: value, interval, a sign where nothing is shown, and the opponent."""
     if paired is None:
         return "-"
     return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
@@ -207,9 +205,7 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
-    """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they
-    agree.
-    """
+    """Write `leaderboard.csv`, and from it `leaderboard.md`, so that they agree."""
     table = write_records([_record(standing) for standing in found], folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
     write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")

@@ -184,8 +184,7 @@ def plain_text(cell: Cell) -> str:
 
 
 def print_table(table: Table, console: Console, file: str) -> None:
-    """Print a table without the columns that the terminal has no room for, and name those and who
-    has them.
+    """Print a table without the columns that have no room, and name those and their file.
 
     Args:
         table: The table.

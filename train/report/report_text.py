@@ -108,9 +108,7 @@ class Results:
 
 
 def headline(results: Results) -> str:
-    """Three sentences: what was played and what failed, who is best, and what learning adds, or
-    who comes last.
-    """
+    """Three sentences: what was played, who is best, and what learning adds or who is last."""
     table = results.table
     failed, played = failures(table.rows)
     of_these = f"of which {failed} failed" if failed else "none of which failed"
@@ -123,9 +121,7 @@ def headline(results: Results) -> str:
 
 
 def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
-    """Sentences on the best and the worst policy by the first judged metric; one that fails less
-    often is better.
-    """
+    """Sentences on the best and the worst policy by the first judged metric."""
     column = table.environment.judged[0]
     scores = _scores(table.rows, column)
     known = ranking(scores)
@@ -146,9 +142,7 @@ def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
 
 
 def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tuple[int, int]]]:
-    """Mean of every policy over training seeds and cells with an episode that reached its end
-    [SI], and failures.
-    """
+    """Mean of every policy over training seeds and cells [SI], and failures."""
     found = {}
     for title, own in rows.groupby("policy", sort=False):
         values = per_seed(own, column.metric)
@@ -159,9 +153,7 @@ def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tup
 
 
 def _learning_sentence(results: Results) -> str:
-    """Change by learning in the first judged metric, or that there are too few training seeds to
-    judge.
-    """
+    """Change by learning in the first judged metric, or that there are too few training seeds."""
     rows = [row for row in results.changes if row.is_family and row.is_judged and not row.is_rival]
     if not rows:
         return ""
@@ -211,9 +203,7 @@ def _training_text(origin: Origin) -> str:
 
 
 def in_short(results: Results) -> list[str]:
-    """Gains by learning in a sentence each; then per residual and metric in how many cells it is
-    better, or worse.
-    """
+    """Gains by learning in a sentence each; then how many cells are better or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)]
     found += claims(results)
     judged = [row for row in results.changes if row.is_family and row.is_judged]
@@ -233,9 +223,7 @@ def in_short(results: Results) -> list[str]:
 
 
 def of_a_map(heat_map: HeatMap) -> list[str]:
-    """Who is best in how many cells of a map, and where learning is ahead of the best policy
-    without it.
-    """
+    """Who is best in how many cells of a map, and in how many learning is ahead."""
     where = f"{heat_map.column.title}, {heat_map.title}"
     cells = heat_map.flat
     wins = Counter(cell.best for cell in cells)
@@ -253,9 +241,7 @@ def of_a_map(heat_map: HeatMap) -> list[str]:
 
 
 def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
-    """Lines of a residual in one metric against one other policy: pooled figures, and in how
-    many cells what holds.
-    """
+    """Lines of a residual in one metric against one policy: pooled figures, and counts of cells."""
     title = f"{own[0].policy} against {own[0].base}, {own[0].column.title}"
     has_rival = any(row.is_rival and row.policy == own[0].policy for row in results.changes)
     found = []
@@ -268,8 +254,7 @@ def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
 
 
 def claims(results: Results) -> list[str]:
-    """Gains by learning over the base of a residual, and to the best policy without learning: a
-    sentence per scope.
+    """Gains by learning over the base and to the best policy without learning, one per scope.
 
     Scopes are the groups; without groups the scenarios, where there are few.
     """

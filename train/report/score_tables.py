@@ -75,9 +75,7 @@ def robots_table(found: Sequence[RobotScores]) -> Table:
 
 
 def print_robots(found: Sequence[RobotScores], console: Console) -> None:
-    """Print a line per policy with all metrics, under the motion and the scenario, where there
-    is anything to print.
-    """
+    """Print a line per policy with all metrics, under the motion and the scenario."""
     if not found:
         return
     columns = list(dict.fromkeys(row.column for row in found))
@@ -89,7 +87,8 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
             figures = {row.column: _three(row) for row in own}
             failed = f"{own[0].failed}/{own[0].episodes}"
             rows.append(Row((policy, *(figures[column] for column in columns), failed)))
-    title = "over the drawn robots that did not fail: mean / interquartile mean / worst tenth"
+    figures = "mean / interquartile mean / mean of the worst tenth"
+    title = f"over the drawn robots that did not fail: {figures}"
     heads.append(Head(found[0].failure))
     print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
 

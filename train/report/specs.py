@@ -112,9 +112,7 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
 
 
 def _abscissa(x: Array) -> Spec:
-    """Points of the axis; of many that are evenly spaced the first one and the distance, which
-    is shorter.
-    """
+    """Points of the axis; of many that are evenly spaced the first one and the distance."""
     if len(x) < 20:
         return {"x": x.tolist()}
     return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}

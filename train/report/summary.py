@@ -1,5 +1,4 @@
-"""The summary of a comparison: medians over the episodes of every cell, on the terminal and as
-Markdown.
+"""The summary of a comparison: medians over the episodes of every cell.
 
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
@@ -21,9 +20,7 @@ from train.runs.escaping import write_records
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print the summary with as many columns as the terminal has room for; what policies are
-    judged by stays.
-    """
+    """Print the summary with as many columns as the terminal has room for."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
     print_table(summary_table(evaluations, columns), console, "summary.md")
@@ -74,9 +71,7 @@ def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
-    """How and, on the walker, when the episodes of a cell ended, median [s], for the cells in
-    which all failed.
-    """
+    """How and when the episodes of a cell ended, median [s], for cells in which all failed."""
     cells = {(e.condition.reference_name, e.condition.scenario) for e in evaluations}
     notes = []
     for e in evaluations:
@@ -99,9 +94,7 @@ def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """The summary table and its splits as Markdown: medians, and the worst episode in brackets;
-    by environment.
-    """
+    """The summary table and its splits as Markdown, by environment."""
     groups = groupby(evaluations, key=lambda evaluation: evaluation.condition.env)
     parts = [part for _, group in groups for part in _parts(list(group))]
     write_whole(path, "\n\n".join(parts) + "\n")

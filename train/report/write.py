@@ -1,6 +1,4 @@
-"""The report of a comparison: `report.html`, which works without a network, and its tables as
-Markdown.
-"""
+"""The report of a comparison: `report.html`, which works offline, and `report.md`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -117,9 +115,7 @@ def _add_learning(page: Page, results: Results) -> None:
 
 
 def _add_maps(page: Page, results: Results) -> None:
-    """Heat maps: who is best, learning against the best policy without it, and folded away every
-    policy's score.
-    """
+    """Heat maps: who is best, what learning adds, and folded away every policy's score."""
     page.section(
         "Maps",
         "Who is best where, and what learning changes against the best policy without it, in per"
