@@ -18,7 +18,7 @@ from elastic_env.world.scenario import make_scenario
 from tests.cells import METRIC, cell, family
 from train.commands.compare import CompareConfig
 from train.evaluate.changes import changes
-from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
+from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, vary_scenario
 from train.evaluate.episodes import Evaluation
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
 from train.evaluate.rollout import make_vector_env
@@ -78,7 +78,7 @@ def test_a_map_plays_every_pair_of_values_in_the_environment() -> None:
 def test_a_field_within_a_sensor_is_varied_and_the_others_stay() -> None:
     """Catches an axis that sets a sensor back to its defaults."""
     nominal = make_scenario("nominal")
-    found = varied(nominal, {OFFSET: 0.002})
+    found = vary_scenario(nominal, {OFFSET: 0.002})
     assert found == nominal.replace(pelvis_imu=nominal.pelvis_imu.replace(bias_spread_rad=0.002))
     assert scenario_fields()[OFFSET] == ("half-width of a further offset, drawn per episode", "rad")
     assert (

@@ -194,7 +194,7 @@ class Condition(Model):
         fields = {name: self.swept[name] for name in self.swept if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
-        return varied(make_scenario(self.scenario).with_ranges(self.ranges), fields)
+        return vary_scenario(make_scenario(self.scenario).with_ranges(self.ranges), fields)
 
     @property
     def policy_options(self) -> dict[str, Any]:
@@ -208,7 +208,7 @@ class Condition(Model):
         return self.policy.track or track(self.policy.name, self.environment.walks)
 
 
-def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
+def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
     """A scenario with other values of some fields, such as `scenario.stiffness_scale` [SI].
 
     Raises:

@@ -16,7 +16,7 @@ from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, Pairings
-from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
+from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, vary_scenario
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
@@ -116,7 +116,7 @@ class MapConfig(Model):
                     raise ConfigurationError(
                         f"values of map.{name} must be numbers, got {quote(value)}"
                     )
-                varied(GROUNDS["nominal"], {axis.what: value})
+                vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
         """Fields of the scenario in every cell, for one motion."""

@@ -29,7 +29,7 @@ def algorithm_class(name: str) -> Any:
 
 
 @contextmanager
-def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
+def name_options(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """Name algorithm and options in what it raises while it is built from them.
 
     Raises:

@@ -114,7 +114,7 @@ class Scores:
     def _play(self, policy: str, metrics: list[str]) -> _Scored:
         """Scores of a policy in every scenario."""
         conditions = [self._config.condition(name, policy) for name in self._config.scenarios]
-        results = played_together(conditions, metrics, self._threads)
+        results = play_together(conditions, metrics, self._threads)
         means = [
             [np.mean(some) if len(some) else np.nan for some in scores[~failed].T]
             for scores, failed in results
@@ -147,7 +147,7 @@ def _no_table(path: Path, error: object) -> ConfigurationError:
     return ConfigurationError(f"{path} is no table of evaluations ({error}); remove it")
 
 
-def played_together(
+def play_together(
     conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
 ) -> list[tuple[Array, BoolArray]]:
     """Play the episodes of several conditions at once: scores as of `evaluate`, without traces.

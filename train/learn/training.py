@@ -23,7 +23,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual.residual import ResidualDescription
-from train.learn.algorithms import algorithm_class, options_named
+from train.learn.algorithms import algorithm_class, name_options
 from train.learn.curves import Curves
 from train.learn.export import network_of
 from train.learn.finite import require_finite
@@ -84,7 +84,7 @@ class Training(Trainer):
         set_random_seed(seed)
         self._normaliser.seed(first_episode(seed))
         algorithm = algorithm_class(config.algorithm)
-        with options_named(config.algorithm, config.algorithm_options), warnings.catch_warnings():
+        with name_options(config.algorithm, config.algorithm_options), warnings.catch_warnings():
             # a rollout whose last minibatch is smaller is no mistake
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
             self.model: Any = algorithm(

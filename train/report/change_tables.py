@@ -46,7 +46,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     policies = tuple(dict.fromkeys(row.policy for row in rows))
     is_one = len(policies) == 1
-    names = ["reference", "scenario"] if is_one else ["residual", "reference", "scenario"]
+    names = [*([] if is_one else ["residual"]), "reference", "scenario"]
     heads = [Head(name, is_number=False, wraps=True, titles=name == "reference") for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head(column.title, leaves=1) for column in columns]
@@ -55,7 +55,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
     for line in by_line(rows):
         first = line[0]
         scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
-        own = [first.reference, scope] if is_one else [first.policy, first.reference, scope]
+        own = [*([] if is_one else [first.policy]), first.reference, scope]
         figures = {row.column: signed_interval(row.relative, row.verdict) for row in line}
         cells = [*own, *_swept(first, swept), *(figures[column] for column in columns)]
         kind = "group" if first.is_group else ""

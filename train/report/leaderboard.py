@@ -56,10 +56,9 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
         if own:
             rows.append(Row((str(track),), kind="heading"))
         places = {(s.policy, s.scope, s.reference, s.metric): s for s in own}
-        best = {
-            key: best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in some})
-            for key, some in group_by(own, lambda s: (s.scope, s.reference, s.metric)).items()
-        }
+        best = {}
+        for key, some in group_by(own, lambda s: (s.scope, s.reference, s.metric)).items():
+            best[key] = best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in some})
         order = {s.policy: _order(places.get((s.policy, *columns[0], metrics[0]))) for s in own}
         for policy in sorted(order, key=lambda policy: order[policy]):
             entries = []
@@ -208,7 +207,8 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv`, and from it `leaderboard.md`, so that they agree."""
     table = write_records([_record(standing) for standing in found], folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
-    write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
+    board = leaderboard_markdown(read_leaderboard(table))
+    write_whole(text, f"# Leaderboard\n\n{board}")
     return [table, text]
 
 

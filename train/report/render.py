@@ -146,16 +146,13 @@ class Table:
 
     def without(self, place: int) -> "Table":
         """The same without a column."""
-        rows = (
-            (
-                row
-                if row.kind == "heading"
-                else replace(row, cells=row.cells[:place] + row.cells[place + 1 :])
-            )
-            for row in self.rows
-        )
+        rows = []
+        for row in self.rows:
+            cells = row.cells[:place] + row.cells[place + 1 :]
+            rows.append(row if row.kind == "heading" else replace(row, cells=cells))
         heads = self.heads[:place] + self.heads[place + 1 :]
-        return replace(self, heads=heads, rows=tuple(rows), keys=self.keys - (place < self.keys))
+        keys = self.keys - (place < self.keys)
+        return replace(self, heads=heads, rows=tuple(rows), keys=keys)
 
     @property
     def sparse(self) -> list[Row]:
@@ -165,11 +162,8 @@ class Table:
         for row in self.rows:
             is_heading = row.kind == "heading"
             said = 0
-            while (
-                not is_heading
-                and said < self.keys - 1
-                and row.cells[: said + 1] == before[: said + 1]
-            ):
+            most = 0 if is_heading else self.keys - 1
+            while said < most and row.cells[: said + 1] == before[: said + 1]:
                 said += 1
             found.append(replace(row, cells=("",) * said + row.cells[said:]))
             before = () if is_heading else row.cells
@@ -305,7 +299,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 
 def load_template(name: str = "page.html.j2") -> "Template":
-    """A template, by default that of a page; a page escapes all that is put into it.
+    """A template, by default that of a page; it escapes all that is put into it.
 
     Raises:
         MissingExtraError: Jinja2 is not installed.
@@ -316,7 +310,7 @@ def load_template(name: str = "page.html.j2") -> "Template":
         raise missing_extra("jinja2", "report", "writing a report") from None
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=name.endswith(".html.j2"),
+        autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         finalize=template_value,

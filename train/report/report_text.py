@@ -11,15 +11,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from train.evaluate import changes as terms
 from train.evaluate.changes import (
     BEST_ANALYTIC,
-    CEILING,
-    CLAIM_SEEDS,
     FEWEST_SEEDS,
-    HELD_OUT,
-    PARTLY,
-    SAME_ROBOT,
-    SIGNS_ARE,
     Change,
     Verdict,
     percent,
@@ -81,9 +76,12 @@ class Results:
     def learning(self) -> dict[str, Curves]:
         """Learning curves of the families whose folders lie in a training run."""
         columns = self.environment.judged
-        families = self.table.families.items()
-        found = {title: learning_curves(origin.folders, columns) for title, origin in families}
-        return {title: curves for title, curves in found.items() if curves is not None}
+        found = {}
+        for title, origin in self.table.families.items():
+            curves = learning_curves(origin.folders, columns)
+            if curves is not None:
+                found[title] = curves
+        return found
 
     @cached_property
     def metadata(self) -> Mapping[str, Any]:
@@ -93,11 +91,10 @@ class Results:
     @property
     def grouped_changes(self) -> dict[str, list[Change]]:
         """Changes by what is compared with what."""
+        residuals = [row for row in self.changes if row.is_family]
         return {
-            "Residuals against their base": [
-                row for row in self.changes if row.is_family and not row.is_rival
-            ],
-            f"Residuals against the {BEST_ANALYTIC}": [row for row in self.changes if row.is_rival],
+            "Residuals against their base": [row for row in residuals if not row.is_rival],
+            f"Residuals against the {BEST_ANALYTIC}": [row for row in residuals if row.is_rival],
             "Baselines against one another": [row for row in self.changes if not row.is_family],
         }
 
@@ -339,22 +336,15 @@ def marks_text(row: Change) -> str:
 
 def notes(results: Results) -> list[str]:
     """Notes that a reader of this comparison needs."""
-    kinds = (HELD_OUT, PARTLY, CEILING, SAME_ROBOT)
     marks = {mark for row in results.changes for mark in row.marks}
-    text = load_template("notes.j2").render(
+    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
+    text = load_template("notes.html.j2").render(
         failures=results.environment.failures,
         families=results.table.families,
         maps=results.maps,
         has_rivals=any(row.is_rival for row in results.changes),
         marks={kind for kind in kinds if any(mark.startswith(kind) for mark in marks)},
-        held_out=HELD_OUT,
-        partly=PARTLY,
-        ceiling=CEILING,
-        same_robot=SAME_ROBOT,
-        best_analytic=BEST_ANALYTIC,
-        signs=SIGNS_ARE,
-        fewest=FEWEST_SEEDS,
-        claim=CLAIM_SEEDS,
+        terms=terms,
     )
     return [" ".join(note.split()) for note in text.split("\n\n") if note.strip()]
 
