@@ -110,7 +110,7 @@ class Change:
 
     @property
     def line(self) -> tuple[object, ...]:
-        """What rows of the same policy, base and cell have in common."""
+        """Key of the rows that have policy, base and cell in common."""
         return (self.policy, self.base, self.reference, self.scope, *self.swept.items())
 
     @property

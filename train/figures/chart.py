@@ -133,12 +133,12 @@ def time_chart(
             curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
         if signal.reference is not None:
             reference = signal.scale * longest[signal.reference][::stride]
-            curves.append(
-                Curve("reference", REFERENCE, time_s[::stride], reference, dash="dash", width=1.1)
-            )
+            style = {"dash": "dash", "width": 1.1}
+            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, **style))
         limits = _limits([e for own in policies.values() for e in own], signal)
         panels.append(Panel(signal.label, curves, limits))
-    shaded = intervals(longest["single_support"], time_s) if "single_support" in longest else []
+    single = longest.get("single_support", np.zeros(len(time_s)))
+    shaded = intervals(single, time_s)
     return Chart("", "time [s]", panels, shaded=shaded)
 
 
@@ -180,7 +180,8 @@ def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[fl
 def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
     """Beginnings and ends of the times in which a mask is true, (n,) each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0.0], mask > 0.5, [0.0]])))
-    return [(float(time[begin]), float(time[end - 1])) for begin, end in edges.reshape(-1, 2)]
+    pairs = edges.reshape(-1, 2)
+    return [(float(time[begin]), float(time[end - 1])) for begin, end in pairs]
 
 
 def spread(values: Array) -> tuple[Array, Array, Array]:

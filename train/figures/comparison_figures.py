@@ -68,10 +68,8 @@ def draw_figures(
 
 def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    return [
-        draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png")
-        for found in maps
-    ]
+    names = [_safe(f"{found.title}_{found.column.metric}") for found in maps]
+    return [draw_map(m, folder / f"map_{name}.png") for m, name in zip(maps, names, strict=True)]
 
 
 def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
@@ -84,7 +82,8 @@ def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> l
     """
     if not evaluations or (name == "static" and evaluations[0].points is None):
         return []
-    return [_FIGURES[name](evaluations, folder / f"{figure_name(name, evaluations[0])}.png")]
+    path = folder / f"{figure_name(name, evaluations[0])}.png"
+    return [_FIGURES[name](evaluations, path)]
 
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
@@ -108,19 +107,20 @@ def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
 
 def by_option(evaluations: Sequence[Evaluation]) -> Cells:
     """Evaluations of every policy by the swept value; None for a policy that was not swept."""
-    return {
-        title: group_by(own, lambda e: next(iter(e.condition.swept.values()), None))
-        for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()
-    }
+    return _by_policy(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
 def by_reference(evaluations: Sequence[Evaluation]) -> Cells:
     """Evaluations of every policy by the number of the reference, such as the step period [s]."""
     numbered = [e for e in evaluations if e.condition.number is not None]
-    return {
-        title: group_by(own, lambda e: e.condition.number)
-        for title, own in group_by(numbered, lambda e: e.condition.policy.title).items()
-    }
+    return _by_policy(numbered, lambda e: e.condition.number)
+
+
+def _by_policy(
+    evaluations: Sequence[Evaluation], key: Callable[[Evaluation], float | None]
+) -> Cells:
+    policies = group_by(evaluations, lambda e: e.condition.policy.title)
+    return {title: group_by(own, key) for title, own in policies.items()}
 
 
 def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
@@ -160,7 +160,8 @@ def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Roll and pitch of the pelvis, one line per policy, as Figs. 7 and 8 of the paper."""
-    chart = _over_time(evaluations, _PELVIS, _walk_title(evaluations, "pelvis", "Pelvis error"))
+    title = _walk_title(evaluations, "pelvis", "Pelvis error")
+    chart = _over_time(evaluations, _PELVIS, title)
     if paper_figure("pelvis", evaluations[0].condition) is None:
         return draw_chart(chart, path)
     panels = []
@@ -189,7 +190,8 @@ def _over_time(
     evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = ""
 ) -> Chart:
     policies = {e.condition.policy.title: [e] for e in evaluations}
-    return replace(time_chart(policies, signals, policy_colours(list(policies))), title=title)
+    chart = time_chart(policies, signals, policy_colours(list(policies)))
+    return replace(chart, title=title)
 
 
 def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> str:
@@ -201,7 +203,8 @@ def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> s
 
 
 def _stem(evaluation: Evaluation) -> str:
-    return _safe(f"{evaluation.condition.reference_name}_{evaluation.condition.scenario}")
+    condition = evaluation.condition
+    return _safe(f"{condition.reference_name}_{condition.scenario}")
 
 
 def _safe(text: str) -> str:

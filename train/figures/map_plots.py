@@ -83,8 +83,8 @@ def panels(heat_map: HeatMap) -> list[Panel]:
     rivals = {cell.best_analytic for cell in heat_map.flat} - {None}
     rival_letters = letters if len(rivals) > 1 else {}
     levels = [level.value for cell in heat_map.flat for level in cell.levels.values()]
-    positive = [level for level in levels if np.isfinite(level) and level > 0.0] or [1.0]
-    ends = (min(positive), max(positive))
+    positive = [level for level in levels if np.isfinite(level) and level > 0.0]
+    ends = (min(positive, default=1.0), max(positive, default=1.0))
 
     def panel(title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
         return Panel(

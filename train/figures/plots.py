@@ -112,9 +112,8 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)
-    figure.legend(
-        once.values(), once.keys(), ncols=columns_of(len(once)), loc="outside lower center"
-    )
+    ncols = columns_of(len(once))
+    figure.legend(once.values(), once.keys(), ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
@@ -163,7 +162,8 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
-    policies = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    shades = policy_colours(titles)
     is_one_scenario = len({e.condition.scenario for e in evaluations}) == 1
     panels: dict[str, dict[str, list[Evaluation]]] = {}
     for e in evaluations:
@@ -172,7 +172,8 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
         if is_one_scenario:
             outer, inner = f"scenario {inner}", reference
         panels.setdefault(outer, {}).setdefault(inner, []).append(e)
-    width = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * max(map(len, panels.values())))
+    group_width = 0.35 + 0.14 * len(titles)
+    width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     figure, axes = plt.subplots(
@@ -185,13 +186,19 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
         layout="constrained",
     )
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
-        _draw_bars(axis, groups, column, policies)
+        _draw_bars(axis, groups, column, shades)
         axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
     if is_one_scenario and known.quantity:
         axes[-1][0].set_xlabel(known.quantity)
-    _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * width / 1.7), 2))
+    bar = axes.flat[0].bar
+    handles = [bar(np.nan, 0.0, color=shade, label=title) for title, shade in shades.items()]
+    if any(evaluation.num_failed for evaluation in evaluations):
+        cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
+        handles.append(axes.flat[0].scatter([], [], **cross))
+    ncols = columns_of(len(handles), max(int(columns * width / 1.7), 2))
+    figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
@@ -202,11 +209,11 @@ _ROOMY = 7
 
 
 def _draw_bars(
-    axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]
+    axis: Any, groups: dict[str, list[Evaluation]], column: Column, shades: dict[str, str]
 ) -> None:
     """A bar per policy in every group."""
+    policies = list(shades)
     width = 0.84 / len(policies)
-    shades = policy_colours(policies)
     for place, group in enumerate(groups.values()):
         for e in group:
             index = policies.index(e.condition.policy.title)
@@ -228,19 +235,3 @@ def _draw_bars(
     axis.set_xticks(range(len(groups)), list(groups), **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)
-
-
-def _legend(
-    figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int
-) -> None:
-    """Policies, and the mark of failures if there are any."""
-    handles = [
-        axis.bar(np.nan, 0.0, color=shade, label=policy)
-        for policy, shade in policy_colours(policies).items()
-    ]
-    if any(evaluation.num_failed for evaluation in evaluations):
-        failure = evaluations[0].condition.environment.failure
-        handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
-    figure.legend(
-        handles=handles, ncols=columns_of(len(handles), per_row), loc="outside lower center"
-    )

@@ -218,7 +218,7 @@ class Training(Trainer):
         self._begin_episodes()
 
     def checkpoint(self) -> None:
-        """See `Trainer`. A checkpoint holds no state of the worlds: it ends their episodes."""
+        """Keep everything but the state of the worlds: a checkpoint ends their episodes."""
         super().checkpoint()
         self._begin_episodes()
 
