@@ -168,9 +168,11 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     panels: dict[str, dict[str, list[Evaluation]]] = {}
     for e in evaluations:
         reference = e.condition.reference_name
-        outer, inner = known.title(reference), e.condition.scenario
+        outer = known.title(reference)
+        inner = e.condition.scenario
         if is_one_scenario:
-            outer, inner = f"scenario {inner}", reference
+            outer = f"scenario {inner}"
+            inner = reference
         panels.setdefault(outer, {}).setdefault(inner, []).append(e)
     group_width = 0.35 + 0.14 * len(titles)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
