@@ -1,6 +1,4 @@
-"""Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without
-torch.
-"""
+"""Trained SB3 models as residual folders: weights for a NumPy forward pass without torch."""
 
 import pickle
 from pathlib import Path
@@ -64,9 +62,7 @@ def network_of(
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
-    """The joints of the configuration's robot, once the widths of a network are what its
-    residual sees and does.
-    """
+    """The joints of the robot, if the widths of a network are those that its residual needs."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
     sees = flatdim(worlds.single_observation_space)
     does = flatdim(worlds.single_action_space)
@@ -112,7 +108,7 @@ def export_zip(
             raise ConfigurationError(f"no model at {shorten(file)}")
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
-        statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())
+        statistics = pickle.loads(normaliser.read_bytes()) if normaliser else None
         tensors, activation, kind = network_of(model, statistics)
     except ConfigurationError:
         raise
