@@ -76,9 +76,7 @@ def run_conditions(
         condition for condition, found in zip(conditions, kept, strict=True) if found is None
     ]
     if len(missing) < len(conditions):
-        console.print(
-            f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True
-        )
+        console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept")
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if found is None else Outcome(found) for found in kept]
     finished = [result.value for result in results if result is not None and result.error is None]
@@ -111,7 +109,7 @@ def _load_kept(
         said = (
             f"kept cells that do not fit are played again: {'; '.join(unfit[:_MOST_NAMED])}{more}"
         )
-        console.print(said, soft_wrap=True, markup=False, highlight=False)
+        console.print(said, markup=False, highlight=False)
     return found
 
 
@@ -203,14 +201,12 @@ class _Playing:
             ):
                 name = _name(self._conditions[number])
                 said = f"{name} is not kept: a file that it names changed while it was played"
-                self._console.print(said, soft_wrap=True)
+                self._console.print(said)
         self._show_progress()
 
     def _say_moved(self, batch: int) -> None:
         for condition in self._of(batch):
-            self._console.print(
-                f"a worker was lost; {_name(condition)} is played again", soft_wrap=True
-            )
+            self._console.print(f"a worker was lost; {_name(condition)} is played again")
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
@@ -278,9 +274,7 @@ def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluati
     (total,) = num_steps([condition])
     done = 0
     say = plain_progress(console)
-    console.print(
-        f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True
-    )
+    console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}")
 
     def advance(steps: int) -> None:
         nonlocal done

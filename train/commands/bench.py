@@ -132,17 +132,15 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
         with Path(summary).open("a", encoding="utf-8") as file:
             file.write(markdown)
     console.print(_table(figures))
-    console.print(f"wrote {folder}/bench.json and bench.md", soft_wrap=True)
+    console.print(f"wrote {folder}/bench.json and bench.md")
     if update:
         _accept(path, config, evaluations)
-        console.print(f"accepted the figures into {path}", soft_wrap=True)
+        console.print(f"accepted the figures into {path}")
     short = [
         figure for figure in figures if (np.isnan(figure.measured) if update else figure.problem)
     ]
     for figure in short:
-        console.print(
-            f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False
-        )
+        console.print(f"{figure.case}: {figure.problem}", markup=False, highlight=False)
     return not short
 
 

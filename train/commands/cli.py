@@ -62,7 +62,7 @@ def _print_failure(error: Exception) -> int:
         DEFECT,
     )
     line = Text.assemble(("error:", "bold red"), f" {_with_notes(error, said)}")
-    PlainConsole(stderr=True).print(line, highlight=False, soft_wrap=True)
+    PlainConsole(stderr=True).print(line, highlight=False)
     return code
 
 
@@ -187,7 +187,5 @@ def main(arguments: list[str] | None = None) -> None:
                 if number == signal.SIGINT
                 else f"ended by {signal.Signals(number).name}"
             )
-            PlainConsole(stderr=True).print(
-                _with_notes(error, said), highlight=False, soft_wrap=True
-            )
+            PlainConsole(stderr=True).print(_with_notes(error, said), highlight=False)
             os._exit(128 + number)  # worker processes must not keep the terminal waiting

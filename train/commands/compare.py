@@ -420,7 +420,6 @@ def _play_cells(
             kept = write_episodes(error.finished, folder / "episodes.csv")
             console.print(
                 f"the other {len(error.finished)} cells are in {kept} and summary.md",
-                soft_wrap=True,
             )
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
@@ -561,6 +560,6 @@ class Compare(Model):
 
 def print_files(comparison: Comparison, console: Console) -> None:
     """Say what a comparison wrote."""
-    console.print(f"Results in {comparison.folder}:", soft_wrap=True)
+    console.print(f"Results in {comparison.folder}:")
     for path in comparison.files:
-        console.print(f"  {path}", soft_wrap=True)
+        console.print(f"  {path}")

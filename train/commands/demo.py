@@ -110,7 +110,7 @@ class Demo(Model):
         print_summary(walks, console)
         console.print("Figures and data:")
         for path in files:
-            console.print(f"  {path}", soft_wrap=True)
+            console.print(f"  {path}")
 
 
 _HEAD = ("quantity", "here", "paper")

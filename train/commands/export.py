@@ -36,4 +36,4 @@ class Export(Model):
         config = load_yaml(self.config, TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
-        console.print(f"play it as residual:{folder}", soft_wrap=True)
+        console.print(f"play it as residual:{folder}")

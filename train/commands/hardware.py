@@ -73,7 +73,6 @@ class Scan(Model):
             console.print(
                 f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
                 " it is the IMU's port",
-                soft_wrap=True,
             )
             sys.exit(3)
         console.print(table)
@@ -172,9 +171,7 @@ class Run(Model):
                         log.write(info)
                         metrics = info.get("episode_metrics", metrics)
                 (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        console.print(
-            f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True
-        )
+        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 
 def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
@@ -234,7 +231,7 @@ class _Log:
             )
 
     def _print(self, cells: list[str]) -> None:
-        self._console.print("".join(cells), soft_wrap=True, highlight=False)
+        self._console.print("".join(cells), highlight=False)
 
 
 @contextlib.contextmanager
@@ -246,9 +243,7 @@ def _open_log(path: Path, console: Console) -> Iterator[_Log]:
             yield log
         except BaseException:
             if log.num_rows:
-                console.print(
-                    f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True
-                )
+                console.print(f"cut short; the {log.num_rows} steps until then are in {path}")
             else:
                 path.unlink()
             raise
@@ -335,19 +330,16 @@ def emulate(
             f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {quote(after_s)}"
         )
     with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
-        console.print(
-            f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True
-        )
-        console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
+        console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}")
+        console.print(f"IMU at {emulator.imu_port}")
         console.print(
             f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
             f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
-            soft_wrap=True,
         )
         if later:
             time.sleep(after_s)
             emulator.faults(**later)
-            console.print(f"from now on: {', '.join(later)}", soft_wrap=True)
+            console.print(f"from now on: {', '.join(later)}")
         emulator.wait()
 
 

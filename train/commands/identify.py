@@ -129,7 +129,7 @@ class Identify(Model):
                 files.append(write_records(repeats, folder / "repeats.csv"))
                 console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
         for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+            console.print(f"wrote {path}")
         return results
 
     def _require_one_joint_with_an_imu(self) -> None:
@@ -156,7 +156,7 @@ def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[
     """A function that takes the share of the work that is done."""
     work = "visiting static positions"
     if hardware:
-        console.print(f"{work} at {hardware['port']}", soft_wrap=True)
+        console.print(f"{work} at {hardware['port']}")
         yield plain_progress(console)
         return
     with show_progress(console, {f"{work}, in %": 100}, transient=True) as show:

@@ -164,7 +164,7 @@ def run_arm_identification(
     for line in [summed_up(fit), *remarks(result)]:
         console.print(line, highlight=False)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return result
 
 
@@ -370,7 +370,7 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
         " each joint; half the deflection doubles it",
         highlight=False,
     )
-    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True)
+    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}")
 
 
 def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:

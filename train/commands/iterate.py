@@ -121,9 +121,9 @@ class Iterate(Model):
                 policies = _save(self, env, policy, folder)
         console.print(trials_table(trials, columns, condition))
         for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+            console.print(f"wrote {path}")
         for path in policies:
-            console.print(f"play it as iterative:{path}", soft_wrap=True)
+            console.print(f"play it as iterative:{path}")
         return trials
 
 

@@ -81,7 +81,7 @@ def steps_within(task: Any, max_s: float | None) -> int:
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
     """Let a policy learn on the robot, out of sight."""
-    console.print(f"{condition.policy.title} learns on this robot first", soft_wrap=True)
+    console.print(f"{condition.policy.title} learns on this robot first")
     with closing(make_vector_env(condition, 1)) as unseen:
         policy.rehearse(unseen, condition.seed)
 

@@ -99,9 +99,9 @@ class Robot(Model):
     def run(self, console: Console) -> None:
         """Play, write, print."""
         result = try_robot(self, console)
-        console.print(f"Results in {result.folder}:", soft_wrap=True)
+        console.print(f"Results in {result.folder}:")
         for path in result.files:
-            console.print(f"  {path}", soft_wrap=True)
+            console.print(f"  {path}")
 
 
 @dataclass(frozen=True)
@@ -391,7 +391,7 @@ def _pictures(config: RobotConfig, plant: JointPlant, folder: Path, console: Con
     try:
         image = picture(config, plant)
     except ElasticError as error:
-        console.print(f"no picture: {error}", soft_wrap=True, markup=False)
+        console.print(f"no picture: {error}", markup=False)
         return []
     import PIL.Image
 

@@ -300,17 +300,16 @@ class View(WatchedEpisode):
         """Play an episode, then show it until Ctrl-C."""
         listen(self.host, self.port).close()  # what cannot be is said before the episode
         condition = self.condition
-        console.print(f"playing {self.policy} first", soft_wrap=True)
+        console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)
         with show(recording, self.host, self.port) as page:
-            console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False)
+            console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
                 console.print(
                     "who has this address sees the page and moves its sliders; nothing on the way"
                     " is encrypted",
-                    soft_wrap=True,
                 )
-            console.print("Ctrl-C ends it", soft_wrap=True)
+            console.print("Ctrl-C ends it")
             _open_tab(page.access.address)
             while page.handle.is_running():
                 page.handle.sync()

@@ -10,6 +10,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
 from train.runs.escaping import visible
 
@@ -19,21 +20,21 @@ class PlainConsole(Console):
 
     Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that
     was received. A text that is printed is no markup of Rich's either, unless `markup=True` asks
-    for it.
+    for it, and is one line however long it is.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(emoji=False, **options)  # a policy of the user may be called mine:zero
 
-    def print(self, *objects: Any, markup: bool | None = None, **options: Any) -> None:
-        """Print texts as they are, without markup."""
+    def print(self, *objects: Any, markup: bool = False, **options: Any) -> None:
+        """Print texts as they are: without markup, colours or line breaks of our own."""
+        if all(isinstance(part, str | Text) for part in objects):
+            options = {"soft_wrap": True, "highlight": False, **options}
         highlight = options.get("highlight")
         parts = [
-            (
-                self.render_str(part, markup=markup is True, highlight=highlight)
-                if isinstance(part, str)
-                else part
-            )
+            self.render_str(part, markup=markup, highlight=highlight)
+            if isinstance(part, str)
+            else part
             for part in objects
         ]
         super().print(*parts, **options)

@@ -84,7 +84,7 @@ def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -
             said = int(10 * share)
             when = time.monotonic()
             more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
-            console.print(f"  {10 * said} %{more}", soft_wrap=True)
+            console.print(f"  {10 * said} %{more}")
 
     return say
 
@@ -179,4 +179,4 @@ class _FirstRecord(logging.Handler):
             return
         self._is_said = True
         with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
-            self._console.print(record.getMessage(), highlight=False, soft_wrap=True)
+            self._console.print(record.getMessage(), highlight=False)
