@@ -53,15 +53,13 @@ def named_files(text: str) -> list[Path]:
         folder = located(Path(text.partition(":")[2]))
         return [folder / name for name in _SAVED if _is_file(folder / name)]
     place, _, name = text.rpartition(":")
-    if name.isidentifier() and place.endswith(".py"):
-        return _with_imports(Path(place))
-    if name.isidentifier() and (source := _source(place)):
-        return _with_imports(source)
-    return (
-        [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
-        if _is_file(Path(text))
-        else []
-    )
+    if name.isidentifier():
+        source = Path(place) if place.endswith(".py") else _source(place)
+        if source is not None:
+            return _with_imports(source)
+    if not _is_file(Path(text)):
+        return []
+    return [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
 
 
 def _is_file(path: Path) -> bool:
@@ -80,9 +78,8 @@ def _source(module: str) -> Path | None:
     if not all(part.isidentifier() for part in (package, *parts)):
         return None
     try:
-        found = importlib.util.find_spec(
-            package
-        )  # which would import the packages around a name with dots
+        # of the outermost package: that of a name with dots would import the packages around it
+        found = importlib.util.find_spec(package)
     except (ImportError, ValueError):
         return None
     if found is None:
@@ -129,8 +126,9 @@ def _imports(file: Path) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield from ([node.module] if node.module else [])
-            yield from (".".join(filter(None, [node.module, alias.name])) for alias in node.names)
+            package = [node.module] if node.module else []
+            yield from package
+            yield from (".".join([*package, alias.name]) for alias in node.names)
 
 
 def _texts(value: Any) -> Iterator[str]:

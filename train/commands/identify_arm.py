@@ -106,13 +106,11 @@ class _Setting:
     elastic: tuple[str, ...]
     seed: int
 
-    def model(self, log: PoseLog | None = None) -> PoseModel:
+    def model(self, log: PoseLog) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
-        own = self.log if log is None else log
         has_payload = self.options.payload is not None
-        return PoseModel(
-            self.arm, own, Unknowns.of(own, self.elastic, self.options.frame, has_payload)
-        )
+        unknowns = Unknowns.of(log, self.elastic, self.options.frame, has_payload)
+        return PoseModel(self.arm, log, unknowns)
 
 
 def run_arm_identification(
@@ -151,48 +149,44 @@ def run_arm_identification(
             _plan_first(setting, folder, console)
             return None
         with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(setting.model(), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
-        plan = (
-            plan_further(fit, _candidates(setting, console), options.plan) if options.plan else None
-        )
+            fit = fit_arm(
+                setting.model(setting.log), lambda done: show(0, min(done, USUAL_EVALUATIONS))
+            )
+        plan = None
+        if options.plan:
+            plan = plan_further(fit, _candidates(setting, console), options.plan)
         information = None if plan is None else plan.information
         result = described(fit, options.within, options.assume, information)
         files = result.save(folder)
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
-        files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
+        if plan is not None:
+            files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
     console.print(result_table(result))
-    for line in [summed_up(fit), *remarks(result)]:
-        console.print(line, highlight=False)
-    for path in files:
-        console.print(f"wrote {path}")
+    console.print(
+        "\n".join([summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)])
+    )
     return result
 
 
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
-    has_friction = not result.friction_is_noise
-    has_plan = result.joints[0].planned_half_width is not None
+    joints = result.joints
+    columns: dict[str, Sequence[str]] = {
+        "joint": [joint.joint for joint in joints],
+        "K": [_number(joint.stiffness_nm_per_rad, ".4g", _has_interval(joint)) for joint in joints],
+        "95 % interval": [_interval(joint) for joint in joints],
+        "±": [_percent(joint.half_width) for joint in joints],
+    }
+    if joints[0].planned_half_width is not None:
+        columns["planned ±"] = [_percent(joint.planned_half_width) for joint in joints]
+    if not result.friction_is_noise:
+        columns["F [N·m]"] = [_number(joint.friction_nm) for joint in joints]
+    columns["o [mrad]"] = [
+        _number(None if joint.offset_rad is None else 1e3 * joint.offset_rad) for joint in joints
+    ]
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
-    head = [
-        "joint",
-        "K",
-        "95 % interval",
-        "±",
-        *["planned ±"] * has_plan,
-        *["F [N·m]"] * has_friction,
-        "o [mrad]",
-    ]
-    rows = [
-        [
-            joint.joint,
-            *_stiffness_cells(joint),
-            *[_percent(joint.planned_half_width)] * has_plan,
-            *[_number(joint.friction_nm)] * has_friction,
-            _number(joint.offset_rad, 1e3),
-        ]
-        for joint in result.joints
-    ]
-    table = make_table(title, head, rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    rows = zip(*columns.values(), strict=True)
+    table = make_table(title, list(columns), rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for column in table.columns:
         column.no_wrap = True
     return table
@@ -202,15 +196,30 @@ def remarks(result: ArmIdentification) -> list[str]:
     """Remarks beside the table: the payload, joints that are not told apart, and poses that do
     not fit.
     """
+    joints = result.joints
     lines = []
-    if result.payload_half_width_kg is not None:
-        lines.append(_payload_line(result.payload_kg, result.payload_half_width_kg))
-    for why in dict.fromkeys(joint.reason for joint in result.joints if joint.reason):
-        names = ", ".join(joint.joint for joint in result.joints if joint.reason == why)
+    half_width_kg = result.payload_half_width_kg
+    if half_width_kg is not None and result.payload_kg is None:
+        lines.append(
+            f"the poses do not tell the payload: its interval is ± {half_width_kg:.3g} kg wide"
+        )
+    elif half_width_kg is not None:
+        lines.append(f"payload {result.payload_kg:.3f} ± {half_width_kg:.3f} kg")
+    for why in dict.fromkeys(joint.reason for joint in joints if joint.reason):
+        names = ", ".join(joint.joint for joint in joints if joint.reason == why)
         lines.append(f"not told apart to {100 * result.within:g} %: {names}; {why}")
-    if negative := [joint.joint for joint in result.joints if joint.is_negative]:
+    if negative := [joint.joint for joint in joints if joint.is_negative]:
         lines.append(f"{', '.join(negative)}: {NEGATIVE}")
-    lines += _written_lines(result.joints)
+    for source, text in _WRITTEN.items():
+        own = [joint for joint in joints if joint.source == source]
+        names = ", ".join(
+            joint.joint
+            if source == "rigid"
+            else f"{joint.joint} {joint.stiffness_nm_per_rad:.4g} N·m/rad"
+            for joint in own
+        )
+        if own:
+            lines.append(text.format(names))
     usual = USUAL_NOISE[result.measurement]
     if result.residual_spread > FAR_BEYOND * usual:
         lines.append(
@@ -219,66 +228,32 @@ def remarks(result: ArmIdentification) -> list[str]:
             " friction, and errors of the model"
         )
     if result.outlying_poses:
-        lines.append(
-            f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check"
-            " them"
-        )
+        poses = ", ".join(map(str, result.outlying_poses))
+        lines.append(f"poses that do not fit the others: {poses}; check them")
     if result.held_joints:
-        lines.append(
-            "not in the log, and taken as held where the model has them:"
-            f" {', '.join(result.held_joints)}"
-        )
-    if any(joint.reason for joint in result.joints) and result.joints[0].planned_half_width is None:
+        held = ", ".join(result.held_joints)
+        lines.append(f"not in the log, and taken as held where the model has them: {held}")
+    unknown = [joint for joint in joints if joint.reason]
+    if unknown and joints[0].planned_half_width is None:
         lines.append("--plan 20 proposes poses that tell more")
-    return lines + _beyond_any_plan(result.joints)
-
-
-def _payload_line(mass_kg: float | None, half_width_kg: float) -> str:
-    """The payload, or why there is none."""
-    if mass_kg is None:
-        return f"the poses do not tell the payload: its interval is ± {half_width_kg:.3g} kg wide"
-    return f"payload {mass_kg:.3f} ± {half_width_kg:.3f} kg"
-
-
-def _written_lines(joints: Sequence[JointStiffness]) -> list[str]:
-    """Values in `joints.yaml` of joints whose interval reaches to rigid."""
-    says: dict[Source, str] = {
-        "no upper end": (
-            "joints.yaml has the estimate, {}, although the interval reaches to rigid; --assume"
-            " changes it"
-        ),
-        "rigid": "joints.yaml has {} as rigid (.inf); --assume changes it",
-        "assumed": "joints.yaml has the assumed K for {}",
-    }
-    lines = []
-    for source, text in says.items():
-        own = [joint for joint in joints if joint.source == source]
-        names = ", ".join(
-            (
-                joint.joint
-                if source == "rigid"
-                else f"{joint.joint} {joint.stiffness_nm_per_rad:.4g} N·m/rad"
-            )
-            for joint in own
+    helpless = [one.joint for one in unknown if (one.planned_half_width or 0.0) > 1.0]
+    if helpless:
+        lines.append(
+            f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the"
+            " measurement must show it; tilt the base, hang on a weight, or measure it by hand"
         )
-        if own:
-            lines.append(text.format(names))
     return lines
 
 
-def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
-    """Joints for which no proposed pose helps."""
-    helpless = [
-        j.joint
-        for j in joints
-        if j.planned_half_width is not None and j.reason and j.planned_half_width > 1.0
-    ]
-    if not helpless:
-        return []
-    return [
-        f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the"
-        " measurement must show it; tilt the base, hang on a weight, or measure it by hand"
-    ]
+_WRITTEN: dict[Source, str] = {
+    "no upper end": (
+        "joints.yaml has the estimate, {}, although the interval reaches to rigid; --assume"
+        " changes it"
+    ),
+    "rigid": "joints.yaml has {} as rigid (.inf); --assume changes it",
+    "assumed": "joints.yaml has the assumed K for {}",
+}
+"""Remarks on joints whose interval reaches to rigid."""
 
 
 def _candidates(setting: _Setting, console: Console) -> PoseLog:
@@ -323,14 +298,13 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
         )
     setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
     if options.log is not None:
-        require_poses(setting.model())
+        require_poses(setting.model(log))
     return setting
 
 
 def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
-    low, high = (
-        model.joint(joint).range if model.jnt_limited[model.joint(joint).id] else (-np.inf, np.inf)
-    )
+    hinge = model.joint(joint)
+    low, high = hinge.range if model.jnt_limited[hinge.id] else (-np.inf, np.inf)
     return float(low), float(high)
 
 
@@ -352,23 +326,15 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
-    half = (
-        1.96
-        * np.sqrt(np.diag(np.linalg.inv(plan.information))[own])
-        * model.scale[own]
-        / start[own]
-    )
-    rows = [
-        (joint, _percent(float(width))) for joint, width in zip(setting.elastic, half, strict=True)
-    ]
-    console.print(
-        make_table(f"{len(plan.theta)} proposed poses", ["joint", "expected ± of K"], rows)
-    )
+    spread = np.sqrt(np.diag(np.linalg.inv(plan.information))[own])
+    half = 1.96 * spread * model.scale[own] / start[own]
+    rows = [(j, _percent(float(width))) for j, width in zip(setting.elastic, half, strict=True)]
+    head = ["joint", "expected ± of K"]
+    console.print(make_table(f"{len(plan.theta)} proposed poses", head, rows))
     console.print(
         f"expected for noise of {in_unit(noise, setting.log.kind)} and"
         f" {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of deflection under the largest gravity torque of"
-        " each joint; half the deflection doubles it",
-        highlight=False,
+        " each joint; half the deflection doubles it"
     )
     console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}")
 
@@ -376,26 +342,23 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
 def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
     columns = {f"theta.{joint}": plan.theta[:, i] for i, joint in enumerate(arm.joints)}
     if plan.direction is not None:
-        columns |= {
-            f"direction.{joint}": plan.direction[:, i] for i, joint in enumerate(arm.joints)
-        }
+        for i, joint in enumerate(arm.joints):
+            columns[f"direction.{joint}"] = plan.direction[:, i]
     return write_poses(path, columns)
 
 
-def _stiffness_cells(joint: JointStiffness) -> list[str]:
-    low = joint.stiffness_low_nm_per_rad
-    high = joint.stiffness_high_nm_per_rad
-    if low is None or high is None:
-        return ["–", "–", _percent(joint.half_width)]
-    return [
-        f"{joint.stiffness_nm_per_rad:.4g}",
-        f"{low:.4g} to {high:.4g}",
-        _percent(joint.half_width),
-    ]
+def _has_interval(joint: JointStiffness) -> bool:
+    return None not in (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
 
 
-def _number(value: float | None, scale: float = 1.0) -> str:
-    return "–" if value is None else f"{scale * value:.2f}"
+def _interval(joint: JointStiffness) -> str:
+    if not _has_interval(joint):
+        return "–"
+    return f"{joint.stiffness_low_nm_per_rad:.4g} to {joint.stiffness_high_nm_per_rad:.4g}"
+
+
+def _number(value: float | None, form: str = ".2f", is_known: bool = True) -> str:
+    return "–" if value is None or not is_known else format(value, form)
 
 
 def _percent(half: float | None) -> str:

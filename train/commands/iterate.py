@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 from pydantic import model_validator
 from rich.console import Console
 from rich.table import Table
@@ -143,48 +143,29 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
 
 def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
     """The judged metrics and the failures of every trial, the mean over the robots that did not
-    fail.
+    fail; nan where all did.
     """
     title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
     head = ["trial", *(column.label for column in columns), condition.environment.failures]
     rows = []
     for trial in trials:
-        values = [
-            f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}"
-            for column in columns
-        ]
-        rows.append(
-            [str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"]
-        )
+        survived = pd.DataFrame(trial.metrics)[~trial.failed]
+        means = [column.scale * survived[column.metric].mean() for column in columns]
+        scores = [f"{m:.{column.decimals}f}" for m, column in zip(means, columns, strict=True)]
+        failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
+        rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)
-
-
-def trial_mean(trial: Trial, metric: str) -> float:
-    """A metric of a trial, the mean over the robots that did not fail; nan where all did."""
-    found = [
-        metrics[metric]
-        for metrics, failed in zip(trial.metrics, trial.failed, strict=True)
-        if not failed
-    ]
-    return float(np.mean(found)) if found else float("nan")
 
 
 def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
     """One row per robot and trial: what the sensors showed, and the metrics."""
-    rows = [
-        {
-            "trial": trial.number,
-            "seed": seed + robot,
-            "failed": bool(trial.failed[robot]),
-            **{
-                f"measured_{name}": rms
-                for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True)
-            },
-            **metrics,
-        }
-        for trial in trials
-        for robot, metrics in enumerate(trial.metrics)
-    ]
+    rows = []
+    for trial in trials:
+        for robot, metrics in enumerate(trial.metrics):
+            row = {"trial": trial.number, "seed": seed + robot, "failed": bool(trial.failed[robot])}
+            for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True):
+                row[f"measured_{name}"] = rms
+            rows.append({**row, **metrics})
     return write_records(rows, path)
 
 

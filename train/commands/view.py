@@ -46,6 +46,7 @@ _PAUSE_S = 0.01
 _SHORT = "/tmp"
 """Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
+_FACTOR = "deviations drawn x"
 _PLACE = (16.0, 40.0)
 _SIZE = (400.0, 130.0)
 """Of the window of sliders [pixels]."""
@@ -117,9 +118,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
                 f"{type(picture).__name__} has no sides: see HasSides in"
                 " elastic_env.rendering.side_by_side"
             )
-        for step, now in episode(
-            env, make_policy(condition.policy, env), condition, steps, console
-        ):
+        policy = make_policy(condition.policy, env)
+        for step, now in episode(env, policy, condition, steps, console):
             if step % every == 0:
                 times_s.append(float(now["time_s"]))
                 frames.append(picture.sides(now))
@@ -142,14 +142,12 @@ class _Poses(plugin.SimPlugin):
 
     @messages.handler
     def _on_step(self, event: messages.StepEvent) -> None:
-        if event.model is not self._scene.model:
-            time.sleep(_PAUSE_S)
-            return
-        self._playback.tick()
-        event.data.time = self._playback.time_s
-        self._scene.pose(
-            event.data, self._playback.recording.at(self._playback.time_s), self._playback.factor
-        )
+        playback = self._playback
+        if event.model is self._scene.model:
+            playback.tick()
+            event.data.time = playback.time_s
+            frame = playback.recording.at(playback.time_s)
+            self._scene.pose(event.data, frame, playback.factor)
         time.sleep(_PAUSE_S)
 
 
@@ -165,12 +163,9 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.Once)
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
-            _, play.factor = imgui.SliderFloat(
-                "deviations drawn x", play.factor, 0.0, LARGEST_FACTOR
-            )
-            _, play.time_s = imgui.SliderFloat(
-                "time [s]", play.time_s, 0.0, play.recording.times_s[-1]
-            )
+            end_s = play.recording.times_s[-1]
+            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, LARGEST_FACTOR)
+            _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, end_s)
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
 
@@ -187,10 +182,8 @@ class _PrivateViewer(web_viewer.WebViewer):
 
     def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
         self._listener = listener
-        config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=_free_port())
-        with contextlib.redirect_stdout(
-            io.StringIO()
-        ):  # the address that it prints is not the page's
+        config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address that is not ours
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
@@ -201,11 +194,6 @@ class _PrivateViewer(web_viewer.WebViewer):
     def get_drop_file(self) -> str:
         """No file is taken from the page."""
         return ""
-
-
-def _free_port() -> int:
-    with socket.create_server(("", 0)) as free:
-        return free.getsockname()[1]
 
 
 @dataclass(frozen=True)
@@ -239,12 +227,10 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
     with (
         contextlib.closing(browsers),
         tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder,
+        _launch(recording, f"{folder}/viewer") as handle,
+        contextlib.closing(Proxy(browsers, f"{folder}/viewer", access)),
     ):
-        place = f"{folder}/viewer"
-        with _launch(recording, place) as handle:
-            proxy = Proxy(browsers, place, access)
-            with contextlib.closing(proxy):
-                yield Page(handle, access)
+        yield Page(handle, access)
 
 
 def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
@@ -317,9 +303,6 @@ class View(WatchedEpisode):
 
 def _open_tab(address: str) -> None:
     """Open a tab of the browser, where there is a display."""
-    if (
-        not sys.platform.startswith("linux")
-        or os.environ.get("DISPLAY")
-        or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if has_display or not sys.platform.startswith("linux"):
         threading.Thread(target=webbrowser.open, args=(address, 2), daemon=True).start()

@@ -22,7 +22,7 @@ from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
 from train.runs.user_code import code_refused, require_no_code
-from train.workers.calls import Outcome, Tally, Watch, run_calls
+from train.workers.calls import Outcome, Watch, run_calls
 from train.workers.executors import Executors
 
 ONE_BY_ONE = Executors(jobs=1)
@@ -170,15 +170,10 @@ def _train_beside(
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
     """
     done = [0] * len(calls)
-    note = ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
-        show(number, done[number], note)
-
-    def tallied(tally: Tally) -> None:
-        nonlocal note
-        note = tally.in_words("seeds")
+        show(number, done[number], watch.tally.in_words("seeds"))
 
     def moved(number: int) -> None:
         console.print(
@@ -187,7 +182,7 @@ def _train_beside(
 
     threads = executors.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
-    watch = Watch(reported=report, tallied=tallied, moved=moved)
+    watch = Watch(reported=report, moved=moved)
     with executors.open(len(given), calls[0].run.folder) as pool:
         outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
     _raise_first(calls, outcomes)

@@ -4,6 +4,7 @@ import traceback
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -65,6 +66,13 @@ def make_table(
     for row in rows:
         table.add_row(*map(escape, row))
     return table
+
+
+def print_files(folder: Path, files: Iterable[Path], console: Console) -> None:
+    """Say what was written."""
+    console.print(f"Results in {folder}:")
+    for path in files:
+        console.print(f"  {path}")
 
 
 def traceback_of(error: BaseException) -> str:

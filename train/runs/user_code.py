@@ -78,9 +78,9 @@ def named_object(name: str) -> Any:
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
         own = [
-            f.__name__
-            for f in vars(module).values()
-            if inspect.isfunction(f) and f.__module__ == module.__name__
+            name
+            for name, found in inspect.getmembers(module, inspect.isfunction)
+            if found.__module__ == module.__name__
         ]
         raise ConfigurationError(
             f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"

@@ -215,7 +215,7 @@ class ForeignLoop(Contender):
 
         subprocesses = partial(SubprocVecEnv, start_method="spawn")
         makers = (AsyncVectorEnv, subprocesses, SyncVectorEnv, DummyVecEnv)
-        kinds = dict(zip((*IN_PROCESSES, *IN_THIS_PROCESS), makers, strict=True))
+        kinds: dict[str, Any] = dict(zip((*IN_PROCESSES, *IN_THIS_PROCESS), makers, strict=True))
         self.title = kind
         self.num_envs = num_envs
         self.env = kinds[kind]([partial(_make, env)] * num_envs)

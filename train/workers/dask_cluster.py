@@ -69,11 +69,8 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    public = [
-        str(place[0])
-        for *_, place in found
-        if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_global
-    ]
+    addresses = [str(place[0]) for *_, place in found]
+    public = [one for one in addresses if ipaddress.ip_address(one.partition("%")[0]).is_global]
     if public:
         warnings.warn(
             f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"

@@ -51,9 +51,9 @@ class Executors:
         """Threads for each of some calls: an equal share of the cores of this machine; elsewhere
         one.
         """
-        return (
-            max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls)) if self.is_local else 1
-        )
+        if not self.is_local:
+            return 1
+        return max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls))
 
     def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.
