@@ -43,7 +43,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.runs.folders import free_folder, run_folder
 from train.runs.progress import show_progress
-from train.runs.warned import each_once, said_so_far
+from train.runs.warned import shown_warnings, warn_once
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
@@ -1160,12 +1160,12 @@ def test_a_warning_is_shown_once() -> None:
     """Catches a line of warning for every cell and every process of a comparison."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
-        with each_once(["said before"]):
+        with warn_once(["said before"]):
             for text in ("said before", "3 meshes are missing", "3 meshes are missing", "another"):
                 warnings.warn(text, stacklevel=1)
-            with each_once():
+            with warn_once():
                 warnings.warn("another", stacklevel=1)
-            assert said_so_far() == {"said before", "3 meshes are missing", "another"}
+            assert shown_warnings() == {"said before", "3 meshes are missing", "another"}
         warnings.warn("another", stacklevel=1)
     assert [str(warning.message) for warning in shown] == [
         "3 meshes are missing",

@@ -30,8 +30,7 @@ _LARGEST_SOURCE = 10_000_000
 
 
 def cell_key(condition: Condition) -> str:
-    """SHA-256 digest of a condition, of the files that it names, and of the versions of the
-    physics.
+    """SHA-256 digest of a condition, of the files that it names, and of the physics' versions.
 
     Files are weights of residuals, tables of offsets and stiffness, robots with their models and
     joints, and Python files of the user's, with those of their folder that they import. They are
@@ -46,9 +45,7 @@ def cell_key(condition: Condition) -> str:
 
 
 def named_files(text: str) -> list[Path]:
-    """Files that a text of a configuration stands for: residual:FOLDER, FILE.py:NAME,
-    module:NAME, or a path.
-    """
+    """Files that a text stands for: residual:FOLDER, FILE.py:NAME, module:NAME, or a path."""
     if is_saved(text):
         folder = located(Path(text.partition(":")[2]))
         return [folder / name for name in _SAVED if _is_file(folder / name)]
@@ -99,9 +96,7 @@ def _files_of(module: Path) -> list[Path]:
 
 
 def _with_imports(file: Path) -> list[Path]:
-    """A Python file and those that it imports from its own folder, and these from there, in
-    order of their names.
-    """
+    """A Python file and those that it imports from its folder, directly or not, sorted."""
     seen = set[Path]()
     waiting = [file]
     while waiting:
@@ -115,9 +110,7 @@ def _with_imports(file: Path) -> list[Path]:
 
 
 def _imports(file: Path) -> Iterator[str]:
-    """Modules that a file imports, by full name; none of a file that is no Python, which cannot
-    be imported itself.
-    """
+    """Modules that a file imports, by full name; none of a file that is no Python."""
     try:
         tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))
     except (SyntaxError, ValueError, RecursionError, MemoryError):

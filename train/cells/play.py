@@ -1,6 +1,4 @@
-"""The cells of a comparison, played side by side: what is kept, and what one that fails leaves
-of the others.
-"""
+"""The cells of a comparison, played side by side; one that fails leaves the others."""
 
 import os
 import tempfile
@@ -18,7 +16,7 @@ from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_
 from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
-from train.runs.warned import each_once, said_so_far
+from train.runs.warned import shown_warnings, warn_once
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -138,9 +136,7 @@ class _Playing:
         self._show: Show = lambda *_: None
 
     def results(self) -> list[Outcome | None]:
-        """Outcomes in the order of the conditions; None for those that Ctrl-C kept from
-        starting.
-        """
+        """Outcomes in the order of the conditions; None for those that Ctrl-C prevented."""
         unit = "control steps"
         totals = {unit: sum(self._steps)}
         with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
@@ -154,7 +150,7 @@ class _Playing:
 
     def _play_beside(self) -> None:
         watch = Watch(self._report, self._end, self._say_moved)
-        given = [(cells, said_so_far()) for cells in self._cells]
+        given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
             with self._place.open(len(given), folder) as pool:
@@ -188,8 +184,7 @@ class _Playing:
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
-    """Conditions, by their numbers, that are played in one vector environment: many worlds cost
-    less each.
+    """Numbers of conditions that share a vector environment: many worlds cost less each.
 
     Args:
         conditions: What to play.
@@ -254,7 +249,7 @@ def _evaluate_beside(
     conditions: Sequence[Condition], said: frozenset[str], report: Callable[[int], None]
 ) -> list[Outcome]:
     """Evaluations in a process of their own, without the warnings that were shown before."""
-    with each_once(said):
+    with warn_once(said):
         return _evaluate(conditions, report)
 
 

@@ -1,5 +1,4 @@
-"""Finished cells on the disk: a file each under the key of its content, written whole or not at
-all.
+"""Finished cells on the disk: a file each under the key of its content, written atomically.
 
 A file holds its key and a digest of the rest, and is checked against the condition before anything
 of it is used.
@@ -163,9 +162,7 @@ def _part(found: Arrays, name: str) -> Arrays:
 
 
 def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
-    """What keeps records from being those of a condition's episodes: all of them, in order, with
-    finite scores where they did not fail.
-    """
+    """Yield why records are not those of a condition: all, in order, with finite scores."""
     condition = evaluation.condition
     episodes = evaluation.episodes
     if not isinstance(episodes, list) or not all(isinstance(one, dict) for one in episodes):
@@ -197,7 +194,7 @@ def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
 
 
 def _problems_of_arrays(evaluation: Evaluation) -> Iterator[str]:
-    """What keeps time series and static points from being the condition's."""
+    """Yield why time series and static points are not those of the condition."""
     trace = evaluation.trace
     rest = evaluation.rest_references
     traced = list(evaluation.condition.environment.traced)

@@ -35,7 +35,7 @@ from train.runs.folders import run_folder
 from train.runs.kinds import is_a
 
 USUAL = Path("configs/bench.yaml")
-"""Where a configuration is looked for; in a checkout it is that of the package."""
+"""The default configuration; in a checkout it is that of the package."""
 _SHIPPED = Path(__file__).with_name("bench.yaml")
 
 
@@ -138,8 +138,9 @@ def configuration(path: Path, update: bool = False) -> Path:
 
 
 def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[dict[str, Any]]:
-    """Figures of a rollout: what was measured, None where the episode failed or does not have it;
-    what was accepted; what it may be at most; and what is wrong with it, in words.
+    """Figures of a rollout: measured, accepted and largest value, and what is wrong in words.
+
+    `measured` is None where the episode failed or does not have the figure.
     """
     (episode,) = evaluation.episodes
     name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"

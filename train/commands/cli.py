@@ -71,9 +71,7 @@ _SAME_WISH_S = 2.0
 
 @contextlib.contextmanager
 def _ended_by(*numbers: int) -> Iterator[None]:
-    """Signals that would end this program end what is within by an exception; ignored ones do
-    not.
-    """
+    """Turn signals that would end this program into an exception within; ignored ones stay so."""
     asked_s = -math.inf
 
     def end(number: int, _: Any) -> None:
@@ -136,9 +134,7 @@ _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 
 
 def _parse_overview(arguments: list[str]) -> Any:
-    """Print the help of all commands, or refuse a command that does not exist; the commands need
-    not be loaded.
-    """
+    """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
     members: Any = []
     for name in COMMANDS:
         kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})

@@ -43,8 +43,8 @@ from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.console import print_files
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
-from train.runs.user_code import code_refused, require_no_code
-from train.runs.warned import each_once
+from train.runs.user_code import refuse_code, require_no_code
+from train.runs.warned import warn_once
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -133,7 +133,7 @@ class CompareConfig(Model):
         return self
 
     def _problems(self) -> Iterator[str]:
-        """What is wrong with single parts, or between them."""
+        """Yield what is wrong with single parts, or between them."""
         titles = [policy.title for policy in self.policies]
         references = self._reference_names()
         if repeated := _repeated(titles):
@@ -172,7 +172,7 @@ class CompareConfig(Model):
             yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"
 
     def _problems_of_map(self) -> Iterator[str]:
-        """A map that its environment does not have, or that something else contradicts."""
+        """Yield how environment or other parts contradict the map."""
         if self.map is None:
             return
         self.map.require(environment(self.env))
@@ -243,9 +243,7 @@ class CompareConfig(Model):
         return [label or known.label(reference) for label, reference in labelled]
 
     def _reference_labels(self) -> list[str | None]:
-        """Names that tell references of one kind apart by their parameters; None where the kind
-        is enough.
-        """
+        """Names that tell references of one kind apart; None where the kind is enough."""
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
         return [
@@ -265,7 +263,7 @@ class Comparison:
     files: list[Path]
 
 
-@each_once()
+@warn_once()
 def compare(
     config: CompareConfig,
     console: Console,
@@ -349,7 +347,7 @@ def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
     file = require_run(folder, "run", "compare wrote")
     if trust_code:
         return load_yaml(file, CompareConfig)
-    with code_refused(file):
+    with refuse_code(file):
         config = load_yaml(file, CompareConfig)
     policies = [policy.name for policy in config.policies if not is_saved(policy.name)]
     require_no_code(file, [config.env, *policies])
@@ -410,8 +408,9 @@ def try_out(conditions: Sequence[Condition]) -> None:
 
 
 def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
-    """Conditions with an environment, or a policy at a motion, that no earlier one has: a sum of
-    them, no product.
+    """Conditions with an environment, or a policy at a motion, that no earlier one has.
+
+    There are as many as the sum of both, not their product.
     """
     seen = set[str]()
     for condition in conditions:

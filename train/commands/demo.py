@@ -1,6 +1,4 @@
-"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10)
-in short.
-"""
+"""`elastic demo`: the paper's experiments (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -13,8 +13,9 @@ from train.runs.folders import own_folder
 
 
 class Export(Model):
-    """Turn a model that Stable-Baselines3 saved into a residual folder, which plays without torch
-    and runs no code.
+    """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
+
+    Loading that folder runs no code.
 
     Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl
         --trust-pickle

@@ -70,8 +70,9 @@ class Scan(Model):
 
 
 class Check(Model):
-    """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there
-    is anything to do.
+    """Look at port, servos and IMU before anything moves, and say what to do.
+
+    The exit code is 3 if there is anything to do.
 
     Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
     """
@@ -127,9 +128,7 @@ class Run(Model):
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Play one episode, show it as it goes, and keep every step in log.csv, also of one that
-        is cut short.
-        """
+        """Play one episode and show it; log.csv keeps every step, also of one that is cut short."""
         if not (arguments := self.on.arguments):
             raise ConfigurationError(
                 "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
@@ -165,9 +164,7 @@ _SHOWN = (
 
 
 class _Log:
-    """The rows of log.csv, and a line on the console once a second, up to which all rows are on
-    the disk.
-    """
+    """The rows of log.csv, and once a second a line on the console and all rows on the disk."""
 
     def __init__(self, file: TextIO, console: Console) -> None:
         self.num_rows = 0
@@ -209,8 +206,7 @@ def _open_log(path: Path, console: Console) -> Iterator[_Log]:
 
 
 class Emulate(Model):
-    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without
-    hardware.
+    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, to try all without hardware.
 
     Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
     emulate --lost 0.01

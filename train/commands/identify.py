@@ -73,8 +73,7 @@ class Identify(Model):
         return self
 
     def run(self, console: Console) -> list[Identification] | ArmIdentification | None:
-        """Identify the testbed, simulated or real, or an arm; write `identification.json` and the
-        figure.
+        """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:
             One result per repetition; of an arm its result, or None for a plan without a log.

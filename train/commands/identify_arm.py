@@ -1,6 +1,4 @@
-"""`elastic identify --robot`: stiffness of an arm from a log of static poses, and poses that
-would tell more.
-"""
+"""`elastic identify --robot`: stiffness of an arm from a log of static poses, and a plan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,8 +114,7 @@ class _Setting:
 def run_arm_identification(
     options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
 ) -> ArmIdentification | None:
-    """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result;
-    or plan.
+    """Identify an arm, write result, `joints.yaml` and figure, and print the result; or plan poses.
 
     Args:
         options: What to do.
@@ -193,9 +190,7 @@ def result_table(result: ArmIdentification) -> Table:
 
 
 def remarks(result: ArmIdentification) -> list[str]:
-    """Remarks beside the table: the payload, joints that are not told apart, and poses that do
-    not fit.
-    """
+    """Remarks beside the table: payload, joints that are not told apart, poses that do not fit."""
     joints = result.joints
     lines = []
     half_width_kg = result.payload_half_width_kg
@@ -268,9 +263,7 @@ def _candidates(setting: _Setting, console: Console) -> PoseLog:
 
 
 def shaped_model(path: str) -> mujoco.MjModel:
-    """The model with its collision shapes; that of `compiled_model` where MuJoCo cannot read the
-    shapes.
-    """
+    """The model with its collision shapes, or without them where MuJoCo cannot read them."""
     plain = compiled_model(path)
     try:
         shaped = from_mujoco(

@@ -1,6 +1,4 @@
-"""`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as
-a policy.
-"""
+"""`elastic iterate`: learn offsets from trial to trial, and write them as a policy."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -35,8 +33,9 @@ _MOST_ROBOTS = 64
 
 
 class Iterate(Model):
-    """Learn on the robot itself, from walk to walk: iterative learning control, without any
-    training in simulation.
+    """Learn on the robot itself, from walk to walk: iterative learning control.
+
+    Nothing is trained in simulation.
 
     After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on
     the testbed the IMU of the link, have shown at the same time. Prints a table trial by trial;
@@ -95,8 +94,7 @@ class Iterate(Model):
         )
 
     def run(self, console: Console) -> list[Trial]:
-        """Learn, play a last trial with what was learned, write the run, and print a table of the
-        trials.
+        """Learn, play a last trial with what was learned, write the run, and print the trials.
 
         Returns:
             The trials; the first has no offsets, the last has what was learned.
@@ -142,9 +140,7 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
 
 
 def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
-    """The judged metrics and the failures of every trial, the mean over the robots that did not
-    fail; nan where all did.
-    """
+    """Judged metrics of every trial, means over the robots that did not fail, and failures."""
     title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
     head = ["trial", *(column.label for column in columns), condition.environment.failures]
     rows = []
@@ -170,9 +166,7 @@ def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, 
 
 
 def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-    """Write the offsets of every robot: to the folder itself for one, else to folders by their
-    seeds.
-    """
+    """Write the offsets of every robot: to the folder itself for one, else to folders by seed."""
     model = env.unwrapped.assumed_model
     base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
     folders = []

@@ -1,6 +1,4 @@
-"""Options that several commands of `elastic` share, and how the text of an option becomes a
-value.
-"""
+"""Options that several commands share, and how the text of an option becomes a value."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -72,9 +70,7 @@ PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 
 
 class Mounting(HardwareSettings):
-    """Content of the file of `--mounting`: wiring and mounting of the testbed, and the pendulum
-    that hangs there.
-    """
+    """Content of the file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
 
     pendulum: Pendulum = Pendulum()
 
@@ -142,8 +138,7 @@ class OnHardware(Model):
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
-        """The named scenario, or the default; on hardware, which has none, the word for it in
-        tables.
+        """The named scenario, or the default; on hardware the word for it in tables.
 
         Raises:
             ConfigurationError: A scenario is named for hardware.
@@ -174,9 +169,7 @@ def option_name(path: ParameterPath) -> str:
 
 @contextmanager
 def name_options() -> Iterator[None]:
-    """Let errors of a configuration that is made from options name the options in place of its
-    parameters.
-    """
+    """Let errors of a configuration that is made from options name the options."""
     try:
         yield
     except ModelError as error:

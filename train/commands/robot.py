@@ -1,5 +1,4 @@
-"""`elastic robot`: a robot from its model, made elastic, played with and without compensation, in
-one call.
+"""`elastic robot`: a robot from its model, made elastic, played with and without compensation.
 
 Its folder holds the robot's file, a comparison with report, a picture, and the two tables that it
 prints.
@@ -55,8 +54,7 @@ _POSES_SHOWN = 2
 
 
 class Robot(Model):
-    """Try a robot of your own: make its joints elastic, play it with and without compensation, and
-    say what it gains.
+    """Try a robot of your own: make its joints elastic and say what compensation gains.
 
     Plays static poses and a motion with the policies uncompensated, input and dynamic, in the
     scenario nominal: with friction and encoders as the joints file has them. Prints the error of
@@ -237,8 +235,7 @@ def _settings(joint: ElasticJoint) -> dict[str, Any]:
 
 
 def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
-    """Write a robot's file and its joints into a folder; the model stays where it is, unless it is
-    text.
+    """Write a robot's file and its joints into a folder; the model stays, unless it is text.
 
     Args:
         arguments: Of `elastic_env/Robot-v0`.
@@ -263,9 +260,7 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
 
 
 def _placement(evaluation: Evaluation) -> dict[str, Any]:
-    """How far the end effector is from where it should be, rms over what is scored and at most
-    [m]; nan where the episode failed.
-    """
+    """Distance of the end effector from its target, rms and peak [m]; nan for a failed episode."""
 
     def only(metric: str) -> float:
         return next(map(float, evaluation.values(metric)), float("nan"))
@@ -335,8 +330,7 @@ def _rms(values: Array) -> Array:
 
 
 def picture(config: RobotConfig, plant: JointPlant) -> Image:
-    """The poses with the largest sag, in rows: left without, right with the command of
-    `PositionCompensator`.
+    """The poses with the largest sag, in rows: left without compensation, right with it.
 
     It is in closed form, as `joint_shares`. Deviations from the translucent reference are enlarged.
 

@@ -1,6 +1,4 @@
-"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO, in
-one run.
-"""
+"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO."""
 
 import cProfile
 import importlib
@@ -200,8 +198,9 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
 
 
 def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
-    """Contenders, and for each the number of the one that it is compared with: beside it in turn,
-    where there is one for it alone.
+    """Contenders, and for each the number of the one that it is compared with.
+
+    The two are beside each other in turn, where that one is for it alone.
     """
     env = config.env
     policy = config.looped_policy

@@ -1,6 +1,4 @@
-"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side
-by side.
-"""
+"""`elastic view`: reference, motor side and link side, side by side in MuJoCo's web viewer."""
 
 import bisect
 import contextlib
@@ -44,7 +42,7 @@ LARGEST_FACTOR = 20.0
 _FRAMES_PER_S = 50
 _PAUSE_S = 0.01
 _SHORT = "/tmp"
-"""Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
+"""Folder of a socket: its path has at most about 100 characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
 _FACTOR = "deviations drawn x"
 _PLACE = (16.0, 40.0)
@@ -73,9 +71,7 @@ class Recording:
 
 @dataclass
 class Playback:
-    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether
-    time stands still.
-    """
+    """State of the page, which sliders set and the drawing reads: time [s], factor, pause."""
 
     recording: Recording
     time_s: float = 0.0
@@ -135,9 +131,7 @@ class _Poses(plugin.SimPlugin):
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
-        """Keep the three robots: no file of a page, nor its button to reload, puts another model
-        in their place.
-        """
+        """Keep the three robots: no file of a page, nor its button to reload, replaces them."""
         return True
 
     @messages.handler
@@ -171,8 +165,7 @@ class _Sliders(plugin.ViewerPlugin):
 
 
 class _PrivateViewer(web_viewer.WebViewer):
-    """MuJoCo's web viewer at a socket of ours, in place of a port that everybody reaches; it takes
-    no models.
+    """MuJoCo's web viewer at a socket of ours, in place of a public port; it takes no models.
 
     Args:
         endpoint: To the side that poses the robots.
@@ -262,8 +255,7 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
 
 
 class View(WatchedEpisode):
-    """Look at one episode in the browser: reference, motor side and link side of the robot, side by
-    side.
+    """Look at one episode in the browser: reference, motor side and link side, side by side.
 
     The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C.
     Sliders set the time, and the factor by which deviations from the reference are enlarged. The

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 
 LOOPBACK = "127.0.0.1"
-"""Where a page listens unless somebody asks for another address."""
+"""The address of a page unless somebody asks for another one."""
 
 _FIRST_PORT = 8080
 _PORTS_TRIED = 20

@@ -21,7 +21,7 @@ from train.learn.trainer import Trainer
 from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
-from train.runs.user_code import code_refused, require_no_code
+from train.runs.user_code import refuse_code, require_no_code
 from train.workers.calls import Outcome, Watch, run_calls
 from train.workers.executors import Executors
 
@@ -114,7 +114,7 @@ def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     file = require_run(folder, "training run", "train printed")
     if trust_code:
         return load_yaml(file, TrainConfig)
-    with code_refused(file):
+    with refuse_code(file):
         config = load_yaml(file, TrainConfig)
     require_no_code(file, [config.algorithm, config.env, config.base])
     return config
@@ -175,14 +175,14 @@ def _train_beside(
         done[number] = max(done[number], decisions)
         show(number, done[number], watch.tally.in_words("seeds"))
 
-    def moved(number: int) -> None:
+    def say_moved(number: int) -> None:
         console.print(
             f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True
         )
 
     threads = executors.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
-    watch = Watch(reported=report, moved=moved)
+    watch = Watch(reported=report, moved=say_moved)
     with executors.open(len(given), calls[0].run.folder) as pool:
         outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
     _raise_first(calls, outcomes)

@@ -1,6 +1,4 @@
-"""Result folders: never overwritten, each with the configuration, seed, versions and commit that
-made it.
-"""
+"""Result folders: never overwritten, each with configuration, seed, versions and commit."""
 
 import contextlib
 import errno
@@ -29,7 +27,7 @@ from elastic_env.core.files import leads_out, write_whole
 from elastic_env.core.yaml_text import yaml_of
 
 RUNS = Path("runs")
-"""Where results go unless a folder is named."""
+"""Folder of results unless one is named."""
 
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
@@ -42,9 +40,7 @@ _LIBRARIES = ("mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
-    """Write down what the results of a run depend on: its resolved configuration as `config.yaml`;
-    the first seed, versions and commit as `metadata.json`.
-    """
+    """Write configuration (`config.yaml`), first seed, versions and commit (`metadata.json`)."""
     write_whole(folder / CONFIG, yaml_of(configuration))
     write_whole(folder / _METADATA, json.dumps(provenance(seed), indent=2) + "\n")
 
@@ -83,8 +79,7 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:
-    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if
-    taken.
+    """A new folder for results: the one that is named, or runs/<name>, numbered if taken.
 
     It is made in one step, so that of several programs each gets another one.
 
@@ -181,9 +176,7 @@ def _take_lock(lock: TextIO) -> bool:
 
 @contextmanager
 def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
-    """`lock_run` for a part of a run, whose folder is made; it goes again if the work fails
-    without a result.
-    """
+    """`lock_run` for a part of a run, whose folder is made, and removed without a result."""
     folder.mkdir(parents=True, exist_ok=True)
     with lock_run(folder, patience_s), _removed_without_result(folder):
         yield
@@ -191,9 +184,7 @@ def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
 
 @contextmanager
 def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
-    """`free_folder` for the work within; it goes again if that is interrupted or fails without a
-    result.
-    """
+    """`free_folder` for the work within, removed if that fails without a result."""
     folder = free_folder(name, output)
     with _removed_without_result(folder):
         yield folder
@@ -224,9 +215,7 @@ def _removed_without_result(folder: Path) -> Iterator[None]:
 
 
 def _next_free(name: str) -> Path:
-    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one
-    program alone.
-    """
+    """runs/<name>, or the first of its numbers that is free; `mkdir` makes it for one program."""
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
@@ -269,9 +258,7 @@ def installed_version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the source tree, with a + where it has uncommitted changes; None outside a
-    repository.
-    """
+    """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str:

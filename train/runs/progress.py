@@ -35,8 +35,7 @@ running.
 def plain_progress(
     console: Console, least_s: float = 0.0, unit: str = "work"
 ) -> Callable[..., None]:
-    """A function that takes the share of the work that is done, from 0 to 1, and a note, and says
-    each tenth of it in a line.
+    """A function that takes share of the work, 0 to 1, and note, and prints each tenth in a line.
 
     Long work is announced early, with the time that it will take. A line with a note ends with the
     time to go.
@@ -88,8 +87,7 @@ def duration(seconds: float) -> str:
 def show_progress(
     console: Console, totals: Mapping[str, int], transient: bool = False, unit: str = "work"
 ) -> Iterator[Show]:
-    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there
-    is none.
+    """Show the progress of tasks: by a bar each on a terminal, else by a line now and then.
 
     Args:
         console: Where it is shown.
@@ -132,8 +130,7 @@ def show_progress(
 
 @contextmanager
 def say_what_is_compiled(console: Console) -> Iterator[None]:
-    """Say in one line that functions are compiled, when the first one is within; nothing where all
-    are loaded.
+    """Say in one line that functions are compiled, when the first one is; nothing if none is.
 
     Args:
         console: Where it is said.

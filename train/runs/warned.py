@@ -1,6 +1,4 @@
-"""Warnings of long work: each text once, whatever the number of environments and processes that
-give it.
-"""
+"""Warnings of long work: each text once, however many environments and processes give it."""
 
 import warnings
 from collections.abc import Iterable, Iterator
@@ -11,15 +9,13 @@ from typing import Any
 _SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
 
 
-def said_so_far() -> frozenset[str]:
-    """Texts that were shown within `each_once`; processes are told them, so that they do not
-    show them again.
-    """
+def shown_warnings() -> frozenset[str]:
+    """Texts that were shown within `warn_once`, for processes that shall not show them again."""
     return frozenset(_SAID.get() or ())
 
 
 @contextmanager
-def each_once(said: Iterable[str] = ()) -> Iterator[None]:
+def warn_once(said: Iterable[str] = ()) -> Iterator[None]:
     """Show each warning within once.
 
     Args:

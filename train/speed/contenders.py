@@ -1,6 +1,4 @@
-"""Contenders of `elastic speed`: each plays control steps of one environment and says how long
-it took.
-"""
+"""Contenders of `elastic speed`: each plays control steps and measures how long they take."""
 
 import itertools
 import threading
@@ -136,8 +134,7 @@ class ScalarLoop(_OurLoop):
 
 
 class RawWorlds(Contender):
-    """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm
-    in its cache.
+    """`mj_step` and nothing else: threads share the worlds, each with one `MjData` in its cache.
 
     It starts from the states of an environment and plays the servo inputs of its last run: on a
     thread nothing but writing `ctrl` and one call of `mj_step` with all sub-steps of a control
@@ -232,9 +229,7 @@ class ForeignLoop(Contender):
 
 
 class PPOLoop(Contender):
-    """PPO end to end, collecting and learning, of a residual on a base policy: our vector
-    environment, or processes.
-    """
+    """PPO end to end, collecting and learning, of a residual: in our environment, or processes."""
 
     def __init__(
         self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False
@@ -286,9 +281,7 @@ class PPOLoop(Contender):
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
-    """A residual with a network of 64×64 as it is before training, small random weights, around
-    a base policy.
-    """
+    """A residual with an untrained network of 64×64, small random weights, on a base policy."""
     acts_on = DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND
     model = env.unwrapped.assumed_model
     corrected = Corrected(base, model, ResidualSettings(acts_on={acts_on: None}))

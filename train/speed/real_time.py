@@ -1,6 +1,4 @@
-"""A policy against the clock: whether its command is ready within the control period, as on a
-robot.
-"""
+"""A policy against the clock: is its command ready within the control period, as on a robot?"""
 
 import contextlib
 import time
@@ -23,8 +21,7 @@ PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 def play_against_the_clock(
     env_name: str, policy_name: str | None, seconds: float
 ) -> dict[str, Any]:
-    """Record what the policy observes in an episode, then call it with that once in every control
-    period.
+    """Record what a policy observes in an episode, then call it with that at the control rate.
 
     The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells
     whether it has it. The episode begins again, with a policy that remembers nothing, where it is

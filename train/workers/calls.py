@@ -1,5 +1,4 @@
-"""Calls of one function beside each other, by any `concurrent.futures.Executor`: faults, reports
-and Ctrl-C.
+"""Calls beside each other by any `concurrent.futures.Executor`: faults, reports and Ctrl-C.
 
 A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew
 elsewhere.

@@ -58,8 +58,7 @@ def dask_pool(address: str) -> Iterator[Pool]:
 
 
 def warn_of_public(address: str) -> None:
-    """Warn where a scheduler, which runs the code of whoever reaches it, has an address of the
-    Internet.
+    """Warn of a scheduler, which runs the code of whoever reaches it, at a public address.
 
     Args:
         address: HOST:PORT; a name stands for all of its addresses.

@@ -1,6 +1,4 @@
-"""Workers as jobs of Slurm, by submitit: an array of jobs, which needs a folder that all
-machines see.
-"""
+"""Workers as jobs of Slurm, by submitit; they need a folder that all machines see."""
 
 import os
 import queue

@@ -58,9 +58,7 @@ def _library_versions() -> dict[str, str]:
 
 
 def _digest(folders: Sequence[str]) -> str:
-    """SHA-256 digest of modules and tables in some folders, with their paths; its first 16
-    characters.
-    """
+    """The first 16 characters of the SHA-256 digest of modules and tables in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for file in sorted((_ROOT / folder).rglob("*")):
