@@ -41,9 +41,9 @@ from train.commands.compare import CompareConfig
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
+from train.runs.console import shown_warnings, warn_once
 from train.runs.folders import free_folder, run_folder
 from train.runs.progress import show_progress
-from train.runs.warned import shown_warnings, warn_once
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}

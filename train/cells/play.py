@@ -14,9 +14,9 @@ from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
 from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
+from train.runs.console import shown_warnings, warn_once
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
-from train.runs.warned import shown_warnings, warn_once
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -139,11 +139,12 @@ class _Playing:
         """Outcomes in the order of the conditions; None for those that Ctrl-C prevented."""
         unit = "control steps"
         totals = {unit: sum(self._steps)}
-        with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
+        with show_progress(self._console, totals, transient=True, unit=unit) as show:
+            self._show = show
             if len(self._batches) == 1 and self._place.is_local:
                 # a process of its own takes seconds to start
-                cells = _evaluate(self._cells[0], partial(self._report, 0), self._place.jobs)
-                self._end(0, Outcome(cells))
+                report = partial(self._report, 0)
+                self._end(0, Outcome(_evaluate(self._cells[0], report, self._place.jobs)))
             else:
                 self._play_beside()
         return self._outcomes
@@ -157,26 +158,25 @@ class _Playing:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:
+        numbers = self._batches[batch]
         self._played[batch] = played
-        if self._outcomes[self._batches[batch][0]] is None:  # a report may come behind the end
-            self._tally.running.update(self._batches[batch])
+        if self._outcomes[numbers[0]] is None:  # a report may come behind the end
+            self._tally.running.update(numbers)
         self._show(0, sum(self._played), self._tally.in_words("cells"))
 
     def _end(self, batch: int, outcome: Outcome) -> None:
         """Take the outcomes of a batch, or what ended all of it."""
         numbers = self._batches[batch]
-        for number, own in zip(numbers, outcome.value or [outcome] * len(numbers), strict=True):
+        outcomes = outcome.value or [outcome] * len(numbers)
+        for number, own in zip(numbers, outcomes, strict=True):
             self._outcomes[number] = own
             self._tally.end(number, own)
-            if own.error is None and self._store is not None:
-                self._keep(own.value, self._keys[number], self._store)
+            store = self._store
+            if own.error is None and store and not store.keep(own.value, self._keys[number]):
+                name = _name(self._conditions[number])
+                cause = "a file that it names changed while it was played"
+                self._console.print(f"{name} is not kept: {cause}")
         self._report(batch, self._steps[batch])
-
-    def _keep(self, evaluation: Evaluation, key: str, store: Store) -> None:
-        if not store.keep(evaluation, key):
-            name = _name(evaluation.condition)
-            said = f"{name} is not kept: a file that it names changed while it was played"
-            self._console.print(said)
 
     def _say_moved(self, batch: int) -> None:
         for condition in self._cells[batch]:
@@ -215,7 +215,9 @@ def _failure_text(condition: Condition, error: Exception, trace: str) -> tuple[s
     """Text and exit code of a failure; a defect's traceback goes to the terminal."""
     defect = (f"this is a defect: {type(error).__name__}: {error}\n{trace}", DEFECT)
     said, code = explain(error) or defect
-    return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
+    if isinstance(error, PolicyFailedError):  # which names the cell itself
+        return said, code
+    return f"{_name(condition)}: {said}", code
 
 
 def _name(condition: Condition) -> str:

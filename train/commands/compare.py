@@ -40,11 +40,10 @@ from train.report.change_tables import print_changes, write_maps, write_statisti
 from train.report.leaderboard import print_leaderboard, write_leaderboard
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.console import print_files
+from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import refuse_code, require_no_code
-from train.runs.warned import warn_once
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -197,9 +196,7 @@ class CompareConfig(Model):
         entrants = expand(self.policies, with_bases)
         own = self.reference_scenarios
         played = [own.get(name, self.scenarios) for name in self._reference_names()]
-        swept = (
-            len(self.map.coordinates()) if self.map else len(self.sweep.values) if self.sweep else 1
-        )
+        swept = max(len(self._swept(policy)) for policy in self.policies)
         cells = sum(map(len, played)) * len(entrants) * swept
         if cells > _MOST_CELLS:
             raise ConfigurationError(

@@ -116,12 +116,11 @@ _HEAD = ("quantity", "here", "paper")
 
 
 def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
-    low = result.stiffness_low_nm_per_rad
-    high = result.stiffness_high_nm_per_rad
+    interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
         ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
-        ("  95 % interval", f"{low:.1f} to {high:.1f}", "-"),
+        ("  95 % interval", interval, "-"),
         ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),

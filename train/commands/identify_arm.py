@@ -1,8 +1,8 @@
 """`elastic identify --robot`: stiffness of an arm from a log of static poses, and a plan."""
 
-from collections.abc import Sequence
+import fnmatch
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import mujoco
@@ -145,23 +145,23 @@ def run_arm_identification(
         if options.log is None:
             _plan_first(setting, folder, console)
             return None
-        with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(
-                setting.model(setting.log), lambda done: show(0, min(done, USUAL_EVALUATIONS))
-            )
+        work = {"fitting, steps": USUAL_EVALUATIONS}
+        with show_progress(console, work, transient=True) as show:
+            model = setting.model(setting.log)
+            fit = fit_arm(model, lambda done: show(0, min(done, USUAL_EVALUATIONS)))
         plan = None
         if options.plan:
             plan = plan_further(fit, _candidates(setting, console), options.plan)
         information = None if plan is None else plan.information
         result = described(fit, options.within, options.assume, information)
         files = result.save(folder)
-        files.append(draw_arm_identification(fit, result, folder / "identification.png"))
+        picture = folder / "identification.png"
+        files.append(draw_arm_identification(fit, result, picture))
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
     console.print(result_table(result))
-    console.print(
-        "\n".join([summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)])
-    )
+    for line in (summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)):
+        console.print(line)
     return result
 
 
@@ -170,7 +170,7 @@ def result_table(result: ArmIdentification) -> Table:
     joints = result.joints
     columns: dict[str, Sequence[str]] = {
         "joint": [joint.joint for joint in joints],
-        "K": [_number(joint.stiffness_nm_per_rad, ".4g", _has_interval(joint)) for joint in joints],
+        "K": [_number(_stiffness(joint), ".4g") for joint in joints],
         "95 % interval": [_interval(joint) for joint in joints],
         "±": [_percent(joint.half_width) for joint in joints],
     }
@@ -178,9 +178,7 @@ def result_table(result: ArmIdentification) -> Table:
         columns["planned ±"] = [_percent(joint.planned_half_width) for joint in joints]
     if not result.friction_is_noise:
         columns["F [N·m]"] = [_number(joint.friction_nm) for joint in joints]
-    columns["o [mrad]"] = [
-        _number(None if joint.offset_rad is None else 1e3 * joint.offset_rad) for joint in joints
-    ]
+    columns["o [mrad]"] = [_number(joint.offset_rad, ".2f", 1e3) for joint in joints]
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
     rows = zip(*columns.values(), strict=True)
     table = make_table(title, list(columns), rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
@@ -189,22 +187,20 @@ def result_table(result: ArmIdentification) -> Table:
     return table
 
 
-def remarks(result: ArmIdentification) -> list[str]:
+def remarks(result: ArmIdentification) -> Iterator[str]:
     """Remarks beside the table: payload, joints that are not told apart, poses that do not fit."""
     joints = result.joints
-    lines = []
     half_width_kg = result.payload_half_width_kg
     if half_width_kg is not None and result.payload_kg is None:
-        lines.append(
-            f"the poses do not tell the payload: its interval is ± {half_width_kg:.3g} kg wide"
-        )
+        width = f"± {half_width_kg:.3g} kg"
+        yield f"the poses do not tell the payload: its interval is {width} wide"
     elif half_width_kg is not None:
-        lines.append(f"payload {result.payload_kg:.3f} ± {half_width_kg:.3f} kg")
+        yield f"payload {result.payload_kg:.3f} ± {half_width_kg:.3f} kg"
     for why in dict.fromkeys(joint.reason for joint in joints if joint.reason):
         names = ", ".join(joint.joint for joint in joints if joint.reason == why)
-        lines.append(f"not told apart to {100 * result.within:g} %: {names}; {why}")
+        yield f"not told apart to {100 * result.within:g} %: {names}; {why}"
     if negative := [joint.joint for joint in joints if joint.is_negative]:
-        lines.append(f"{', '.join(negative)}: {NEGATIVE}")
+        yield f"{', '.join(negative)}: {NEGATIVE}"
     for source, text in _WRITTEN.items():
         own = [joint for joint in joints if joint.source == source]
         names = ", ".join(
@@ -214,30 +210,29 @@ def remarks(result: ArmIdentification) -> list[str]:
             for joint in own
         )
         if own:
-            lines.append(text.format(names))
+            yield text.format(names)
     usual = USUAL_NOISE[result.measurement]
     if result.residual_spread > FAR_BEYOND * usual:
-        lines.append(
+        yield (
             f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}:"
             " look for other elastic joints, another frame (--frame) or body (--end-effector),"
             " friction, and errors of the model"
         )
     if result.outlying_poses:
         poses = ", ".join(map(str, result.outlying_poses))
-        lines.append(f"poses that do not fit the others: {poses}; check them")
+        yield f"poses that do not fit the others: {poses}; check them"
     if result.held_joints:
         held = ", ".join(result.held_joints)
-        lines.append(f"not in the log, and taken as held where the model has them: {held}")
+        yield f"not in the log, and taken as held where the model has them: {held}"
     unknown = [joint for joint in joints if joint.reason]
     if unknown and joints[0].planned_half_width is None:
-        lines.append("--plan 20 proposes poses that tell more")
+        yield "--plan 20 proposes poses that tell more"
     helpless = [one.joint for one in unknown if (one.planned_half_width or 0.0) > 1.0]
     if helpless:
-        lines.append(
+        yield (
             f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the"
             " measurement must show it; tilt the base, hang on a weight, or measure it by hand"
         )
-    return lines
 
 
 _WRITTEN: dict[Source, str] = {
@@ -303,12 +298,13 @@ def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
 
 def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     """Joints that a name or pattern fits, in the order of the log."""
+    chosen = set[str]()
     for pattern in patterns:
-        if not any(fnmatchcase(joint, pattern) for joint in joints):
+        fitting = fnmatch.filter(joints, pattern)
+        if not fitting:
             raise unknown_name("joint or pattern of the log's joints", pattern, joints)
-    return tuple(
-        joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns)
-    )
+        chosen.update(fitting)
+    return tuple(joint for joint in joints if joint in chosen or not patterns)
 
 
 def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
@@ -340,18 +336,19 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
     return write_poses(path, columns)
 
 
-def _has_interval(joint: JointStiffness) -> bool:
-    return None not in (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
+def _stiffness(joint: JointStiffness) -> float | None:
+    has_interval = None not in (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
+    return joint.stiffness_nm_per_rad if has_interval else None
 
 
 def _interval(joint: JointStiffness) -> str:
-    if not _has_interval(joint):
-        return "–"
-    return f"{joint.stiffness_low_nm_per_rad:.4g} to {joint.stiffness_high_nm_per_rad:.4g}"
+    low = _number(joint.stiffness_low_nm_per_rad, ".4g")
+    high = _number(joint.stiffness_high_nm_per_rad, ".4g")
+    return "–" if "–" in (low, high) else f"{low} to {high}"
 
 
-def _number(value: float | None, form: str = ".2f", is_known: bool = True) -> str:
-    return "–" if value is None or not is_known else format(value, form)
+def _number(value: float | None, form: str = ".2f", scale: float = 1.0) -> str:
+    return "–" if value is None else format(scale * value, form)
 
 
 def _percent(half: float | None) -> str:

@@ -287,17 +287,10 @@ class Proxy:
         self._listener.close()
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            start = asyncio.start_server(self._answer, sock=self._listener, limit=_LARGEST_HEAD)
-            self._loop.run_until_complete(start)
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            limit = _LARGEST_HEAD
+            runner.run(asyncio.start_server(self._answer, sock=self._listener, limit=limit))
             self._loop.run_forever()
-        finally:
-            tasks = asyncio.all_tasks(self._loop)
-            for task in tasks:
-                task.cancel()
-            self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-            self._loop.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """One connection, which is for one request."""
@@ -355,7 +348,8 @@ class Proxy:
 
 async def _read_head(reader: asyncio.StreamReader) -> Head:
     try:
-        return Head.parse(await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_S))
+        async with asyncio.timeout(_HEAD_S):
+            return Head.parse(await reader.readuntil(b"\r\n\r\n"))
     except asyncio.LimitOverrunError:
         raise RefusedError(f"a request may have {_LARGEST_HEAD} bytes of headers") from None
 
