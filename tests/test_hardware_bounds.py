@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -26,7 +25,7 @@ from elastic_env.robots.testbed.model import Pendulum
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture
-from train.commands.hardware import emulate
+from train.commands.hardware import Emulate
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf]
 no_number = pytest.mark.parametrize("value", NO_NUMBERS)
@@ -313,8 +312,10 @@ def test_a_range_of_goals_is_more_than_a_rounding_error() -> None:
 @pytest.mark.parametrize("after_s", [-1.0, 1e39, *NO_NUMBERS])
 def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
     """Catches a traceback of the clock."""
-    with pytest.raises(ConfigurationError, match="--fault-after-s must be from 0 to 86400 s"):
-        emulate(EmulatorConfig(), Console(quiet=True), {"hot": True}, after_s)
+    with pytest.raises(
+        ConfigurationError, match=r"fault_after_s must be .*>= 0 and <= 86400 \[s\]"
+    ):
+        Emulate(fault=["hot"], fault_after_s=after_s)
 
 
 BOUNDS = ("ge", "gt", "le", "lt")

@@ -19,8 +19,8 @@ from train.learn.trainer import Trainer
 from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
-from train.runs.user_code import code_refused, require_no_code
-from train.workers.calls import Outcome, Tally, Watch, run_calls
+from train.runs.user_code import refuse_code, require_no_code
+from train.workers.calls import Outcome, Watch, run_calls
 from train.workers.executors import Executors
 
 ONE_BY_ONE = Executors(jobs=1)
@@ -109,7 +109,7 @@ def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     file = require_run(folder, "training run", "train printed")
     if trust_code:
         return load_yaml(file, TrainConfig)
-    with code_refused(file):
+    with refuse_code(file):
         config = load_yaml(file, TrainConfig)
     require_no_code(file, [config.algorithm, config.env, config.base])
     return config
@@ -147,21 +147,17 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
 def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
     """Show the progress of seeds that are trained side by side."""
     done = [0] * len(names)
-    note = ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
-        show(number, done[number], note)
-
-    def count(tally: Tally) -> None:
-        nonlocal note
-        note = tally.in_words("seeds")
+        show(number, done[number], watch.tally.in_words("seeds"))
 
     def move(number: int) -> None:
         text = f"a worker was lost; {names[number]} goes on from its checkpoint"
         console.print(text, soft_wrap=True)
 
-    return Watch(reported=report, tallied=count, moved=move)
+    watch = Watch(reported=report, moved=move)
+    return watch
 
 
 def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> None:
