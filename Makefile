@@ -52,7 +52,7 @@ bench: $(STAMP) ## Measure the speed of the simulation, then run the benchmarks 
 	$(if $(wildcard tests/benchmarks),$(BIN)/python -m pytest -o addopts= --benchmark-only tests/benchmarks $(ARGS))
 
 residuals: $(STAMP) ## Train every residual of the package anew and compare it with the old one; takes hours
-	$(BIN)/python -m train.commands.residuals $(ARGS)
+	$(BIN)/python -m tests.residuals_anew $(ARGS)
 
 docs: $(STAMP) ## Build the site into docs/_build/html and run the tutorials; warnings are errors
 	@$(BIN)/python -c 'import furo, myst_parser, sphinx_gallery' 2>/dev/null || \

@@ -47,7 +47,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def tree(model: mujoco.MjModel) -> Tree:
-    return Tree.of(model, JOINTS, {}, gravcomp=True)
+    return Tree.of(model, JOINTS, {})
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware import imu
+from elastic_env.hardware.buses.bus import Condition
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
@@ -25,7 +25,7 @@ from elastic_env.robots.testbed.model import Pendulum
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture
-from train.commands.hardware import emulate
+from train.commands.hardware import Emulate
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf]
 no_number = pytest.mark.parametrize("value", NO_NUMBERS)
@@ -94,9 +94,9 @@ def test_a_request_with_what_is_no_number_switches_torque_off(what: str, value: 
 @no_number
 def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
     """Catches a servo at an unknown speed that counts as at rest."""
-    bus: Any = SimpleNamespace(name="one", read_velocity=lambda _: value)
+    condition = Condition(velocity=value, temperature=30.0, temperature_limit=80.0, error="")
     with pytest.raises(FaultError, match="torque goes on at rest"):
-        supervisor.require_rest(bus, 1)
+        supervisor.require_ready("servo 1 at one", condition, 80.0)
 
 
 @no_number
@@ -312,8 +312,10 @@ def test_a_range_of_goals_is_more_than_a_rounding_error() -> None:
 @pytest.mark.parametrize("after_s", [-1.0, 1e39, *NO_NUMBERS])
 def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
     """Catches a traceback of the clock."""
-    with pytest.raises(ConfigurationError, match="--fault-after-s must be from 0 to 86400 s"):
-        emulate(EmulatorConfig(), Console(quiet=True), {"hot": True}, after_s)
+    with pytest.raises(
+        ConfigurationError, match=r"fault_after_s must be .*>= 0 and <= 86400 \[s\]"
+    ):
+        Emulate(fault=["hot"], fault_after_s=after_s)
 
 
 BOUNDS = ("ge", "gt", "le", "lt")

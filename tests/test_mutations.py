@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from baselines.residual.residual import load_residual, read_description
+from baselines.residual.residual_policy import load_residual, read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.json_text import parse_json
@@ -190,7 +190,7 @@ def test_telling_keys_are_those_of_one_kind_alone() -> None:
         others = {
             name for other, model in models.items() if other != kind for name in model.model_fields
         }
-        assert keys <= set(models[kind].model_fields) - others
+        assert set(keys.split()) <= set(models[kind].model_fields) - others
 
 
 def test_worlds_beyond_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,7 @@ from rich.console import Console
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.commands.compare import CompareConfig
-from train.commands.residuals import (
+from tests.residuals_anew import (
     CONFIGS,
     RESIDUALS,
     beside_the_shipped,
@@ -16,6 +15,7 @@ from train.commands.residuals import (
     reproduce,
     shipped_seeds,
 )
+from train.commands.compare import CompareConfig
 from train.workers.executors import Executors
 
 TRAINING = """\

@@ -57,9 +57,9 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     trial = Robot(**files, end_effector="tool", poses=QUICK, motion=SINE)
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
         patch.setattr(train.commands.compare, "run_conditions", in_this_process)
-        result = try_robot(trial, Console(width=160, file=file))
-    assert all(made.is_file() for made in result.files)
-    return result.folder, (root / "printed.txt").read_text()
+        folder, files = try_robot(trial, Console(width=160, file=file))
+    assert all(made.is_file() for made in files)
+    return folder, (root / "printed.txt").read_text()
 
 
 def test_the_table_says_what_was_played(tried: tuple[Path, str]) -> None:
@@ -160,14 +160,12 @@ def test_shares_are_finite_differences_of_mujoco() -> None:
         parts.append(np.array(columns) / (2.0 * step))
         errors.append(parts[-1].sum(axis=0))
     shares = joint_shares(plant)
-    assert [one.joint for one in shares] == names
+    assert list(shares["joint"]) == names
     alone = np.sqrt(np.mean(np.sum(np.square(parts), axis=2), axis=0))
-    np.testing.assert_allclose(
-        [one.end_effector_rms_m for one in shares], alone, rtol=1e-6, atol=1e-9
-    )
+    np.testing.assert_allclose(shares["end_effector_rms_m"], alone, rtol=1e-6, atol=1e-9)
     explained = np.einsum("pji,pi->j", parts, errors) / np.sum(np.square(errors))
-    np.testing.assert_allclose([one.share for one in shares], explained, atol=1e-7)
-    assert sum(one.share for one in shares) == pytest.approx(1.0)
+    np.testing.assert_allclose(shares["share"], explained, atol=1e-7)
+    assert shares["share"].sum() == pytest.approx(1.0)
 
 
 def test_the_robot_of_the_readme_is_what_its_command_plays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,12 +180,12 @@ def test_the_robot_of_the_readme_is_what_its_command_plays(monkeypatch: pytest.M
     config = configure_robot(**robot_arguments(Robot(model=name)), reference=SEVERAL)
     shares = joint_shares(config.robot.plant(config))
     assert len(shares) == 7
-    assert sum(one.share for one in shares) == pytest.approx(1.0)
+    assert shares["share"].sum() == pytest.approx(1.0)
 
 
 def test_a_joint_without_weight_has_no_share() -> None:
     """Catches a share of a vertical axis: the turret carries no torque, whatever the pose."""
-    base = joint_shares(arm())[0]
+    base = joint_shares(arm()).iloc[0]
     assert base.joint == "base"
     assert abs(base.share) < 1e-12
     assert base.friction_leaves_m > 0.0

@@ -16,7 +16,7 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
 from train.commands.compare import recorded_config
 from train.learn.run_training import resume
-from train.runs.folders import free_folder, lock_run, new_run, require_run
+from train.runs.folders import free_folder, lock_run, require_run, run_folder
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +48,7 @@ def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
 def test_a_name_leads_nowhere_else(name: str, tmp_path: Path) -> None:
     """Catches a configuration that writes outside of runs."""
     with pytest.raises(ConfigurationError, match="name must be the name of a folder in runs"):
-        new_run(name, {}, 0)
+        free_folder(name)
     assert not (tmp_path / "runs").exists()
 
 
@@ -70,7 +70,7 @@ def test_a_run_that_cannot_be_described_leaves_no_folder(
     """Catches a folder with a configuration alone, where the disk got full behind it."""
     monkeypatch.setattr("train.runs.folders.write_whole", full_at("metadata.json"))
     with pytest.raises(OSError, match="No space"):
-        new_run("x", {"a": 1}, 0)
+        run_folder("x", {"a": 1}, 0).__enter__()
     assert list((tmp_path / "runs").iterdir()) == []
 
 

@@ -41,9 +41,9 @@ from train.commands.compare import CompareConfig
 from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.runs.folders import new_run, run_folder
+from train.runs.console import shown_warnings, warn_once
+from train.runs.folders import free_folder, run_folder
 from train.runs.progress import show_progress
-from train.runs.warned import each_once, said_so_far
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
@@ -248,7 +248,10 @@ def condition_of(env: Any) -> str:
 
 def test_a_taken_name_gets_the_next_free_number() -> None:
     """Catches results that overwrite those of the run before."""
-    folders = [new_run("name", {"number": i}, seed=i) for i in range(3)]
+    folders = []
+    for number in range(3):
+        with run_folder("name", {"number": number}, seed=number) as folder:
+            folders.append(folder)
     assert folders == [Path("runs/name"), Path("runs/name-2"), Path("runs/name-3")]
     assert [
         yaml.safe_load((folder / "config.yaml").read_text())["number"] for folder in folders
@@ -257,7 +260,8 @@ def test_a_taken_name_gets_the_next_free_number() -> None:
 
 def test_metadata_says_seed_versions_and_commit() -> None:
     """Catches results that cannot be made again."""
-    written = json.loads((new_run("name", {}, seed=17) / "metadata.json").read_text())
+    with run_folder("name", {}, seed=17) as folder:
+        written = json.loads((folder / "metadata.json").read_text())
     assert written["seed"] == 17
     assert written["versions"]["mujoco"].count(".") >= 1
     assert {"elastic-env", "gymnasium", "numpy", "pin", "scipy"} <= written["versions"].keys()
@@ -267,8 +271,8 @@ def test_metadata_says_seed_versions_and_commit() -> None:
 def test_named_output_folder_may_be_new_or_empty(tmp_path: Path) -> None:
     """Catches a folder that must exist, and one that must not."""
     (tmp_path / "empty").mkdir()
-    assert new_run("x", {}, 0, tmp_path / "empty") == tmp_path / "empty"
-    assert new_run("x", {}, 0, tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
+    assert free_folder("x", tmp_path / "empty") == tmp_path / "empty"
+    assert free_folder("x", tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
@@ -279,7 +283,7 @@ def test_output_that_exists_is_refused(kind: str, tmp_path: Path) -> None:
     inside.parent.mkdir(exist_ok=True)
     inside.write_text("years of work")
     with pytest.raises(ResultsExistError, match="taken"):
-        new_run("x", {}, 0, output)
+        free_folder("x", output)
     assert files_of(tmp_path) == {str(inside.relative_to(tmp_path)): b"years of work"}
 
 
@@ -1156,12 +1160,12 @@ def test_a_warning_is_shown_once() -> None:
     """Catches a line of warning for every cell and every process of a comparison."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
-        with each_once(["said before"]):
+        with warn_once(["said before"]):
             for text in ("said before", "3 meshes are missing", "3 meshes are missing", "another"):
                 warnings.warn(text, stacklevel=1)
-            with each_once():
+            with warn_once():
                 warnings.warn("another", stacklevel=1)
-            assert said_so_far() == {"said before", "3 meshes are missing", "another"}
+            assert shown_warnings() == {"said before", "3 meshes are missing", "another"}
         warnings.warn("another", stacklevel=1)
     assert [str(warning.message) for warning in shown] == [
         "3 meshes are missing",

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
-from elastic_env.core.signals import Array, renamed
+from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
 from elastic_env.world.robot_model import WalkerModel
 
@@ -70,8 +70,8 @@ class GroundLevel:
         table = model.observation_table
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
-        own = renamed(table.signals_of("imu_attitude"), "own_tilt")
-        self.signals = (*own, *renamed(table.signals_of("wrench"), "level_wrench"))
+        own = rename_group(table.signals_of("imu_attitude"), "own_tilt")
+        self.signals = (*own, *rename_group(table.signals_of("wrench"), "level_wrench"))
         """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")
@@ -106,9 +106,7 @@ class GroundLevel:
         return np.hstack([own, wrenches]), memory
 
     def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
-        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12),
-        and the new memory.
-        """
+        """Tilt of the ground [rad], level foot wrenches, (num_worlds, 12), and new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
         force = wrench[:, :, 0]
@@ -118,10 +116,8 @@ class GroundLevel:
         lean = mean * self._certainty(number)[:, None]
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
-        added = over_ankles * (upright - force)[..., :2]
-        turned = moment + np.stack(
-            [-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1
-        )
+        x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
+        turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
 
@@ -142,12 +138,15 @@ class GroundLevel:
         return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
-        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
-        one, (n, 2).
+        """Center of mass on the ankles: height [m], and velocity against the loaded one [m/s].
+
+        Shapes are (n, 2, 1) and (n, 2).
         """
-        n = len(rows)
-        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
-        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
-        now, soon = com[:, :, None] - ankles
+        theta = rows[:, self._theta]
+        rate = rows[:, self._rate]
+        com, ankles = self._carried.com_and_feet(
+            np.concatenate([theta, theta + _DIFFERENCE_S * rate])
+        )
+        now, soon = np.split(com[:, None] - ankles, 2)
         velocity = (soon - now)[..., :2] / _DIFFERENCE_S
-        return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]
+        return now[..., 2:], velocity[np.arange(len(rows)), np.argmax(load, axis=1)]

@@ -10,8 +10,7 @@ from typing import Any
 
 from baselines.adaptation import offset_table
 from baselines.policies import is_saved
-from baselines.residual import residual
-from baselines.residual.residual import located
+from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.files import read_bounded
 from train.evaluate.conditions import Condition
 from train.evaluate.robot_file import files_of_robot
@@ -23,15 +22,14 @@ tables list it.
 """
 _LABELS = {"label": True, "policy": {"label"}, "member": {"base"}}
 """Parts of a condition that are text for people and name no files."""
-_SAVED = (residual.DESCRIPTION, residual.WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
+_SAVED = (DESCRIPTION, WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
 """Files of which the folder of a policy consists."""
 _LARGEST_SOURCE = 10_000_000
 """Bytes of a Python file that is looked through for imports."""
 
 
 def cell_key(condition: Condition) -> str:
-    """SHA-256 digest of a condition, of the files that it names, and of the versions of the
-    physics.
+    """SHA-256 digest of a condition, of the files that it names, and of the physics' versions.
 
     Files are weights of residuals, tables of offsets and stiffness, robots with their models and
     joints, and Python files of the user's, with those of their folder that they import. They are
@@ -46,22 +44,18 @@ def cell_key(condition: Condition) -> str:
 
 
 def named_files(text: str) -> list[Path]:
-    """Files that a text of a configuration stands for: residual:FOLDER, FILE.py:NAME,
-    module:NAME, or a path.
-    """
+    """Files that a text stands for: residual:FOLDER, FILE.py:NAME, module:NAME, or a path."""
     if is_saved(text):
-        folder = located(Path(text.partition(":")[2]))
+        folder = find_folder(Path(text.partition(":")[2]))
         return [folder / name for name in _SAVED if _is_file(folder / name)]
     place, _, name = text.rpartition(":")
-    if name.isidentifier() and place.endswith(".py"):
-        return _with_imports(Path(place))
-    if name.isidentifier() and (source := _source(place)):
-        return _with_imports(source)
-    return (
-        [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
-        if _is_file(Path(text))
-        else []
-    )
+    if name.isidentifier():
+        source = Path(place) if place.endswith(".py") else _source(place)
+        if source is not None:
+            return _with_imports(source)
+    if not _is_file(Path(text)):
+        return []
+    return [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)]
 
 
 def _is_file(path: Path) -> bool:
@@ -80,9 +74,8 @@ def _source(module: str) -> Path | None:
     if not all(part.isidentifier() for part in (package, *parts)):
         return None
     try:
-        found = importlib.util.find_spec(
-            package
-        )  # which would import the packages around a name with dots
+        # of the outermost package: that of a name with dots would import the packages around it
+        found = importlib.util.find_spec(package)
     except (ImportError, ValueError):
         return None
     if found is None:
@@ -102,9 +95,7 @@ def _files_of(module: Path) -> list[Path]:
 
 
 def _with_imports(file: Path) -> list[Path]:
-    """A Python file and those that it imports from its own folder, and these from there, in
-    order of their names.
-    """
+    """A Python file and those that it imports from its folder, directly or not, sorted."""
     seen = set[Path]()
     waiting = [file]
     while waiting:
@@ -118,9 +109,7 @@ def _with_imports(file: Path) -> list[Path]:
 
 
 def _imports(file: Path) -> Iterator[str]:
-    """Modules that a file imports, by full name; none of a file that is no Python, which cannot
-    be imported itself.
-    """
+    """Modules that a file imports, by full name; none of a file that is no Python."""
     try:
         tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -129,8 +118,9 @@ def _imports(file: Path) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield from ([node.module] if node.module else [])
-            yield from (".".join(filter(None, [node.module, alias.name])) for alias in node.names)
+            package = [node.module] if node.module else []
+            yield from package
+            yield from (".".join([*package, alias.name]) for alias in node.names)
 
 
 def _texts(value: Any) -> Iterator[str]:

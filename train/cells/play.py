@@ -1,10 +1,9 @@
-"""The cells of a comparison, played side by side: what is kept, and what one that fails leaves
-of the others.
-"""
+"""The cells of a comparison, played side by side; one that fails leaves the others."""
 
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -15,9 +14,9 @@ from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
 from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
+from train.runs.console import shown_warnings, warn_once
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
-from train.runs.warned import each_once, said_so_far
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -67,28 +66,22 @@ def run_conditions(
             _on_hardware(condition, f"{n} of {len(conditions)}", console)
             for n, condition in enumerate(conditions, 1)
         ]
-    kept = (
-        [None] * len(conditions)
-        if store is None or fresh
-        else _load_kept(conditions, store, console)
-    )
-    missing = [
-        condition for condition, found in zip(conditions, kept, strict=True) if found is None
-    ]
+    kept = [None] * len(conditions)
+    if store is not None and not fresh:
+        kept = _load_kept(conditions, store, console)
+    missing = [condition for condition, own in zip(conditions, kept, strict=True) if own is None]
     if len(missing) < len(conditions):
-        console.print(
-            f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True
-        )
+        console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept")
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
-    results = [next(played) if found is None else Outcome(found) for found in kept]
+    results = [next(played) if own is None else Outcome(own) for own in kept]
     finished = [result.value for result in results if result is not None and result.error is None]
-    why = [
-        _failure_text(c, r)
-        for c, r in zip(conditions, results, strict=True)
-        if r is not None and r.error is not None
+    failed = [
+        _failure_text(condition, result.error, result.trace)
+        for condition, result in zip(conditions, results, strict=True)
+        if result is not None and result.error is not None
     ]
-    if why:
-        raise CellsFailedError(why, finished)
+    if failed:
+        raise CellsFailedError(failed, finished)
     if None in results:
         raise KeyboardInterrupt
     return finished
@@ -108,10 +101,9 @@ def _load_kept(
             unfit.append(f"{_name(condition)} ({error})")
     if unfit:
         more = f", and {len(unfit) - _MOST_NAMED} more" if len(unfit) > _MOST_NAMED else ""
-        said = (
-            f"kept cells that do not fit are played again: {'; '.join(unfit[:_MOST_NAMED])}{more}"
-        )
-        console.print(said, soft_wrap=True, markup=False, highlight=False)
+        named = "; ".join(unfit[:_MOST_NAMED])
+        said = f"kept cells that do not fit are played again: {named}{more}"
+        console.print(said, markup=False)
     return found
 
 
@@ -131,91 +123,68 @@ class _Playing:
         self._store = store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
-        batches = [
-            (batch, sum(steps[number] for number in batch))
-            for batch in in_batches(conditions, cores)
-        ]
-        longest_first = sorted(batches, key=lambda batch: -batch[1])
-        self._batches = [batch for batch, _ in longest_first]
-        self._steps = [steps for _, steps in longest_first]
+        batches = in_batches(conditions, cores)
+        steps_of = [sum(steps[number] for number in batch) for batch in batches]
+        longest_first = sorted(range(len(batches)), key=lambda batch: -steps_of[batch])
+        self._batches = [batches[batch] for batch in longest_first]
+        self._steps = [steps_of[batch] for batch in longest_first]
+        self._cells = [[conditions[number] for number in batch] for batch in self._batches]
         self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
-        self._played = [0] * len(self._batches)
-        self._running = set[int]()
-        self._done = 0
-        self._failed = 0
+        self._played = [0] * len(batches)
+        self._tally = Tally(len(conditions))
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
         self._show: Show = lambda *_: None
 
     def results(self) -> list[Outcome | None]:
-        """Outcomes in the order of the conditions; None for those that Ctrl-C kept from
-        starting.
-        """
+        """Outcomes in the order of the conditions; None for those that Ctrl-C prevented."""
         unit = "control steps"
         totals = {unit: sum(self._steps)}
-        with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
-            if (
-                len(self._batches) == 1 and self._place.is_local
-            ):  # a process of its own takes seconds to start
-                cells = _evaluate(
-                    self._of(0), lambda played: self._report(0, played), self._place.jobs
-                )
-                self._end(0, Outcome(cells))
+        with show_progress(self._console, totals, transient=True, unit=unit) as show:
+            self._show = show
+            if len(self._batches) == 1 and self._place.is_local:
+                # a process of its own takes seconds to start
+                report = partial(self._report, 0)
+                self._end(0, Outcome(_evaluate(self._cells[0], report, self._place.jobs)))
             else:
-                self._beside()
+                self._play_beside()
         return self._outcomes
 
-    def _of(self, batch: int) -> list[Condition]:
-        return [self._conditions[number] for number in self._batches[batch]]
-
-    def _beside(self) -> None:
-        watch = Watch(self._report, self._end, moved=self._say_moved)
+    def _play_beside(self) -> None:
+        watch = Watch(self._report, self._end, self._say_moved)
+        given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.open(len(self._batches), folder) as pool:
-                said = said_so_far()
-                given = [(self._of(batch), said) for batch in range(len(self._batches))]
+            with self._place.open(len(given), folder) as pool:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:
+        numbers = self._batches[batch]
         self._played[batch] = played
-        if self._outcomes[self._batches[batch][0]] is None:  # a report may come behind the end
-            self._running.add(batch)
-        self._show_progress()
-
-    def _show_progress(self) -> None:
-        running = sum(len(self._batches[batch]) for batch in self._running)
-        tally = Tally(self._done, running, self._failed, len(self._conditions))
-        self._show(0, sum(self._played), tally.in_words("cells"))
+        if self._outcomes[numbers[0]] is None:  # a report may come behind the end
+            self._tally.running.update(numbers)
+        self._show(0, sum(self._played), self._tally.in_words("cells"))
 
     def _end(self, batch: int, outcome: Outcome) -> None:
         """Take the outcomes of a batch, or what ended all of it."""
-        self._played[batch] = self._steps[batch]
-        self._running.discard(batch)
         numbers = self._batches[batch]
-        for number, own in zip(numbers, outcome.value or [outcome] * len(numbers), strict=True):
+        outcomes = outcome.value or [outcome] * len(numbers)
+        for number, own in zip(numbers, outcomes, strict=True):
             self._outcomes[number] = own
-            self._done += own.error is None
-            self._failed += own.error is not None
-            if (
-                own.error is None
-                and self._store is not None
-                and not self._store.keep(own.value, self._keys[number])
-            ):
+            self._tally.end(number, own)
+            store = self._store
+            if own.error is None and store and not store.keep(own.value, self._keys[number]):
                 name = _name(self._conditions[number])
-                said = f"{name} is not kept: a file that it names changed while it was played"
-                self._console.print(said, soft_wrap=True)
-        self._show_progress()
+                cause = "a file that it names changed while it was played"
+                self._console.print(f"{name} is not kept: {cause}")
+        self._report(batch, self._steps[batch])
 
     def _say_moved(self, batch: int) -> None:
-        for condition in self._of(batch):
-            self._console.print(
-                f"a worker was lost; {_name(condition)} is played again", soft_wrap=True
-            )
+        for condition in self._cells[batch]:
+            self._console.print(f"a worker was lost; {_name(condition)} is played again")
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
-    """Conditions, by their numbers, that are played in one vector environment: many worlds cost
-    less each.
+    """Numbers of conditions that share a vector environment: many worlds cost less each.
 
     Args:
         conditions: What to play.
@@ -230,13 +199,8 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
         if not can_share_worlds(condition):
             batches.append([number])
             continue
-        policy = (
-            condition.policy,
-            condition.member,
-            condition.policy_options,
-            condition.reference_name,
-        )
-        key = repr((policy, shared_settings(condition)))
+        policy = (condition.policy, condition.member, condition.policy_options)
+        key = repr((policy, condition.reference_name, shared_settings(condition)))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
             batch = []
@@ -247,54 +211,47 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     return batches
 
 
-def _failure_text(condition: Condition, outcome: Outcome) -> tuple[str, int]:
+def _failure_text(condition: Condition, error: Exception, trace: str) -> tuple[str, int]:
     """Text and exit code of a failure; a defect's traceback goes to the terminal."""
-    error = outcome.error
-    assert error is not None
-    found = explain(error)
-    said, code = found or (
-        f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}",
-        DEFECT,
-    )
-    return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
+    defect = (f"this is a defect: {type(error).__name__}: {error}\n{trace}", DEFECT)
+    said, code = explain(error) or defect
+    if isinstance(error, PolicyFailedError):  # which names the cell itself
+        return said, code
+    return f"{_name(condition)}: {said}", code
 
 
 def _name(condition: Condition) -> str:
     """Name of a cell for a user."""
+    name = f"{condition.policy.title!r} in {condition.scenario!r}, {condition.reference_name}"
     swept = "".join(f", {name}={value:g}" for name, value in condition.swept.items())
-    member = condition.member
-    seed = (
-        ""
-        if member is None or member.training_seed is None
-        else f", training seed {member.training_seed}"
-    )
-    return (
-        f"{condition.policy.title!r} in {condition.scenario!r},"
-        f" {condition.reference_name}{swept}{seed}"
-    )
+    seed = None if condition.member is None else condition.member.training_seed
+    return f"{name}{swept}" if seed is None else f"{name}{swept}, training seed {seed}"
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
     (total,) = num_steps([condition])
-    done = 0
     say = plain_progress(console)
-    console.print(
-        f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True
-    )
+    console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}")
+    return evaluate(condition, _count(lambda done: say(done / total)))
+
+
+def _count(report: Callable[[int], None]) -> Callable[[int], None]:
+    """A function that takes control steps that were played, and reports their sum."""
+    done = 0
 
     def advance(steps: int) -> None:
         nonlocal done
         done += steps
-        say(done / total)
+        report(done)
 
-    return evaluate(condition, advance)
+    return advance
 
 
 def _evaluate_beside(
     conditions: Sequence[Condition], said: frozenset[str], report: Callable[[int], None]
 ) -> list[Outcome]:
     """Evaluations in a process of their own, without the warnings that were shown before."""
-    with each_once(said):
+    with warn_once(said):
         return _evaluate(conditions, report)
 
 
@@ -305,18 +262,9 @@ def _evaluate(
 
     Where the policy fails beside others, each is played alone, to say which ones it fails in.
     """
-    done = 0
-
-    def advance(steps: int) -> None:
-        nonlocal done
-        done += steps
-        report(done)
-
     try:
-        return [
-            Outcome(evaluation)
-            for evaluation in evaluate_together(conditions, advance, num_threads)
-        ]
+        played = evaluate_together(conditions, _count(report), num_threads)
+        return [Outcome(evaluation) for evaluation in played]
     except PolicyFailedError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]

@@ -1,5 +1,4 @@
-"""Finished cells on the disk: a file each under the key of its content, written whole or not at
-all.
+"""Finished cells on the disk: a file each under the key of its content, written atomically.
 
 A file holds its key and a digest of the rest, and is checked against the condition before anything
 of it is used.
@@ -11,6 +10,8 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -62,17 +63,15 @@ class Store:
         """
         file = self._file(condition)
         try:
-            return _from_bytes(
-                condition, file.stem, read_bounded(file, _MOST_BYTES, within=self.folder)
-            )
+            content = read_bounded(file, _MOST_BYTES, within=self.folder)
+            return _from_bytes(condition, file.stem, content)
         except FileNotFoundError:
             return None
         except UnfitCellError as error:
             raise UnfitCellError(f"{file.name}: {error}") from None
         except Exception as error:  # whatever a reader of archives makes of a foreign file
-            raise UnfitCellError(
-                f"{file.name}: {type(error).__name__}: {quote(str(error))}"
-            ) from None
+            cause = f"{type(error).__name__}: {quote(str(error))}"
+            raise UnfitCellError(f"{file.name}: {cause}") from None
 
     def keep(self, evaluation: Evaluation, key: str | None = None) -> bool:
         """Keep what came out of a condition, unless what it depends on has changed since it began.
@@ -109,10 +108,9 @@ def _to_bytes(evaluation: Evaluation, key: str) -> bytes:
     episodes = json.dumps(evaluation.episodes, default=lambda number: number.item()).encode()
     arrays[_EPISODES] = np.frombuffer(episodes, dtype=np.uint8)
     arrays[_REST] = evaluation.rest_references
+    seal = {_KEY: np.array(key), _DIGEST: _digest(arrays)}
     content = io.BytesIO()
-    np.savez_compressed(
-        content, allow_pickle=False, **arrays, **{_KEY: np.array(key)}, **{_DIGEST: _digest(arrays)}
-    )
+    np.savez_compressed(content, allow_pickle=False, **arrays, **seal)
     return content.getvalue()
 
 
@@ -133,111 +131,88 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         size = sum(part.file_size for part in archive.infolist())
-        _require(
-            size <= _MOST_BYTES, f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read"
-        )
+    if size > _MOST_BYTES:
+        raise UnfitCellError(f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         found = {name: arrays[name] for name in arrays.files}
-    _require(
-        _KEY in found and _DIGEST in found, "it has no key and digest, as those of an older version"
-    )
-    kept_for = str(found.pop(_KEY))
-    digest = str(found.pop(_DIGEST))
-    _require(kept_for == key, "it is that of another cell")
-    _require(digest == str(_digest(found)), "its content is not what was written")
+    if str(found.pop(_KEY, "")) != key:
+        raise UnfitCellError("it is that of another cell")
+    if str(found.pop(_DIGEST, "")) != str(_digest(found)):
+        raise UnfitCellError("its content is not what was written")
+    text = found[_EPISODES]
+    most = _EPISODE_BYTES * condition.episodes
+    if text.nbytes > most:
+        raise UnfitCellError(f"its episodes have {text.nbytes} bytes, at most {most} are read")
     points = _part(found, _POINTS)
     evaluation = Evaluation(
         condition,
-        episodes=_episodes(condition, found[_EPISODES]),
+        episodes=json.loads(text.tobytes()),
         trace=_part(found, _TRACE),
         points=StaticPoints(**points) if points else None,
         rest_references=found[_REST],
     )
-    _require_arrays(evaluation)
+    for problem in chain(_problems_of_episodes(evaluation), _problems_of_arrays(evaluation)):
+        raise UnfitCellError(problem)
     return evaluation
 
 
 def _part(found: Arrays, name: str) -> Arrays:
-    return {
-        key.removeprefix(f"{name}/"): array
-        for key, array in found.items()
-        if key.startswith(f"{name}/")
-    }
+    prefix = f"{name}/"
+    return {key.removeprefix(prefix): own for key, own in found.items() if key.startswith(prefix)}
 
 
-def _episodes(condition: Condition, text: npt.NDArray[Any]) -> list[dict[str, Any]]:
-    """The records of a condition's episodes: all of them, in order, with finite scores where
-    they did not fail.
-    """
-    most = _EPISODE_BYTES * condition.episodes
-    _require(text.nbytes <= most, f"its episodes have {text.nbytes} bytes, at most {most} are read")
-    episodes = json.loads(text.tobytes())
-    _require(
-        isinstance(episodes, list) and all(isinstance(record, dict) for record in episodes),
-        "it has no episodes",
-    )
-    count = len(episodes)
-    _require(
-        count == condition.episodes, f"it has {count} episodes, the cell has {condition.episodes}"
-    )
-    for number, record in enumerate(episodes):
-        _require_record(condition, number, record)
-        _require(
-            record.keys() == episodes[0].keys(),
-            f"episode {number} has other metrics than the first one",
-        )
-    return episodes
-
-
-def _require_record(condition: Condition, number: int, record: dict[str, Any]) -> None:
-    for name, value in episode_labels(condition, number).items():
-        own = record.get(name)
-        same = type(own) is type(value) and own == value
-        _require(
-            same, f"{name} of episode {number} is {quote(own)}, in the cell it is {quote(value)}"
-        )
-    _require(
-        isinstance(record.get("termination"), str), f"episode {number} does not say how it ended"
-    )
-    for name, value in record.items():
-        _require(
-            isinstance(value, str | int | float), f"{name} of episode {number} is {quote(value)}"
-        )
-    if record["termination"]:
+def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
+    """Yield why records are not those of a condition: all, in order, with finite scores."""
+    condition = evaluation.condition
+    episodes = evaluation.episodes
+    if not isinstance(episodes, list) or not all(isinstance(one, dict) for one in episodes):
+        yield "it has no episodes"
         return
-    for column in condition.environment.judged:
-        value = record.get(column.metric)
-        is_score = isinstance(value, float) and math.isfinite(value)
-        _require(
-            is_score,
-            f"{column.metric} of episode {number} must be a finite number, it is {quote(value)}",
-        )
+    if len(episodes) != condition.episodes:
+        yield f"it has {len(episodes)} episodes, the cell has {condition.episodes}"
+    for number, record in enumerate(episodes):
+        for name, value in episode_labels(condition, number).items():
+            own = record.get(name)
+            if type(own) is not type(value) or own != value:
+                wanted = f"in the cell it is {quote(value)}"
+                yield f"{name} of episode {number} is {quote(own)}, {wanted}"
+        if not isinstance(record.get("termination"), str):
+            yield f"episode {number} does not say how it ended"
+        for name, value in record.items():
+            if not isinstance(value, str | int | float):
+                yield f"{name} of episode {number} is {quote(value)}"
+        for column in condition.environment.judged:
+            value = record.get(column.metric)
+            is_score = isinstance(value, float) and math.isfinite(value)
+            if not record.get("termination") and not is_score:
+                yield (
+                    f"{column.metric} of episode {number} must be a finite number, it is"
+                    f" {quote(value)}"
+                )
+        if record.keys() != episodes[0].keys():
+            yield f"episode {number} has other metrics than the first one"
 
 
-def _require_arrays(evaluation: Evaluation) -> None:
-    """Refuse time series and static points that are none of the condition's."""
+def _problems_of_arrays(evaluation: Evaluation) -> Iterator[str]:
+    """Yield why time series and static points are not those of the condition."""
     trace = evaluation.trace
+    rest = evaluation.rest_references
     traced = list(evaluation.condition.environment.traced)
-    _require(
-        list(trace) == traced,
-        f"it has the signals {quote(list(trace))}, the cell has {quote(traced)}",
-    )
-    for name, values in {**trace, "rest_references": evaluation.rest_references}.items():
-        _require(values.ndim == 1 and values.dtype.kind == "f", f"{name} is no series of numbers")
-        _require(not np.isinf(values).any(), f"{name} is not finite")
+    if list(trace) != traced:
+        yield f"it has the signals {quote(list(trace))}, the cell has {quote(traced)}"
+    for name, values in {**trace, _REST: rest}.items():
+        if values.ndim != 1 or values.dtype.kind != "f":
+            yield f"{name} is no series of numbers"
+            return
+        if np.isinf(values).any():
+            yield f"{name} is not finite"
     lengths = {len(values) for values in trace.values()}
-    _require(len(lengths) == 1 and lengths != {0}, f"its signals have {sorted(lengths)} samples")
+    if len(lengths) != 1 or lengths == {0}:
+        yield f"its signals have {sorted(lengths)} samples"
     time_s = trace.get("time_s", np.zeros(1))
-    _require(
-        bool(np.isfinite(time_s).all() and (np.diff(time_s) > 0.0).all()), "its time does not go on"
-    )
-    if evaluation.points is not None:
-        series = vars(evaluation.points).values()
-        same = all(values.shape == evaluation.rest_references.shape for values in series)
-        finite = all(values.dtype.kind in "if" and np.isfinite(values).all() for values in series)
-        _require(same and finite, "its static points are not one for each visit")
-
-
-def _require(holds: bool, problem: str) -> None:
-    if not holds:
-        raise UnfitCellError(problem)
+    if not (np.isfinite(time_s).all() and (np.diff(time_s) > 0.0).all()):
+        yield "its time does not go on"
+    for values in () if evaluation.points is None else vars(evaluation.points).values():
+        is_finite = values.dtype.kind in "if" and np.isfinite(values).all()
+        if values.shape != rest.shape or not is_finite:
+            yield "its static points are not one for each visit"

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,8 +26,8 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
+from train.commands.options import reference_of
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
-from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation
 from train.runs.console import make_table
 from train.runs.escaping import markdown_table
@@ -36,7 +35,7 @@ from train.runs.folders import run_folder
 from train.runs.kinds import is_a
 
 USUAL = Path("configs/bench.yaml")
-"""Where a configuration is looked for; in a checkout it is that of the package."""
+"""The default configuration; in a checkout it is that of the package."""
 _SHIPPED = Path(__file__).with_name("bench.yaml")
 
 
@@ -57,12 +56,12 @@ class BenchCase(Model):
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        motion = (
-            environment(self.env).default_reference if self.reference is None else self.reference
-        )
-        policy = PolicySpec(name=self.policy)
         return Condition(
-            env=self.env, policy=policy, scenario=self.scenario, seed=self.seed, reference=motion
+            env=self.env,
+            policy=PolicySpec(name=self.policy),
+            scenario=self.scenario,
+            seed=self.seed,
+            reference=reference_of(self.env, self.reference),
         )
 
 
@@ -74,197 +73,6 @@ class BenchConfig(Model):
     """Relative amount by which a figure may exceed the accepted."""
     _kind = model_validator(mode="before")(is_a("bench"))
     cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A figure of a rollout against what was accepted.
-
-    Attributes:
-        case: Environment, motion, scenario and policy.
-        metric: Its name, which ends with its unit.
-        measured: nan where the episode failed or does not have it.
-        accepted: None where nothing was accepted yet.
-        bound: What it may be at most.
-        problem: Why it falls short, in words; empty where it does not.
-    """
-
-    case: str
-    metric: str
-    measured: float
-    accepted: float | None
-    bound: float | None
-    problem: str
-
-
-def bench(path: Path, console: Console, update: bool = False, output: Path | None = None) -> bool:
-    """Play the rollouts of a configuration, write and print their figures.
-
-    Args:
-        path: Configuration; with `update` its figures are changed.
-        console: Where progress and results go.
-        update: Accept what is measured now.
-        output: Folder for bench.json and bench.md; default runs/bench, numbered if taken.
-
-    Returns:
-        Whether all figures kept their bounds; with `update` whether all have a value.
-
-    Raises:
-        ConfigurationError: Names or options that do not exist.
-        ResultsExistError: The output folder holds results.
-    """
-    config = load_yaml(path, BenchConfig)
-    with run_folder(config.name, config.model_dump(mode="json"), None, output) as folder:
-        evaluations = run_conditions([case.condition for case in config.cases], console)
-        figures = [
-            figure
-            for case, evaluation in zip(config.cases, evaluations, strict=True)
-            for figure in _figures(case, evaluation, config.margin)
-        ]
-        write_whole(
-            folder / "bench.json",
-            json.dumps([_plain(figure) for figure in figures], indent=2) + "\n",
-        )
-        markdown = _markdown(figures)
-        write_whole(folder / "bench.md", markdown)
-    summary = os.environ.get("GITHUB_STEP_SUMMARY")
-    if summary:
-        with Path(summary).open("a", encoding="utf-8") as file:
-            file.write(markdown)
-    console.print(_table(figures))
-    console.print(f"wrote {folder}/bench.json and bench.md", soft_wrap=True)
-    if update:
-        _accept(path, config, evaluations)
-        console.print(f"accepted the figures into {path}", soft_wrap=True)
-    short = [
-        figure for figure in figures if (np.isnan(figure.measured) if update else figure.problem)
-    ]
-    for figure in short:
-        console.print(
-            f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False
-        )
-    return not short
-
-
-def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Figure]:
-    (episode,) = evaluation.episodes
-    name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"
-    found = []
-    for metric, accepted in case.figures.items():
-        measured = (
-            float(episode.get(metric, np.nan)) if not episode["termination"] else float("nan")
-        )
-        bound = None if accepted is None else accepted + margin * abs(accepted)
-        found.append(
-            Figure(
-                name, metric, measured, accepted, bound, _problem(metric, measured, bound, episode)
-            )
-        )
-    return found
-
-
-def _problem(metric: str, measured: float, bound: float | None, episode: dict[str, Any]) -> str:
-    if episode["termination"]:
-        return f"{metric} has no value: the episode ended as {episode['termination']!r}"
-    if metric not in episode:
-        known = ", ".join(name for name in episode if name.endswith(("_m", "_rad", "_s", "_nm")))
-        return f"{metric} is no metric of this episode; those are {known}"
-    if bound is None:
-        return (
-            f"{metric} is {measured:.4g}, and nothing was accepted yet; elastic bench --update"
-            " accepts it"
-        )
-    return (
-        f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted"
-        if not measured <= bound
-        else ""
-    )
-
-
-def configuration(path: Path, update: bool = False) -> Path:
-    """The configuration that is meant: where the usual one does not exist, that of the package.
-
-    Raises:
-        ConfigurationError: The one of the package is to be changed.
-    """
-    if path != USUAL or path.exists():
-        return path
-    if update:
-        raise ConfigurationError(f"there is no {USUAL} to update; copy {_SHIPPED} there first")
-    return _SHIPPED
-
-
-def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> None:
-    """Write measured figures in the place of accepted ones; what stands around them stays."""
-    text = path.read_text(encoding="utf-8")
-    changes = []
-    for case, evaluation, figures in zip(
-        config.cases, evaluations, _figure_nodes(text), strict=True
-    ):
-        (episode,) = evaluation.episodes
-        for metric in case.figures:
-            if metric in episode and not episode["termination"]:
-                changes.append((figures[metric], f"{episode[metric]:.4g}"))
-    for node, value in sorted(changes, key=lambda change: -change[0].start_mark.index):
-        begin = node.start_mark.index
-        end = node.end_mark.index
-        text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
-    write_whole(path.resolve(), text)  # the user named it, maybe by a link
-
-
-def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:
-    """Nodes of the figures of every case in a configuration, by metric."""
-    cases = _child(yaml.compose(text), "cases")
-    return [
-        {key.value: value for key, value in _child(case, "figures").value} for case in cases.value
-    ]
-
-
-def _child(node: Any, name: str) -> Any:
-    return next(value for key, value in node.value if key.value == name)
-
-
-def _plain(figure: Figure) -> dict[str, Any]:
-    return {
-        name: None if value != value else value for name, value in asdict(figure).items()
-    }  # nan is not JSON
-
-
-def _rows(figures: list[Figure]) -> list[tuple[str, ...]]:
-    def text(value: float | None) -> str:
-        return "-" if value is None or np.isnan(value) else f"{value:.4g}"
-
-    def verdict(figure: Figure) -> str:
-        if not figure.problem:
-            return "kept"
-        return "new" if figure.bound is None and np.isfinite(figure.measured) else "falls short"
-
-    return [
-        (f.case, f.metric, text(f.measured), text(f.accepted), text(f.bound), verdict(f))
-        for f in figures
-    ]
-
-
-_COLUMNS = ("rollout", "figure", "measured", "accepted", "at most", "")
-
-
-def _table(figures: list[Figure]) -> Table:
-    rows = []
-    last = ""
-    for case, metric, measured, _, bound, verdict in _rows(figures):
-        if case != last:
-            rows.append((case, "", "", ""))
-        rows.append((f"  {metric}", measured, bound, verdict))
-        last = case
-    head = ["rollout and figure", "measured", "at most", ""]
-    table = make_table("short rollouts against what was accepted", head, rows, box=box.SIMPLE)
-    table.columns[-1].justify = "left"
-    return table
-
-
-def _markdown(figures: list[Figure]) -> str:
-    rules = ["---", "---", "---:", "---:", "---:", "---"]
-    return f"## elastic bench\n\n{markdown_table(_COLUMNS, rules, _rows(figures))}\n"
 
 
 class Bench(Model):
@@ -286,6 +94,141 @@ class Bench(Model):
     """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
 
     def run(self, console: Console) -> None:
-        """Play and compare."""
-        if not bench(configuration(self.config, self.update), console, self.update, self.output):
+        """Play the rollouts, and write and print their figures."""
+        path = configuration(self.config, self.update)
+        config = load_yaml(path, BenchConfig)
+        with run_folder(config.name, config.model_dump(mode="json"), None, self.output) as folder:
+            evaluations = run_conditions([case.condition for case in config.cases], console)
+            figures = [
+                figure
+                for case, evaluation in zip(config.cases, evaluations, strict=True)
+                for figure in _figures(case, evaluation, config.margin)
+            ]
+            write_whole(folder / "bench.json", json.dumps(figures, indent=2) + "\n")
+            markdown = _markdown(figures)
+            write_whole(folder / "bench.md", markdown)
+        if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
+            with Path(summary).open("a", encoding="utf-8") as file:
+                file.write(markdown)
+        console.print(_table(figures))
+        console.print(f"wrote {folder}/bench.json and bench.md")
+        if self.update:
+            _accept(path, evaluations)
+            console.print(f"accepted the figures into {path}")
+        short = [one for one in figures if one["problem"]]
+        if self.update:
+            short = [one for one in figures if one["measured"] is None]
+        for one in short:
+            console.print(f"{one['case']}: {one['problem']}")
+        if short:
             sys.exit(1)
+
+
+def configuration(path: Path, update: bool = False) -> Path:
+    """The configuration that is meant: where the usual one does not exist, that of the package.
+
+    Raises:
+        ConfigurationError: The one of the package is to be changed.
+    """
+    if path != USUAL or path.exists():
+        return path
+    if update:
+        raise ConfigurationError(f"there is no {USUAL} to update; copy {_SHIPPED} there first")
+    return _SHIPPED
+
+
+def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[dict[str, Any]]:
+    """Figures of a rollout: measured, accepted and largest value, and what is wrong in words.
+
+    `measured` is None where the episode failed or does not have the figure.
+    """
+    (episode,) = evaluation.episodes
+    name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"
+    found = []
+    for metric, accepted in case.figures.items():
+        measured = None if episode["termination"] else episode.get(metric)
+        if measured is not None and np.isnan(measured):
+            measured = None
+        bound = None if accepted is None else accepted + margin * abs(accepted)
+        found.append(
+            {
+                "case": name,
+                "metric": metric,
+                "measured": measured,
+                "accepted": accepted,
+                "bound": bound,
+                "problem": _problem(metric, measured, bound, episode),
+            }
+        )
+    return found
+
+
+def _problem(
+    metric: str, measured: float | None, bound: float | None, episode: dict[str, Any]
+) -> str:
+    if episode["termination"]:
+        return f"{metric} has no value: the episode ended as {episode['termination']!r}"
+    if metric not in episode:
+        known = ", ".join(name for name in episode if name.endswith(("_m", "_rad", "_s", "_nm")))
+        return f"{metric} is no metric of this episode; those are {known}"
+    if measured is None:
+        return f"{metric} of this episode is not a number"
+    if bound is None:
+        accept = "elastic bench --update accepts it"
+        return f"{metric} is {measured:.4g}, and nothing was accepted yet; {accept}"
+    if measured <= bound:
+        return ""
+    return f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted"
+
+
+def _accept(path: Path, evaluations: list[Evaluation]) -> None:
+    """Write measured figures in the place of accepted ones; what stands around them stays."""
+    text = path.read_text(encoding="utf-8")
+    cases = _child(yaml.compose(text), "cases").value
+    changes = [
+        (value.start_mark.index, value.end_mark.index, f"{evaluation.episodes[0][key.value]:.4g}")
+        for case, evaluation in zip(cases, evaluations, strict=True)
+        for key, value in _child(case, "figures").value
+        if key.value in evaluation.episodes[0] and not evaluation.episodes[0]["termination"]
+    ]
+    for begin, end, value in sorted(changes, reverse=True):
+        text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
+    write_whole(path.resolve(), text)  # the user named it, maybe by a link
+
+
+def _child(node: Any, name: str) -> Any:
+    return next(value for key, value in node.value if key.value == name)
+
+
+def _cells(figure: dict[str, Any]) -> list[str]:
+    """A figure in tables."""
+    numbers = [figure["measured"], figure["accepted"], figure["bound"]]
+    verdict = "falls short" if figure["problem"] else "kept"
+    if figure["bound"] is None and figure["measured"] is not None:
+        verdict = "new"
+    return [
+        figure["case"],
+        figure["metric"],
+        *("-" if number is None else f"{number:.4g}" for number in numbers),
+        verdict,
+    ]
+
+
+def _table(figures: list[dict[str, Any]]) -> Table:
+    rows = []
+    last = ""
+    for case, metric, measured, _, bound, verdict in map(_cells, figures):
+        if case != last:
+            rows.append((case, "", "", ""))
+        rows.append((f"  {metric}", measured, bound, verdict))
+        last = case
+    head = ["rollout and figure", "measured", "at most", ""]
+    table = make_table("short rollouts against what was accepted", head, rows, box=box.SIMPLE)
+    table.columns[-1].justify = "left"
+    return table
+
+
+def _markdown(figures: list[dict[str, Any]]) -> str:
+    head = ("rollout", "figure", "measured", "accepted", "at most", "")
+    rules = ["---", "---", "---:", "---:", "---:", "---"]
+    return f"## elastic bench\n\n{markdown_table(head, rules, map(_cells, figures))}\n"

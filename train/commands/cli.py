@@ -47,9 +47,10 @@ CONSOLE = PlainConsole()
 """The console on which the commands say what they do."""
 
 
-def _with_notes(error: BaseException, said: str | None = None) -> str:
-    """Text of an error, with the notes that it got on its way."""
-    return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
+def _print_last(said: str, error: BaseException, before: str = "") -> None:
+    """Say how the program ends, with the notes that its error got on the way."""
+    text = "; ".join([said, *getattr(error, "__notes__", [])])
+    PlainConsole(stderr=True).print(Text.assemble((before, "bold red"), text))
 
 
 def _print_failure(error: Exception) -> int:
@@ -57,12 +58,10 @@ def _print_failure(error: Exception) -> int:
     found = explain(error)
     if found is None:
         sys.stderr.write(traceback_of(error))
-    said, code = found or (
-        f"this is a defect of elastic-env, please report it: {type(error).__name__}",
-        DEFECT,
-    )
-    line = Text.assemble(("error:", "bold red"), f" {_with_notes(error, said)}")
-    PlainConsole(stderr=True).print(line, highlight=False, soft_wrap=True)
+        kind = type(error).__name__
+        found = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
+    said, code = found
+    _print_last(said, error, "error: ")
     return code
 
 
@@ -72,9 +71,7 @@ _SAME_WISH_S = 2.0
 
 @contextlib.contextmanager
 def _ended_by(*numbers: int) -> Iterator[None]:
-    """Signals that would end this program end what is within by an exception; ignored ones do
-    not.
-    """
+    """Turn signals that would end this program into an exception within; ignored ones stay so."""
     asked_s = -math.inf
 
     def end(number: int, _: Any) -> None:
@@ -84,20 +81,17 @@ def _ended_by(*numbers: int) -> Iterator[None]:
             asked_s = now
             raise EndedError(number)
 
-    is_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in numbers if is_main}
-    taken = {
-        n: handler
-        for n, handler in before.items()
-        if handler in (signal.SIG_DFL, signal.default_int_handler)
-    }
-    for number in taken:
-        signal.signal(number, end)
+    handled = {}
     try:
+        for number in numbers if threading.current_thread() is threading.main_thread() else ():
+            before = signal.getsignal(number)
+            if before in (signal.SIG_DFL, signal.default_int_handler):
+                handled[number] = before
+                signal.signal(number, end)
         yield
     finally:
-        for number, handler in taken.items():
-            signal.signal(number, handler)
+        for number, before in handled.items():
+            signal.signal(number, before)
 
 
 def parse(arguments: list[str]) -> Any:
@@ -140,25 +134,17 @@ _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 
 
 def _parse_overview(arguments: list[str]) -> Any:
-    """Print the help of all commands, or refuse a command that does not exist; the commands need
-    not be loaded.
-    """
-    kinds = [
-        dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
-        for name in COMMANDS
-    ]
-    named = zip(COMMANDS, kinds, strict=True)
-    members: Any = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in named]
-    return tyro.cli(
-        functools.reduce(operator.or_, members),
-        prog="elastic",
-        args=arguments,
-        config=_STYLE,
-        description=(
-            "Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help`"
-            " explains each, `elastic --version` says which version this is."
-        ),
+    """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
+    members: Any = []
+    for name in COMMANDS:
+        kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
+        members.append(Annotated[kind, tyro.conf.subcommand(name)])
+    description = (
+        "Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help`"
+        " explains each, `elastic --version` says which version this is."
     )
+    union = functools.reduce(operator.or_, members)
+    return tyro.cli(union, prog="elastic", args=arguments, config=_STYLE, description=description)
 
 
 def _help_of(name: str) -> str | None:
@@ -182,12 +168,6 @@ def main(arguments: list[str] | None = None) -> None:
             sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
-            said = (
-                "interrupted"
-                if number == signal.SIGINT
-                else f"ended by {signal.Signals(number).name}"
-            )
-            PlainConsole(stderr=True).print(
-                _with_notes(error, said), highlight=False, soft_wrap=True
-            )
+            name = signal.Signals(number).name
+            _print_last("interrupted" if number == signal.SIGINT else f"ended by {name}", error)
             os._exit(128 + number)  # worker processes must not keep the terminal waiting

@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Self, cast
+from typing import Annotated, Any, Self
 
 import tyro
 from pydantic import Field, field_validator, model_validator
@@ -34,15 +35,16 @@ from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
-from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import print_leaderboard, write_leaderboard
+from train.report.report_text import Results
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
+from train.report.write import require_libraries, write_report
+from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
-from train.runs.user_code import code_refused, require_no_code
-from train.runs.warned import each_once
+from train.runs.user_code import refuse_code, require_no_code
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -112,94 +114,75 @@ class CompareConfig(Model):
         if not isinstance(name, str):
             return values
         known = environment(name)
-        return {
-            "references": _along(values.get("map"), known) or [known.default_reference],
-            **values,
-        }
+        references = _motions_of_map(values.get("map"), known) or [known.default_reference]
+        return {"references": references, **values}
 
     _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
 
     @field_validator("policies", mode="before")
     @classmethod
     def _names_are_policies(cls, value: Any) -> Any:
-        return (
-            [{"name": item} if isinstance(item, str) else item for item in value]
-            if isinstance(value, list)
-            else value
-        )
+        if not isinstance(value, list):
+            return value
+        return [{"name": item} if isinstance(item, str) else item for item in value]
 
     @model_validator(mode="after")
-    def _names_exist(self) -> Self:
-        environment(self.env)
+    def _parts_fit(self) -> Self:
+        for problem in chain(self._problems_of_map(), self._problems()):
+            raise ConfigurationError(problem)
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        """Yield what is wrong with single parts, or between them."""
         titles = [policy.title for policy in self.policies]
-        for title in titles:
-            if titles.count(title) > 1:
-                raise ConfigurationError(
-                    f"two policies are called {title!r}; give one of them a label"
-                )
+        references = self._reference_names()
+        if repeated := _repeated(titles):
+            yield f"two policies are called {repeated[0]!r}; give one of them a label"
         if self.sweep is not None and all(policy.level for policy in self.policies):
-            raise ConfigurationError(
-                "a sweep needs a policy that it varies; level: true leaves all of them out of it"
-            )
-        self._require_map()
-        _require_each_once("reference", self._reference_names())
-        _require_each_once("scenario", self.scenarios)
+            yield "a sweep needs a policy that it varies; level: true leaves all of them out of it"
         require_drawn(self.scenarios, self.ranges)
-        _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
         require_known("policy of the figures", self.figure_policies, titles)
         require_known("scenario with episodes of its own", self.scenario_episodes, self.scenarios)
-        for scenario, episodes in self.scenario_episodes.items():
+        require_known("reference with scenarios of its own", self.reference_scenarios, references)
+        once: dict[str, list[Any]] = {
+            "reference": references,
+            "scenario": self.scenarios,
+            "value of the sweep": self.sweep.values if self.sweep else [],
+        }
+        for name, scenarios in self.reference_scenarios.items():
+            once[f"scenario of {name!r}"] = scenarios
+            require_known(f"scenario of {name!r}", scenarios, self.scenarios)
+            if not scenarios:
+                yield f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
+        for what, values in once.items():
+            for value in _repeated(values):
+                yield f"the {what} {quote(value)} stands twice; its episodes would count double"
+        for name, episodes in self.scenario_episodes.items():
             if not 1 <= episodes <= MOST_EPISODES:
-                raise ConfigurationError(
-                    f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got"
-                    f" {quote(episodes)}"
-                )
-        self._require_reference_scenarios()
+                bounds = f">= 1 and <= {MOST_EPISODES}"
+                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(episodes)}"
         for name, scenarios in self.groups.items():
-            if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
-                raise ConfigurationError(
+            require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
+            if name in self.scenarios or not scenarios or _repeated(scenarios):
+                yield (
                     f"group {name!r} must have a name that no scenario has, and scenarios, each"
                     f" once; got {quote(scenarios)}"
                 )
-            require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
-        return self
+        if self.leaderboard and (self.sweep or self.map or environment(self.env).is_real):
+            yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"
 
-    def _require_reference_scenarios(self) -> None:
-        """Refuse scenarios of references that are not played, and a leaderboard of what none can
-        be of.
-        """
-        require_known(
-            "reference with scenarios of its own", self.reference_scenarios, self._reference_names()
-        )
-        for name, scenarios in self.reference_scenarios.items():
-            if not scenarios:
-                raise ConfigurationError(
-                    f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
-                )
-            _require_each_once(f"scenario of {name!r}", scenarios)
-            require_known(f"scenario of {name!r}", scenarios, self.scenarios)
-        if self.leaderboard and (
-            self.sweep is not None or self.map is not None or environment(self.env).is_real
-        ):
-            raise ConfigurationError(
-                "a leaderboard is of simulated cells without a sweep or a map; leave these out"
-            )
-
-    def _require_map(self) -> None:
-        """Refuse a map that its environment does not have, or that something else of the
-        comparison contradicts.
-        """
+    def _problems_of_map(self) -> Iterator[str]:
+        """Yield how environment or other parts contradict the map."""
         if self.map is None:
             return
         self.map.require(environment(self.env))
         if self.sweep is not None or any(policy.level for policy in self.policies):
-            raise ConfigurationError(
-                "a map has two axes of its own; leave out sweep, and level of the policies"
-            )
-        if self.map.motion is not None and self.references != self.map.motion.values:
-            raise ConfigurationError(
-                f"an axis of the map varies the {self.map.motion.what}, so its values are the"
-                f" references; leave out references, got {quote(self.references)}"
+            yield "a map has two axes of its own; leave out sweep, and level of the policies"
+        motion = self.map.motion
+        if motion is not None and self.references != motion.values:
+            yield (
+                f"an axis of the map varies the {motion.what}, so its values are the references;"
+                f" leave out references, got {quote(self.references)}"
             )
 
     def conditions(self, with_bases: bool = True) -> list[Condition]:
@@ -212,12 +195,10 @@ class CompareConfig(Model):
             ConfigurationError: Residuals that do not exist, or are no family.
         """
         entrants = expand(self.policies, with_bases)
-        swept = (
-            len(self.sweep.values) if self.sweep else len(self.map.coordinates()) if self.map else 1
-        )
         own = self.reference_scenarios
-        played = {name: own.get(name, self.scenarios) for name in self._reference_names()}
-        cells = sum(map(len, played.values())) * len(entrants) * swept
+        played = [own.get(name, self.scenarios) for name in self._reference_names()]
+        swept = max(len(self._swept(policy)) for policy in self.policies)
+        cells = sum(map(len, played)) * len(entrants) * swept
         if cells > _MOST_CELLS:
             raise ConfigurationError(
                 f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)}"
@@ -239,7 +220,7 @@ class CompareConfig(Model):
                 seed=self.seed,
             )
             for reference, label, scenarios in zip(
-                self.references, self._reference_labels(), played.values(), strict=True
+                self.references, self._reference_labels(), played, strict=True
             )
             for scenario in scenarios
             for entrant in entrants
@@ -256,24 +237,17 @@ class CompareConfig(Model):
     def _reference_names(self) -> list[str]:
         """Names of the references in tables."""
         known = environment(self.env)
-        labels = self._reference_labels()
-        return [
-            label or known.label(reference)
-            for label, reference in zip(labels, self.references, strict=True)
-        ]
+        labelled = zip(self._reference_labels(), self.references, strict=True)
+        return [label or known.label(reference) for label, reference in labelled]
 
     def _reference_labels(self) -> list[str | None]:
-        """Names that tell references of one kind apart by their parameters; None where the kind
-        is enough.
-        """
+        """Names that tell references of one kind apart; None where the kind is enough."""
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
         return [
-            (
-                " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)]))
-                if kinds.count(kind) > 1
-                else None
-            )
+            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)]))
+            if kinds.count(kind) > 1
+            else None
             for kind, reference in zip(kinds, self.references, strict=True)
         ]
 
@@ -287,27 +261,14 @@ class Comparison:
     files: list[Path]
 
 
-@dataclass(frozen=True)
-class Work:
-    """How a comparison is played.
-
-    Attributes:
-        executors: Where its cells are played.
-        resumes: Whether the output folder is a run that is gone on with.
-        fresh: Whether cells that it keeps are played again.
-    """
-
-    executors: Executors = LOCAL_EXECUTORS
-    resumes: bool = False
-    fresh: bool = False
-
-
-@each_once()
+@warn_once()
 def compare(
     config: CompareConfig,
     console: Console,
     output: Path | None = None,
-    work: Work | None = None,
+    executors: Executors = LOCAL_EXECUTORS,
+    resumes: bool = False,
+    fresh: bool = False,
     report: bool = True,
 ) -> Comparison:
     """Run a comparison, write its folder, and print its tables.
@@ -316,7 +277,9 @@ def compare(
         config: What to compare.
         console: Where progress and table go.
         output: Folder for the results; default runs/<name>, numbered if taken.
-        work: How it is played; None for this machine and a new run.
+        executors: Where its cells are played.
+        resumes: Whether the output folder is a run that is gone on with.
+        fresh: Whether cells that such a run keeps are played again.
         report: Whether policies are compared with one another, and bases of residuals added for it;
             else they are scored alone, and no cells are kept.
 
@@ -325,42 +288,39 @@ def compare(
         ResultsExistError: The output folder holds results.
         KeyboardInterrupt: Ctrl-C; finished cells are kept.
     """
-    work = work or Work()
     plots.require_matplotlib()
     if report:
-        require_plotly()
-        require_jinja2()
+        require_libraries()
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
-    with _folder(config, output, work) as folder:
-        evaluations = _play_cells(conditions, console, work, folder, keeps=report)
+    with _folder(config, output, resumes) as folder:
+        store = Store(folder / CELLS) if report else None
+        with _finished_kept(folder, console):
+            evaluations = run_conditions(conditions, console, executors, store, fresh)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
-        robots = robot_scores(evaluations)
-        if robots:
-            files.append(write_robots(robots, folder / "robots.csv"))
         cells = merge_seeds(evaluations)
-        files.append(write_summary(cells, folder / "summary.md"))
+        robots = robot_scores(evaluations)
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
         maps = [] if config.map is None else heat_maps(evaluations, config.map)
-        files += (
-            draw_maps(maps, folder)
-            if maps
-            else draw_figures(cells, folder, config.figure_policies, axis)
-        )
-        if maps:
-            files.append(write_maps(maps, folder / "map.csv"))
         rows = changes(evaluations, config.groups) if report else []
-        if (
-            config.leaderboard or maps
-        ):  # which find the best policy of every column or cell themselves
+        if config.leaderboard or maps:  # which find the best policy of each column or cell
             rows = [row for row in rows if not row.is_rival]
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")
             board = standings(evaluations, rows, config.groups, step_times(conditions))
+        if robots:
+            files.append(write_robots(robots, folder / "robots.csv"))
+        files.append(write_summary(cells, folder / "summary.md"))
+        if maps:
+            files += [*draw_maps(maps, folder), write_maps(maps, folder / "map.csv")]
+        else:
+            files += draw_figures(cells, folder, config.figure_policies, axis)
+        if board:
             files += write_leaderboard(board, folder)
-        if report:
+        if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
+        if report:
             files += write_report(
                 Results(config.name, evaluations, rows, folder, axis, maps, board, robots)
             )
@@ -385,7 +345,7 @@ def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
     file = require_run(folder, "run", "compare wrote")
     if trust_code:
         return load_yaml(file, CompareConfig)
-    with code_refused(file):
+    with refuse_code(file):
         config = load_yaml(file, CompareConfig)
     policies = [policy.name for policy in config.policies if not is_saved(policy.name)]
     require_no_code(file, [config.env, *policies])
@@ -393,10 +353,10 @@ def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
 
 
 @contextmanager
-def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[Path]:
+def _folder(config: CompareConfig, output: Path | None, resumes: bool) -> Iterator[Path]:
     """The folder of a run, new or gone on with, for this program alone."""
     content = config.model_dump(mode="json")
-    if not work.resumes or output is None:
+    if not resumes or output is None:
         with run_folder(config.name, content, config.seed, output) as folder, lock_run(folder):
             yield folder
         return
@@ -406,35 +366,27 @@ def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[
         yield output
 
 
-def _play_cells(
-    conditions: Sequence[Condition], console: Console, work: Work, folder: Path, keeps: bool
-) -> list[Evaluation]:
-    """The cells; what is finished when some fail, or at Ctrl-C, is kept."""
-    store = Store(folder / CELLS) if keeps else None
-    go_on = f"go on with: elastic compare --resume {folder}"
+@contextmanager
+def _finished_kept(folder: Path, console: Console) -> Iterator[None]:
+    """Keep finished cells where some fail within, and say so at Ctrl-C."""
     try:
-        return run_conditions(conditions, console, work.executors, store, work.fresh)
+        yield
     except CellsFailedError as error:
         if error.finished:
             write_summary(merge_seeds(error.finished), folder / "summary.md")
             kept = write_episodes(error.finished, folder / "episodes.csv")
-            console.print(
-                f"the other {len(error.finished)} cells are in {kept} and summary.md",
-                soft_wrap=True,
-            )
+            console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md")
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
         if any((folder / CELLS).glob("*.npz")):
+            go_on = f"go on with: elastic compare --resume {folder}"
             error.add_note(f"finished cells are kept; {go_on}")
         raise
 
 
-def _require_each_once(what: str, values: Sequence[object]) -> None:
-    for value in values:
-        if values.count(value) > 1:
-            raise ConfigurationError(
-                f"the {what} {quote(value)} stands twice; its episodes would count double"
-            )
+def _repeated(values: Sequence[Any]) -> list[Any]:
+    """Values that stand more than once."""
+    return [value for value in values if values.count(value) > 1]
 
 
 def try_out(conditions: Sequence[Condition]) -> None:
@@ -445,19 +397,18 @@ def try_out(conditions: Sequence[Condition]) -> None:
         except ConfigurationError as error:
             if not condition.swept:
                 raise
-            raise ConfigurationError(
-                f"{error}; level: true leaves a policy out of the sweep"
-            ) from None
+            cure = "level: true leaves a policy out of the sweep"
+            raise ConfigurationError(f"{error}; {cure}") from None
         if not hasattr(policy, "predict"):
-            raise ConfigurationError(
-                f"policy {condition.policy.name!r} has no method predict(), got"
-                f" {type(policy).__name__}"
-            )
+            name = condition.policy.name
+            got = type(policy).__name__
+            raise ConfigurationError(f"policy {name!r} has no method predict(), got {got}")
 
 
 def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
-    """Conditions with an environment, or a policy at a motion, that no earlier one has: a sum of
-    them, no product.
+    """Conditions with an environment, or a policy at a motion, that no earlier one has.
+
+    There are as many as the sum of both, not their product.
     """
     seen = set[str]()
     for condition in conditions:
@@ -470,23 +421,18 @@ def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
             yield condition
 
 
-def _along(axes: Any, known: Environment) -> list[Any]:
+def _motions_of_map(axes: Any, known: Environment) -> list[Any]:
     """Values of the axis of a raw map that varies the motion; empty where none does."""
-    found = (
-        [axis for axis in axes.values() if isinstance(axis, dict)] if isinstance(axes, dict) else []
-    )
-    along = [
-        axis["values"] for axis in found if axis.get("what") == known.motion and "values" in axis
-    ]
-    return along[0] if along and isinstance(along[0], list) else []
+    for axis in axes.values() if isinstance(axes, dict) else []:
+        if isinstance(axis, dict) and axis.get("what") == known.motion:
+            values = axis.get("values")
+            return values if isinstance(values, list) else []
+    return []
 
 
 def _parameters(reference: Reference, known: Environment) -> list[str]:
-    if not isinstance(reference, dict):
-        return []
-    return [
-        f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)
-    ]
+    given = reference.items() if isinstance(reference, dict) else []
+    return [f"{name}={value}" for name, value in given if name not in ("kind", known.motion)]
 
 
 class Compare(Model):
@@ -536,31 +482,24 @@ class Compare(Model):
 
     def run(self, console: Console) -> None:
         """Compare."""
-        self._require()
-        if self.config is not None:
-            config = load_yaml(self.config, CompareConfig)
-        else:
-            config = recorded_config(cast(Path, self.resume), self.trust_code)
-        if self.hardware.arguments:
-            real = self.hardware.environment(config.env)
-            real["env_options"] = {**config.env_options, **real["env_options"]}
-            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
-        work = Work(Executors(self.on, self.jobs), self.resume is not None, self.fresh)
-        print_files(compare(config, console, self.resume or self.output, work), console)
-
-    def _require(self) -> None:
-        if self.config is None and self.resume is None:
-            raise ConfigurationError(
-                "name a configuration or, with --resume, the run to go on with"
-            )
         if self.resume is not None and self.output is not None:
             raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
         if self.resume is None and self.fresh:
             raise ConfigurationError("--fresh needs --resume; a new run plays all of its cells")
-
-
-def print_files(comparison: Comparison, console: Console) -> None:
-    """Say what a comparison wrote."""
-    console.print(f"Results in {comparison.folder}:", soft_wrap=True)
-    for path in comparison.files:
-        console.print(f"  {path}", soft_wrap=True)
+        if self.config is not None:
+            config = load_yaml(self.config, CompareConfig)
+        elif self.resume is not None:
+            config = recorded_config(self.resume, self.trust_code)
+        else:
+            raise ConfigurationError(
+                "name a configuration or, with --resume, the run to go on with"
+            )
+        if self.hardware.arguments:
+            real = self.hardware.environment(config.env)
+            real["env_options"] = {**config.env_options, **real["env_options"]}
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
+        executors = Executors(self.on, self.jobs)
+        output = self.resume or self.output
+        is_resumed = self.resume is not None
+        finished = compare(config, console, output, executors, is_resumed, self.fresh)
+        print_files(finished.folder, finished.files, console)

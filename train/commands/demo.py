@@ -1,6 +1,4 @@
-"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10)
-in short.
-"""
+"""`elastic demo`: the paper's experiments (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,22 +19,25 @@ from train.figures import plots
 from train.figures.comparison_figures import cells_together, draw_figure, draw_time_series
 from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.console import make_table
+from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 """Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
 
+
+def _policies(*names: str) -> list[PolicySpec]:
+    return [PolicySpec(name=name) for name in names]
+
+
 _STATIC = CompareConfig(
-    name="demo",
-    references=["hold"],
-    policies=[PolicySpec(name="uncompensated"), PolicySpec(name="input")],
+    name="demo", references=["hold"], policies=_policies("uncompensated", "input")
 )
 _MOTION = CompareConfig(
     name="demo",
     references=["sine"],
     policies=[
-        *(PolicySpec(name=name) for name in ("uncompensated", "input", "dynamic", "oracle")),
+        *_policies("uncompensated", "input", "dynamic", "oracle"),
         PolicySpec(name="residual:testbed/seed_0", label="residual"),
     ],
 )
@@ -44,13 +45,13 @@ _SLOW_WALK = CompareConfig(
     name="demo",
     env="walker",
     references=[{"step_period": 24, "num_steps": 2}],
-    policies=[PolicySpec(name=name) for name in ("uncompensated", "input_output")],
+    policies=_policies("uncompensated", "input_output"),
 )
 _WALK = CompareConfig(
     name="demo",
     env="walker",
     references=[3],
-    policies=[PolicySpec(name=name) for name in ("uncompensated", "input_output", "input_wrench")],
+    policies=_policies("uncompensated", "input_output", "input_wrench"),
 )
 _SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its base alone
     name="demo",
@@ -58,7 +59,7 @@ _SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its b
     references=[3],
     scenarios=["soft"],
     policies=[
-        PolicySpec(name="input_output"),
+        *_policies("input_output"),
         PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
     ],
 )
@@ -85,6 +86,7 @@ class Demo(Model):
             )
             evaluations = iter(run_conditions(conditions, console))
             static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
+            scored = [*motion, *walks]
             model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
             points = static[0].points
             assert points is not None
@@ -94,35 +96,31 @@ class Demo(Model):
                 draw_identification(result, points, [model], folder / "fig5_identification.png"),
                 draw_static_errors(static, model, folder / "fig6_static_errors.png"),
                 draw_time_series(motion, folder / "sine.png"),
-                *(
-                    file
-                    for name in ("pelvis", "zmp")
-                    for walk in cells_together(walks)
-                    for file in draw_figure(name, walk, folder)
-                ),
+            ]
+            for name in ("pelvis", "zmp"):
+                for walk in cells_together(walks):
+                    files += draw_figure(name, walk, folder)
+            files += [
                 folder / "identification.json",
-                write_episodes([*motion, *walks], folder / "episodes.csv"),
-                write_summary([*motion, *walks], folder / "summary.md"),
+                write_episodes(scored, folder / "episodes.csv"),
+                write_summary(scored, folder / "summary.md"),
             ]
         console.print(_testbed_table(result, static), "")
         print_summary(motion, console)
         console.print("", _walk_table(walks), "")
         print_summary(walks, console)
-        console.print("Figures and data:")
-        for path in files:
-            console.print(f"  {path}", soft_wrap=True)
+        print_files(folder, files, console)
 
 
 _HEAD = ("quantity", "here", "paper")
 
 
 def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
-    low = result.stiffness_low_nm_per_rad
-    high = result.stiffness_high_nm_per_rad
+    interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
         ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
-        ("  95 % interval", f"{low:.1f} to {high:.1f}", "-"),
+        ("  95 % interval", interval, "-"),
         ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
@@ -141,14 +139,12 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
         is_paper = condition.scenario == "nominal"
         scenario = "" if is_paper else f", {condition.scenario}"
         walked = condition.environment.title(condition.reference_name) + scenario
+        peaks = [
+            f"{1e3 * np.max(walk.values(f'pelvis_{axis}_peak_rad')):.1f}"
+            for axis in ("roll", "pitch")
+            if not walk.num_failed
+        ]
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
         name = f"{walked}, {condition.policy.title} [mrad]"
-        rows.append((name, "fell" if walk.num_failed else _pelvis_peaks(walk), paper))
+        rows.append((name, " and ".join(peaks) or "fell", paper))
     return make_table("the paper's walks, Figs. 7 and 8: largest roll and pitch", _HEAD, rows)
-
-
-def _pelvis_peaks(walk: Evaluation) -> str:
-    roll, pitch = (
-        1e3 * np.max(walk.values(f"pelvis_{axis}_peak_rad")) for axis in ("roll", "pitch")
-    )
-    return f"{roll:.1f} and {pitch:.1f}"

@@ -1,6 +1,4 @@
-"""The command `elastic` around its modules: what ends it while they load, and output that nobody
-takes.
-"""
+"""The command `elastic` around its modules: interrupts while they load, and closed output."""
 
 import contextlib
 import os
@@ -44,9 +42,7 @@ def main() -> None:
 
 
 def _leave_working_folder() -> None:
-    """Import nothing from the working folder that is installed, here and in the processes that
-    are started.
-    """
+    """Import what is installed before files of the working folder, also in started processes."""
     look_last_in(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
@@ -57,18 +53,14 @@ def _leave_working_folder() -> None:
 
 
 def _have_streams() -> None:
-    """Give a program that began without its standard streams some: libraries ask them what they
-    are.
-    """
+    """Open standard streams where the program began without them: libraries ask what they are."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
 
 
 def _end_without_output(error: OSError) -> None:
-    """End where nobody reads any more, or the disk that the output goes to is full; that is
-    said, if it can be.
-    """
+    """End where nobody reads, or where the disk is full, which is said if it can be."""
     is_closed = isinstance(error, BrokenPipeError)
     if not is_closed:
         said, _ = explain(error) or (str(error), SYSTEM_FAILED)

@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
-from train.commands.compare import CompareConfig, compare, print_files
+from train.commands.compare import CompareConfig, compare
 from train.commands.options import (
     MotionOrDefault,
     OnHardware,
@@ -14,6 +14,7 @@ from train.commands.options import (
     reference_of,
 )
 from train.evaluate.conditions import MOST_EPISODES, PolicySpec
+from train.runs.console import print_files
 
 
 class Evaluate(Model):
@@ -70,4 +71,5 @@ class Evaluate(Model):
                 seed=self.seed,
                 **self.on.environment(self.env),
             )
-        print_files(compare(config, console, self.output, report=False), console)
+        finished = compare(config, console, self.output, report=False)
+        print_files(finished.folder, finished.files, console)

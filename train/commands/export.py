@@ -13,8 +13,9 @@ from train.runs.folders import own_folder
 
 
 class Export(Model):
-    """Turn a model that Stable-Baselines3 saved into a residual folder, which plays without torch
-    and runs no code.
+    """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
+
+    Loading that folder runs no code.
 
     Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl
         --trust-pickle
@@ -36,4 +37,4 @@ class Export(Model):
         config = load_yaml(self.config, TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
-        console.print(f"play it as residual:{folder}", soft_wrap=True)
+        console.print(f"play it as residual:{folder}")

@@ -5,20 +5,17 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import gymnasium
-import numpy as np
 import tyro
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.core.config import Model
-from elastic_env.core.errors import ConfigurationError, quote, require_known
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import RATES, require_ids
 from elastic_env.hardware.buses.servo_models import servo_models
@@ -32,11 +29,11 @@ from elastic_env.robots.testbed.environment import configure_testbed
 from train.commands.options import MotionOrDefault, OnHardware, reference_of
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.rollout import make_policy
+from train.evaluate.rollout import control_steps, make_policy
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 
 _SHOWN_S = 1.0
-_LATEST_FAULT_S = 86_400.0
 
 
 class Scan(Model):
@@ -54,34 +51,28 @@ class Scan(Model):
         """Scan; exit code 3 where no servo answers."""
         if self.baudrate is not None:
             HardwareSettings(port=self.port, baudrate=self.baudrate)  # checks it
-        table = Table(
-            "bit/s", "id", "model number", "model", "firmware", title=f"servos at {self.port}"
-        )
+        rows = []
         for rate in RATES if self.baudrate is None else (self.baudrate,):
             with DynamixelBus(self.port, rate) as bus:
                 for servo in bus.scan():
                     model = servo_models().get(servo.model_number)
                     name = model.name if model is not None else "not known here"
-                    table.add_row(
-                        str(rate),
-                        str(servo.servo_id),
-                        str(servo.model_number),
-                        name,
-                        str(servo.firmware),
-                    )
-        if not table.row_count:
+                    cells = (rate, servo.servo_id, servo.model_number, name, servo.firmware)
+                    rows.append([str(cell) for cell in cells])
+        if not rows:
             console.print(
                 f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
-                " it is the IMU's port",
-                soft_wrap=True,
+                " it is the IMU's port"
             )
             sys.exit(3)
-        console.print(table)
+        head = ["bit/s", "id", "model number", "model", "firmware"]
+        console.print(make_table(f"servos at {self.port}", head, rows, left=5))
 
 
 class Check(Model):
-    """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there
-    is anything to do.
+    """Look at port, servos and IMU before anything moves, and say what to do.
+
+    The exit code is 3 if there is anything to do.
 
     Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
     """
@@ -99,30 +90,20 @@ class Check(Model):
 
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
-        HardwareSettings(  # checks them
-            port=self.port,
-            baudrate=self.baudrate,
-            imu_port=self.imu_port,
-            imu_baudrate=self.imu_baudrate,
-        )
+        HardwareSettings(**self.model_dump(exclude={"ids"}))  # checks them
         require_ids(self.ids)
         with DynamixelBus(self.port, self.baudrate) as bus:
             checks = check_bus(bus, self.ids)
         if self.imu_port is not None:
             with AttitudeStream(self.imu_port, self.imu_baudrate) as stream:
                 sample = stream.latest()
-            angles = ", ".join(
-                f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw")
-            )
+            names = ("roll", "pitch", "yaw")
+            angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in names)
             checks.append(BusCheck("IMU", f"{angles} rad"))
-        table = Table("", "", "what to do", title=f"check of {self.port}", show_header=True)
-        for one in checks:
-            table.add_row(
-                one.what,
-                one.value,
-                escape(one.cure) or "fine",
-                style="" if one.is_good else "bold yellow",
-            )
+        rows = [(one.what, one.value, "fine" if one.is_good else one.cure) for one in checks]
+        table = make_table(f"check of {self.port}", ["", "", "what to do"], rows, left=3)
+        for row, one in zip(table.rows, checks, strict=True):
+            row.style = "" if one.is_good else "bold yellow"
         console.print(table)
         if not all(one.is_good for one in checks):
             sys.exit(3)
@@ -147,9 +128,7 @@ class Run(Model):
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Play one episode, show it as it goes, and keep every step in log.csv, also of one that
-        is cut short.
-        """
+        """Play one episode and show it; log.csv keeps every step, also of one that is cut short."""
         if not (arguments := self.on.arguments):
             raise ConfigurationError(
                 "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
@@ -158,55 +137,34 @@ class Run(Model):
         spec = PolicySpec(name=self.policy)
         name = environment("hardware").id
         env: Any = gymnasium.make(name, disable_env_checker=True, reference=reference, **arguments)
+        recorded = {"policy": spec.model_dump(mode="json"), "reference": reference, **arguments}
         with contextlib.closing(env):
             policy = make_policy(spec, env)
-            configuration = {
-                "policy": spec.model_dump(mode="json"),
-                "reference": reference,
-                **arguments,
-            }
-            with run_folder("hardware", configuration, None, self.output) as folder:
+            with run_folder("hardware", recorded, None, self.output) as folder:
                 metrics: dict[str, Any] = {}
                 with _open_log(folder / "log.csv", console) as log:
-                    for info in _episode(env, policy):
-                        log.write(info)
-                        metrics = info.get("episode_metrics", metrics)
+                    for step in control_steps(env, policy, None):
+                        log.write(step.info)
+                        metrics = step.info.get("episode_metrics", metrics)
                 (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        console.print(
-            f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True
-        )
+        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
 
 
-def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
-    """Play an episode; yields the info of every step."""
-    observation, _ = env.reset()
-    state = None
-    start = np.array(True)
-    truncated = False
-    while not truncated:
-        action, state = policy.predict(
-            observation, state=state, episode_start=start, deterministic=True
-        )
-        observation, _, _, truncated, info = env.step(action)
-        start = np.array(False)
-        yield info
+_SHOWN = (
+    ("t", "s", "time_s", 1.0, "7.1f"),
+    ("q_ref", "rad", "reference_angle", 1.0, "+8.4f"),
+    ("link", "rad", "link_angle", 1.0, "+8.4f"),
+    ("torque", "N·m", "joint_torque", 1.0, "+8.1f"),
+    ("jitter", "ms", "jitter", 1e3, "+8.2f"),
+    ("overruns", "", "overruns", 1, "9d"),
+    ("missed", "", "missed_replies", 1, "7d"),
+    ("limited", "", "limited", 1, "8d"),
+)
+"""Columns on the console: title, unit, signal, factor and format."""
 
 
 class _Log:
-    """The rows of log.csv, and a line on the console once a second, up to which all rows are on
-    the disk.
-    """
-
-    _SHOWN = (
-        ("t", "s", "time_s", 1.0, "7.1f"),
-        ("q_ref", "rad", "reference_angle", 1.0, "+8.4f"),
-        ("link", "rad", "link_angle", 1.0, "+8.4f"),
-        ("torque", "N·m", "joint_torque", 1.0, "+8.1f"),
-        ("jitter", "ms", "jitter", 1e3, "+8.2f"),
-        ("overruns", "", "overruns", 1, "9d"),
-        ("missed", "", "missed_replies", 1, "7d"),
-        ("limited", "", "limited", 1, "8d"),
-    )
+    """The rows of log.csv, and once a second a line on the console and all rows on the disk."""
 
     def __init__(self, file: TextIO, console: Console) -> None:
         self.num_rows = 0
@@ -221,20 +179,15 @@ class _Log:
             self._writer = csv.DictWriter(self._file, list(row))
             self._writer.writeheader()
             for heading in (0, 1):
-                self._print(
-                    [f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in self._SHOWN]
-                )
+                cells = [f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in _SHOWN]
+                self._console.print("".join(cells))
         self._writer.writerow(row)
         self.num_rows += 1
         if row["time_s"] >= self._next_s:
             self._next_s += _SHOWN_S
             self._file.flush()
-            self._print(
-                [format(row[key] * factor, spec) for _, _, key, factor, spec in self._SHOWN]
-            )
-
-    def _print(self, cells: list[str]) -> None:
-        self._console.print("".join(cells), soft_wrap=True, highlight=False)
+            cells = [format(row[key] * factor, form) for _, _, key, factor, form in _SHOWN]
+            self._console.print("".join(cells))
 
 
 @contextlib.contextmanager
@@ -246,17 +199,14 @@ def _open_log(path: Path, console: Console) -> Iterator[_Log]:
             yield log
         except BaseException:
             if log.num_rows:
-                console.print(
-                    f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True
-                )
+                console.print(f"cut short; the {log.num_rows} steps until then are in {path}")
             else:
                 path.unlink()
             raise
 
 
 class Emulate(Model):
-    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without
-    hardware.
+    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, to try all without hardware.
 
     Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
     emulate --lost 0.01
@@ -289,19 +239,16 @@ class Emulate(Model):
     fault: list[str] = []
     """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf,
     imu_out_of_range, imu_frozen."""
-    fault_after_s: float = 20.0
+    fault_after_s: float = quantity("s", 20.0, ge=0, le=86_400)
     """When that happens, after the start [s]."""
     seed: int = 0
     """Seed of noise and faults."""
 
     def run(self, console: Console) -> None:
-        """Emulate."""
+        """Emulate until Ctrl-C."""
         switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
         require_known("fault", self.fault, switches)
-        shares = {
-            name: getattr(self, name)
-            for name in ("unheard", "lost", "late", "corrupted", "truncated")
-        }
+        shares = self.model_dump(include={"unheard", "lost", "late", "corrupted", "truncated"})
         config = EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
@@ -310,45 +257,18 @@ class Emulate(Model):
             seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )
-        emulate(config, console, dict.fromkeys(self.fault, True), self.fault_after_s)
-
-
-def emulate(
-    config: EmulatorConfig,
-    console: Console,
-    later: Mapping[str, bool] | None = None,
-    after_s: float = 0.0,
-) -> None:
-    """Emulate until Ctrl-C.
-
-    Args:
-        config: What is emulated.
-        console: Where the ports are said.
-        later: Faults that come after a while, see `Faults`.
-        after_s: When [s].
-
-    Raises:
-        ConfigurationError: That is no time that somebody can wait for.
-    """
-    if not 0.0 <= after_s <= _LATEST_FAULT_S:
-        raise ConfigurationError(
-            f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {quote(after_s)}"
-        )
-    with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
-        console.print(
-            f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True
-        )
-        console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
-        console.print(
-            f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
-            f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
-            soft_wrap=True,
-        )
-        if later:
-            time.sleep(after_s)
-            emulator.faults(**later)
-            console.print(f"from now on: {', '.join(later)}", soft_wrap=True)
-        emulator.wait()
+        with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
+            console.print(f"servos {', '.join(map(str, self.ids))} at {emulator.port}")
+            console.print(f"IMU at {emulator.imu_port}")
+            console.print(
+                f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
+                f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it."
+            )
+            if self.fault:
+                time.sleep(self.fault_after_s)
+                emulator.faults(**dict.fromkeys(self.fault, True))
+                console.print(f"from now on: {', '.join(self.fault)}")
+            emulator.wait()
 
 
 class Hardware(Model):

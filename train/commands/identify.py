@@ -1,12 +1,12 @@
 """`elastic identify`: the static experiment of the testbed, its files and its table."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import gymnasium
-import numpy as np
+import pandas as pd
 import tyro
 from pydantic import model_validator
 from rich.console import Console
@@ -76,8 +76,7 @@ class Identify(Model):
     def run(
         self, console: Console
     ) -> list[Identification] | ArmIdentification | GeometryIdentification | None:
-        """Identify the testbed, simulated or real, or an arm; write `identification.json` and the
-        figure.
+        """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:
             One result per repetition; of an arm its result, or None for a plan without a log.
@@ -89,12 +88,11 @@ class Identify(Model):
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
         given = {"seed": self.seed, "output": self.output}
-        if others := [
-            name for name, value in Identify(**given, arm=self.arm) if value != getattr(self, name)
-        ]:
-            names = ", ".join(
-                "--port and the like" if name == "on" else option_name((name,)) for name in others
-            )
+        alone = Identify(**given, arm=self.arm)
+        others = [name for name, value in alone if value != getattr(self, name)]
+        if others:
+            options = [option_name((name,)) for name in others if name != "on"]
+            names = ", ".join([*options, *["--port and the like"] * ("on" in others)])
             raise ConfigurationError(
                 f"options of the testbed: {names}; leave them out beside --robot and --log"
             )
@@ -103,16 +101,18 @@ class Identify(Model):
     def _identify_testbed(self, console: Console) -> list[Identification]:
         plots.require_matplotlib()
         scenario = self.on.scenario(self.scenario)
-        self._require_one_joint_with_an_imu()
+        hardware = self.on.arguments
+        if hardware:
+            self._require_real_joint(hardware)
         envs = identified_environments(self)
         recorded = {
             **self.model_dump(mode="json", exclude={"output", "on", "arm"}),
             "scenario": scenario,
-            "hardware": self.on.arguments,
+            "hardware": hardware,
         }
         with run_folder("identify", recorded, self.seed, self.output) as folder:
             try:
-                with _progress(self.on.arguments, console) as progress:
+                with _progress(hardware, console) as progress:
                     results, points = identify(envs, self.seed, progress)
             finally:
                 for env in envs:
@@ -125,21 +125,20 @@ class Identify(Model):
             ]
             console.print(result_table(results[0]))
             if self.repeats > 1:
-                repeats = [
-                    {"seed": self.seed + i, **result.model_dump()}
-                    for i, result in enumerate(results)
+                seeds = range(self.seed, self.seed + self.repeats)
+                rows = [
+                    {"seed": seed, **result.model_dump()}
+                    for seed, result in zip(seeds, results, strict=True)
                 ]
-                files.append(write_records(repeats, folder / "repeats.csv"))
-                console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
+                files.append(write_records(rows, folder / "repeats.csv"))
+                truth = float(envs[0].unwrapped.truth().model.stiffness[0])
+                console.print(_spread(pd.DataFrame(rows), results, truth))
         for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+            console.print(f"wrote {path}")
         return results
 
-    def _require_one_joint_with_an_imu(self) -> None:
+    def _require_real_joint(self, hardware: Mapping[str, Any]) -> None:
         """Refuse options that do not go with a real joint."""
-        hardware = self.on.arguments
-        if not hardware:
-            return
         if hardware.get("imu_port") is None:
             raise ConfigurationError(
                 "an identification on hardware needs the link's angle: name the IMU with --imu-port"
@@ -155,11 +154,11 @@ class Identify(Model):
 
 
 @contextmanager
-def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
+def _progress(hardware: Mapping[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
     """A function that takes the share of the work that is done."""
     work = "visiting static positions"
     if hardware:
-        console.print(f"{work} at {hardware['port']}", soft_wrap=True)
+        console.print(f"{work} at {hardware['port']}")
         yield plain_progress(console)
         return
     with show_progress(console, {f"{work}, in %": 100}, transient=True) as show:
@@ -168,31 +167,24 @@ def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[
 
 def result_table(result: Identification) -> Table:
     """An identification as a table."""
-    low = result.stiffness_low_nm_per_rad
-    high = result.stiffness_high_nm_per_rad
-    rows = [
-        ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
-        ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
-        (
-            "  plain line",
-            f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}",
-        ),
-        (
-            "friction",
-            (
-                f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to"
-                f" {result.friction_high_nm:.2f})"
-            ),
-        ),
-        ("dead band", f"{1e3 * result.dead_band_rad:.2f} mrad"),
-        ("offset", f"{1e3 * result.offset_rad:+.2f} mrad"),
-        ("directions differ", "yes (hysteresis)" if result.hysteresis else "no"),
-        ("residual spread", f"{1e3 * result.residual_rad:.3f} mrad"),
-        ("points", f"{result.points} at {result.positions} positions"),
-    ]
-    if result.imu_sine_error_rad is not None:
-        rows.insert(6, ("IMU error ~ sin q", f"{1e3 * result.imu_sine_error_rad:+.2f} mrad"))
-    return make_table("identification", ["", ""], rows, left=2, show_header=False)
+    stiffness = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+    line = f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}"
+    friction = f"{result.friction_low_nm:.2f} to {result.friction_high_nm:.2f}"
+    sine_rad = result.imu_sine_error_rad
+    rows = {
+        "stiffness K": f"{result.stiffness_nm_per_rad:.1f} N·m/rad",
+        "  95 % interval": f"{stiffness} (± {100 * result.half_width:.2f} %)",
+        "  plain line": line,
+        "friction": f"{result.friction_nm:.2f} N·m ({friction})",
+        "dead band": f"{1e3 * result.dead_band_rad:.2f} mrad",
+        "offset": f"{1e3 * result.offset_rad:+.2f} mrad",
+        "IMU error ~ sin q": "" if sine_rad is None else f"{1e3 * sine_rad:+.2f} mrad",
+        "directions differ": "yes (hysteresis)" if result.hysteresis else "no",
+        "residual spread": f"{1e3 * result.residual_rad:.3f} mrad",
+        "points": f"{result.points} at {result.positions} positions",
+    }
+    known = [row for row in rows.items() if row[1]]
+    return make_table("identification", ["", ""], known, left=2, show_header=False)
 
 
 def identified_environments(options: Identify) -> list[Any]:
@@ -207,10 +199,9 @@ def identified_environments(options: Identify) -> list[Any]:
         arguments["num_envs"] = 1
     else:
         name = "elastic_env/Testbed-v0"
-        scenario = options.on.scenario(options.scenario)
         arguments = {
             "num_envs": options.repeats,
-            "scenario": scenario,
+            "scenario": options.on.scenario(options.scenario),
             "stiffness": options.stiffness,
         }
     arguments["reference"] = {"kind": "hold", "positions": options.positions}
@@ -222,18 +213,18 @@ def identified_environments(options: Identify) -> list[Any]:
     ]
 
 
-def _spread(results: Sequence[Identification], truth: float) -> str:
+def _spread(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:
     """Spread over the seeds, and how often the intervals hold the truth."""
-    stiffness = np.array([result.stiffness_nm_per_rad for result in results])
-    covered = sum(
-        r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results
-    )
+    stiffness = table["stiffness_nm_per_rad"]
+    low = table["stiffness_low_nm_per_rad"]
+    high = table["stiffness_high_nm_per_rad"]
+    median = table.median(numeric_only=True)
     widest = max(result.half_width for result in results)
     return (
-        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to"
+        f"{len(table)} seeds: K median {stiffness.median():.1f}, {stiffness.min():.1f} to"
         f" {stiffness.max():.1f} N·m/rad (true {truth:g}); friction median"
-        f" {np.median([r.friction_nm for r in results]):.2f} N·m; r median"
-        f" {np.median([r.pearson_r for r in results]):.4f}; plain line median"
-        f" {np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\nthe 95 % interval holds"
-        f" the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
+        f" {median['friction_nm']:.2f} N·m; r median {median['pearson_r']:.4f}; plain line median"
+        f" {median['line_stiffness_nm_per_rad']:.1f}\nthe 95 % interval holds"
+        f" the true K in {((low <= truth) & (truth <= high)).sum()} of {len(table)}, half-width at"
+        f" most {100 * widest:.2f} %"
     )

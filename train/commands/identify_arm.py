@@ -1,10 +1,8 @@
-"""`elastic identify --robot`: stiffness of an arm from a log of static poses, and poses that
-would tell more.
-"""
+"""`elastic identify --robot`: stiffness of an arm from a log of static poses, and a plan."""
 
-from collections.abc import Sequence
+import fnmatch
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +27,7 @@ from baselines.identification.arm_result import (
     ArmIdentification,
     JointStiffness,
     Source,
-    described,
+    describe_fit,
 )
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
@@ -116,20 +114,17 @@ class _Setting:
         """Whether markers tell geometry and stiffness together."""
         return self.log.kind == "markers" or self.options.markers.geometry is not None
 
-    def model(self, log: PoseLog | None = None) -> PoseModel:
+    def model(self, log: PoseLog) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
-        own = self.log if log is None else log
         has_payload = self.options.payload is not None
-        return PoseModel(
-            self.arm, own, Unknowns.of(own, self.elastic, self.options.frame, has_payload)
-        )
+        unknowns = Unknowns.of(log, self.elastic, self.options.frame, has_payload)
+        return PoseModel(self.arm, log, unknowns)
 
 
 def run_arm_identification(
     options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
 ) -> ArmIdentification | GeometryIdentification | None:
-    """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result;
-    or plan.
+    """Identify an arm, write result, `joints.yaml` and figure, and print the result; or plan poses.
 
     Args:
         options: What to do.
@@ -172,135 +167,105 @@ def run_arm_identification(
         if options.log is None:
             _plan_first(setting, folder, console)
             return None
-        with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(setting.model(), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
-        plan = (
-            plan_further(fit, _candidates(setting, console), options.plan) if options.plan else None
-        )
+        work = {"fitting, steps": USUAL_EVALUATIONS}
+        with show_progress(console, work, transient=True) as show:
+            model = setting.model(setting.log)
+            fit = fit_arm(model, lambda done: show(0, min(done, USUAL_EVALUATIONS)))
+        plan = None
+        if options.plan:
+            plan = plan_further(fit, _candidates(setting, console), options.plan)
         information = None if plan is None else plan.information
-        result = described(fit, options.within, options.assume, information)
+        result = describe_fit(fit, options.within, options.assume, information)
         files = result.save(folder)
-        files.append(draw_arm_identification(fit, result, folder / "identification.png"))
-        files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
+        picture = folder / "identification.png"
+        files.append(draw_arm_identification(fit, result, picture))
+        if plan is not None:
+            files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
     console.print(result_table(result))
-    for line in [summed_up(fit), *remarks(result)]:
-        console.print(line, highlight=False)
-    for path in files:
-        console.print(f"wrote {path}", soft_wrap=True)
+    for line in (summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)):
+        console.print(line)
     return result
 
 
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
-    has_friction = not result.friction_is_noise
-    has_plan = result.joints[0].planned_half_width is not None
+    joints = result.joints
+    columns: dict[str, Sequence[str]] = {
+        "joint": [joint.joint for joint in joints],
+        "K": [_number(_stiffness(joint), ".4g") for joint in joints],
+        "95 % interval": [_interval(joint) for joint in joints],
+        "±": [_percent(joint.half_width) for joint in joints],
+    }
+    if joints[0].planned_half_width is not None:
+        columns["planned ±"] = [_percent(joint.planned_half_width) for joint in joints]
+    if not result.friction_is_noise:
+        columns["F [N·m]"] = [_number(joint.friction_nm) for joint in joints]
+    columns["o [mrad]"] = [_number(joint.offset_rad, ".2f", 1e3) for joint in joints]
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
-    head = [
-        "joint",
-        "K",
-        "95 % interval",
-        "±",
-        *["planned ±"] * has_plan,
-        *["F [N·m]"] * has_friction,
-        "o [mrad]",
-    ]
-    rows = [
-        [
-            joint.joint,
-            *_stiffness_cells(joint),
-            *[_percent(joint.planned_half_width)] * has_plan,
-            *[_number(joint.friction_nm)] * has_friction,
-            _number(joint.offset_rad, 1e3),
-        ]
-        for joint in result.joints
-    ]
-    table = make_table(title, head, rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    rows = zip(*columns.values(), strict=True)
+    table = make_table(title, list(columns), rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for column in table.columns:
         column.no_wrap = True
     return table
 
 
-def remarks(result: ArmIdentification) -> list[str]:
-    """Remarks beside the table: the payload, joints that are not told apart, and poses that do
-    not fit.
-    """
-    lines = []
-    if result.payload_half_width_kg is not None:
-        lines.append(_payload_line(result.payload_kg, result.payload_half_width_kg))
-    for why in dict.fromkeys(joint.reason for joint in result.joints if joint.reason):
-        names = ", ".join(joint.joint for joint in result.joints if joint.reason == why)
-        lines.append(f"not told apart to {100 * result.within:g} %: {names}; {why}")
-    if negative := [joint.joint for joint in result.joints if joint.is_negative]:
-        lines.append(f"{', '.join(negative)}: {NEGATIVE}")
-    lines += _written_lines(result.joints)
+def remarks(result: ArmIdentification) -> Iterator[str]:
+    """Remarks beside the table: payload, joints that are not told apart, poses that do not fit."""
+    joints = result.joints
+    half_width_kg = result.payload_half_width_kg
+    if half_width_kg is not None and result.payload_kg is None:
+        width = f"± {half_width_kg:.3g} kg"
+        yield f"the poses do not tell the payload: its interval is {width} wide"
+    elif half_width_kg is not None:
+        yield f"payload {result.payload_kg:.3f} ± {half_width_kg:.3f} kg"
+    for why in dict.fromkeys(joint.reason for joint in joints if joint.reason):
+        names = ", ".join(joint.joint for joint in joints if joint.reason == why)
+        yield f"not told apart to {100 * result.within:g} %: {names}; {why}"
+    if negative := [joint.joint for joint in joints if joint.is_negative]:
+        yield f"{', '.join(negative)}: {NEGATIVE}"
+    for source, text in _WRITTEN.items():
+        own = [joint for joint in joints if joint.source == source]
+        names = ", ".join(
+            joint.joint
+            if source == "rigid"
+            else f"{joint.joint} {joint.stiffness_nm_per_rad:.4g} N·m/rad"
+            for joint in own
+        )
+        if own:
+            yield text.format(names)
     usual = USUAL_NOISE[result.measurement]
     if result.residual_spread > FAR_BEYOND * usual:
-        lines.append(
+        yield (
             f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}:"
             " look for other elastic joints, another frame (--frame) or body (--end-effector),"
             " friction, and errors of the model"
         )
     if result.outlying_poses:
-        lines.append(
-            f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check"
-            " them"
-        )
+        poses = ", ".join(map(str, result.outlying_poses))
+        yield f"poses that do not fit the others: {poses}; check them"
     if result.held_joints:
-        lines.append(
-            "not in the log, and taken as held where the model has them:"
-            f" {', '.join(result.held_joints)}"
+        held = ", ".join(result.held_joints)
+        yield f"not in the log, and taken as held where the model has them: {held}"
+    unknown = [joint for joint in joints if joint.reason]
+    if unknown and joints[0].planned_half_width is None:
+        yield "--plan 20 proposes poses that tell more"
+    helpless = [one.joint for one in unknown if (one.planned_half_width or 0.0) > 1.0]
+    if helpless:
+        yield (
+            f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the"
+            " measurement must show it; tilt the base, hang on a weight, or measure it by hand"
         )
-    if any(joint.reason for joint in result.joints) and result.joints[0].planned_half_width is None:
-        lines.append("--plan 20 proposes poses that tell more")
-    return lines + _beyond_any_plan(result.joints)
 
 
-def _payload_line(mass_kg: float | None, half_width_kg: float) -> str:
-    """The payload, or why there is none."""
-    if mass_kg is None:
-        return f"the poses do not tell the payload: its interval is ± {half_width_kg:.3g} kg wide"
-    return f"payload {mass_kg:.3f} ± {half_width_kg:.3f} kg"
-
-
-def _written_lines(joints: Sequence[JointStiffness]) -> list[str]:
-    """Values in `joints.yaml` of joints whose interval reaches to rigid."""
-    says: dict[Source, str] = {
-        "no upper end": (
-            "joints.yaml has the estimate, {}, although the interval reaches to rigid; --assume"
-            " changes it"
-        ),
-        "rigid": "joints.yaml has {} as rigid (.inf); --assume changes it",
-        "assumed": "joints.yaml has the assumed K for {}",
-    }
-    lines = []
-    for source, text in says.items():
-        own = [joint for joint in joints if joint.source == source]
-        names = ", ".join(
-            (
-                joint.joint
-                if source == "rigid"
-                else f"{joint.joint} {joint.stiffness_nm_per_rad:.4g} N·m/rad"
-            )
-            for joint in own
-        )
-        if own:
-            lines.append(text.format(names))
-    return lines
-
-
-def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
-    """Joints for which no proposed pose helps."""
-    helpless = [
-        j.joint
-        for j in joints
-        if j.planned_half_width is not None and j.reason and j.planned_half_width > 1.0
-    ]
-    if not helpless:
-        return []
-    return [
-        f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the"
-        " measurement must show it; tilt the base, hang on a weight, or measure it by hand"
-    ]
+_WRITTEN: dict[Source, str] = {
+    "no upper end": (
+        "joints.yaml has the estimate, {}, although the interval reaches to rigid; --assume"
+        " changes it"
+    ),
+    "rigid": "joints.yaml has {} as rigid (.inf); --assume changes it",
+    "assumed": "joints.yaml has the assumed K for {}",
+}
+"""Remarks on joints whose interval reaches to rigid."""
 
 
 def _candidates(setting: _Setting, console: Console) -> PoseLog:
@@ -315,9 +280,7 @@ def _candidates(setting: _Setting, console: Console) -> PoseLog:
 
 
 def shaped_model(path: str) -> mujoco.MjModel:
-    """The model with its collision shapes; that of `compiled_model` where MuJoCo cannot read the
-    shapes.
-    """
+    """The model with its collision shapes, or without them where MuJoCo cannot read them."""
     plain = compiled_model(path)
     try:
         shaped = from_mujoco(
@@ -345,25 +308,25 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
         )
     setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
     if options.log is not None and not setting.seeks_geometry:
-        require_poses(setting.model())
+        require_poses(setting.model(log))
     return setting
 
 
 def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
-    low, high = (
-        model.joint(joint).range if model.jnt_limited[model.joint(joint).id] else (-np.inf, np.inf)
-    )
+    hinge = model.joint(joint)
+    low, high = hinge.range if model.jnt_limited[hinge.id] else (-np.inf, np.inf)
     return float(low), float(high)
 
 
 def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     """Joints that a name or pattern fits, in the order of the log."""
+    chosen = set[str]()
     for pattern in patterns:
-        if not any(fnmatchcase(joint, pattern) for joint in joints):
+        fitting = fnmatch.filter(joints, pattern)
+        if not fitting:
             raise unknown_name("joint or pattern of the log's joints", pattern, joints)
-    return tuple(
-        joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns)
-    )
+        chosen.update(fitting)
+    return tuple(joint for joint in joints if joint in chosen or not patterns)
 
 
 def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
@@ -374,50 +337,40 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
-    half = (
-        1.96
-        * np.sqrt(np.diag(np.linalg.inv(plan.information))[own])
-        * model.scale[own]
-        / start[own]
-    )
-    rows = [
-        (joint, _percent(float(width))) for joint, width in zip(setting.elastic, half, strict=True)
-    ]
-    console.print(
-        make_table(f"{len(plan.theta)} proposed poses", ["joint", "expected ± of K"], rows)
-    )
+    spread = np.sqrt(np.diag(np.linalg.inv(plan.information))[own])
+    half = 1.96 * spread * model.scale[own] / start[own]
+    rows = [(j, _percent(float(width))) for j, width in zip(setting.elastic, half, strict=True)]
+    head = ["joint", "expected ± of K"]
+    console.print(make_table(f"{len(plan.theta)} proposed poses", head, rows))
     console.print(
         f"expected for noise of {in_unit(noise, setting.log.kind)} and"
         f" {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of deflection under the largest gravity torque of"
-        " each joint; half the deflection doubles it",
-        highlight=False,
+        " each joint; half the deflection doubles it"
     )
-    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True)
+    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}")
 
 
 def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
     columns = {f"theta.{joint}": plan.theta[:, i] for i, joint in enumerate(arm.joints)}
     if plan.direction is not None:
-        columns |= {
-            f"direction.{joint}": plan.direction[:, i] for i, joint in enumerate(arm.joints)
-        }
+        for i, joint in enumerate(arm.joints):
+            columns[f"direction.{joint}"] = plan.direction[:, i]
     return write_poses(path, columns)
 
 
-def _stiffness_cells(joint: JointStiffness) -> list[str]:
-    low = joint.stiffness_low_nm_per_rad
-    high = joint.stiffness_high_nm_per_rad
-    if low is None or high is None:
-        return ["–", "–", _percent(joint.half_width)]
-    return [
-        f"{joint.stiffness_nm_per_rad:.4g}",
-        f"{low:.4g} to {high:.4g}",
-        _percent(joint.half_width),
-    ]
+def _stiffness(joint: JointStiffness) -> float | None:
+    has_interval = None not in (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
+    return joint.stiffness_nm_per_rad if has_interval else None
 
 
-def _number(value: float | None, scale: float = 1.0) -> str:
-    return "–" if value is None else f"{scale * value:.2f}"
+def _interval(joint: JointStiffness) -> str:
+    low = _number(joint.stiffness_low_nm_per_rad, ".4g")
+    high = _number(joint.stiffness_high_nm_per_rad, ".4g")
+    return "–" if "–" in (low, high) else f"{low} to {high}"
+
+
+def _number(value: float | None, form: str = ".2f", scale: float = 1.0) -> str:
+    return "–" if value is None else format(scale * value, form)
 
 
 def _percent(half: float | None) -> str:

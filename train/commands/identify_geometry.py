@@ -111,7 +111,7 @@ def pose_problem(
         for j in range(model.njnt)
         if model.joint(j).name not in log.joints
     }
-    tree = Tree.of(model, log.joints, held, gravcomp=True)
+    tree = Tree.of(model, log.joints, held)
     names = [end_effector]
     if log.kind == "markers":
         names = [column.removesuffix(".x") for column in log.columns[::3]]

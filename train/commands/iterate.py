@@ -1,13 +1,11 @@
-"""`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as
-a policy.
-"""
+"""`elastic iterate`: learn offsets from trial to trial, and write them as a policy."""
 
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 from pydantic import model_validator
 from rich.console import Console
 from rich.table import Table
@@ -35,8 +33,9 @@ _MOST_ROBOTS = 64
 
 
 class Iterate(Model):
-    """Learn on the robot itself, from walk to walk: iterative learning control, without any
-    training in simulation.
+    """Learn on the robot itself, from walk to walk: iterative learning control.
+
+    Nothing is trained in simulation.
 
     After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on
     the testbed the IMU of the link, have shown at the same time. Prints a table trial by trial;
@@ -95,8 +94,7 @@ class Iterate(Model):
         )
 
     def run(self, console: Console) -> list[Trial]:
-        """Learn, play a last trial with what was learned, write the run, and print a table of the
-        trials.
+        """Learn, play a last trial with what was learned, write the run, and print the trials.
 
         Returns:
             The trials; the first has no offsets, the last has what was learned.
@@ -121,9 +119,9 @@ class Iterate(Model):
                 policies = _save(self, env, policy, folder)
         console.print(trials_table(trials, columns, condition))
         for path in files:
-            console.print(f"wrote {path}", soft_wrap=True)
+            console.print(f"wrote {path}")
         for path in policies:
-            console.print(f"play it as iterative:{path}", soft_wrap=True)
+            console.print(f"play it as iterative:{path}")
         return trials
 
 
@@ -142,56 +140,33 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
 
 
 def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
-    """The judged metrics and the failures of every trial, the mean over the robots that did not
-    fail.
-    """
+    """Judged metrics of every trial, means over the robots that did not fail, and failures."""
     title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
     head = ["trial", *(column.label for column in columns), condition.environment.failures]
     rows = []
     for trial in trials:
-        values = [
-            f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}"
-            for column in columns
-        ]
-        rows.append(
-            [str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"]
-        )
+        survived = pd.DataFrame(trial.metrics)[~trial.failed]
+        means = [column.scale * survived[column.metric].mean() for column in columns]
+        scores = [f"{m:.{column.decimals}f}" for m, column in zip(means, columns, strict=True)]
+        failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
+        rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)
-
-
-def trial_mean(trial: Trial, metric: str) -> float:
-    """A metric of a trial, the mean over the robots that did not fail; nan where all did."""
-    found = [
-        metrics[metric]
-        for metrics, failed in zip(trial.metrics, trial.failed, strict=True)
-        if not failed
-    ]
-    return float(np.mean(found)) if found else float("nan")
 
 
 def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
     """One row per robot and trial: what the sensors showed, and the metrics."""
-    rows = [
-        {
-            "trial": trial.number,
-            "seed": seed + robot,
-            "failed": bool(trial.failed[robot]),
-            **{
-                f"measured_{name}": rms
-                for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True)
-            },
-            **metrics,
-        }
-        for trial in trials
-        for robot, metrics in enumerate(trial.metrics)
-    ]
+    rows = []
+    for trial in trials:
+        for robot, metrics in enumerate(trial.metrics):
+            row = {"trial": trial.number, "seed": seed + robot, "failed": bool(trial.failed[robot])}
+            for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True):
+                row[f"measured_{name}"] = rms
+            rows.append({**row, **metrics})
     return write_records(rows, path)
 
 
 def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-    """Write the offsets of every robot: to the folder itself for one, else to folders by their
-    seeds.
-    """
+    """Write the offsets of every robot: to the folder itself for one, else to folders by seed."""
     model = env.unwrapped.assumed_model
     base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
     folders = []

@@ -1,9 +1,7 @@
-"""Options that several commands of `elastic` share, and how the text of an option becomes a
-value.
-"""
+"""Options that several commands share, and how the text of an option becomes a value."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,9 +31,13 @@ _TEXT = PrimitiveConstructorSpec(
 )
 
 
+def _read_yaml(text: Any) -> Any:
+    return parse_yaml(text) if isinstance(text, str) else text
+
+
 def _read_reference(text: Any) -> Any:
     try:
-        value = parse_yaml(text) if isinstance(text, str) else text
+        value = _read_yaml(text)
     except yaml.YAMLError:
         raise ConfigurationError(
             f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}'"
@@ -45,11 +47,11 @@ def _read_reference(text: Any) -> Any:
 
 
 def _read_stiffness(text: Any) -> Any:
-    try:
-        value = parse_yaml(text) if isinstance(text, str) else text
-    except yaml.YAMLError:
-        return text
-    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
+    with suppress(yaml.YAMLError):
+        value = _read_yaml(text)
+        if isinstance(value, int | float | list) and not isinstance(value, bool):
+            return value
+    return text
 
 
 Motion = Annotated[GivenReference, BeforeValidator(_read_reference), _TEXT]
@@ -68,9 +70,7 @@ PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 
 
 class Mounting(HardwareSettings):
-    """Content of the file of `--mounting`: wiring and mounting of the testbed, and the pendulum
-    that hangs there.
-    """
+    """Content of the file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
 
     pendulum: Pendulum = Pendulum()
 
@@ -111,20 +111,15 @@ class OnHardware(Model):
             "confirm": False if self.yes else None,
         }
         given = {name: value for name, value in options.items() if value is not None}
-        chosen = (
-            Mounting(**given)
-            if self.mounting is None
-            else load_yaml(self.mounting, Mounting, given)
-        )
-        names = chosen.model_fields_set | options.keys() | {"limits"}
-        values = {name: getattr(chosen, name) for name in names}
+        if self.mounting is None:
+            chosen = Mounting(**given)
+        else:
+            chosen = load_yaml(self.mounting, Mounting, given)
+        values = chosen.model_dump(include={*chosen.model_fields_set, *options, "limits"})
         if self.patient:
-            values["limits"] = chosen.limits.replace(**PATIENT_LIMITS)
+            values["limits"] |= PATIENT_LIMITS
             values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
-        return {
-            name: value.model_dump() if isinstance(value, Model) else value
-            for name, value in values.items()
-        }
+        return values
 
     def environment(self, env: str) -> dict[str, Any]:
         """The environment of a comparison: the named one, or a real testbed with its arguments.
@@ -143,8 +138,7 @@ class OnHardware(Model):
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
-        """The named scenario, or the default; on hardware, which has none, the word for it in
-        tables.
+        """The named scenario, or the default; on hardware the word for it in tables.
 
         Raises:
             ConfigurationError: A scenario is named for hardware.
@@ -175,10 +169,8 @@ def option_name(path: ParameterPath) -> str:
 
 @contextmanager
 def name_options() -> Iterator[None]:
-    """Let errors of a configuration that is made from options name the options in place of its
-    parameters.
-    """
+    """Let errors of a configuration that is made from options name the options."""
     try:
         yield
     except ModelError as error:
-        raise ConfigurationError(error.named(spelt=option_name)) from None
+        raise ConfigurationError(error.describe(spelt=option_name)) from None

@@ -81,7 +81,7 @@ def steps_within(task: Any, max_s: float | None) -> int:
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
     """Let a policy learn on the robot, out of sight."""
-    console.print(f"{condition.policy.title} learns on this robot first", soft_wrap=True)
+    console.print(f"{condition.policy.title} learns on this robot first")
     with closing(make_vector_env(condition, 1)) as unseen:
         policy.rehearse(unseen, condition.seed)
 
@@ -126,23 +126,24 @@ def _film(
     except ImportError:
         raise missing_extra("imageio", "report", "writing a video") from None
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
-    video.parent.mkdir(parents=True, exist_ok=True)
-    writer: Any
     frame_s = every * period
     frames = 0
-    gif = io.BytesIO()
-    is_gif = video.suffix == ".gif"
-    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
+    video.parent.mkdir(parents=True, exist_ok=True)
     # a GIF is made in memory in any case, and its writer would print what a full disk makes it
     # raise
-    target: Any = gif if is_gif else video
-    with imageio.get_writer(target, "gif" if is_gif else None, **timing) as writer:
+    memory = io.BytesIO()
+    is_gif = video.suffix == ".gif"
+    if is_gif:
+        writer: Any = imageio.get_writer(memory, "gif", duration=1e3 * frame_s)
+    else:
+        writer = imageio.get_writer(video, fps=1.0 / frame_s)
+    with writer:
         for step in track(episode, "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())
                 frames += 1
     if is_gif:
-        video.write_bytes(gif.getbuffer())
+        video.write_bytes(memory.getbuffer())
     else:
         _require_whole(video, frames)
     console.print(f"wrote {video}")
@@ -187,14 +188,16 @@ class WatchedEpisode(Model):
     @property
     def condition(self) -> Condition:
         """The cell that is played."""
-        watched = environment(self.env).watched_reference if self.reference is None else None
+        reference = self.reference
+        if reference is None:
+            reference = environment(self.env).watched_reference
         with name_options():
             return Condition(
                 env=self.env,
                 policy=PolicySpec(name=self.policy),
                 scenario=self.scenario,
                 seed=self.seed,
-                reference=reference_of(self.env, self.reference) if watched is None else watched,
+                reference=reference_of(self.env, reference),
             )
 
 

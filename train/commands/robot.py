@@ -1,16 +1,16 @@
-"""`elastic robot`: a robot from its model, made elastic, played with and without compensation, in
-one call.
+"""`elastic robot`: a robot from its model, made elastic, played with and without compensation.
 
 Its folder holds the robot's file, a comparison with report, a picture, and the two tables that it
 prints.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
+import PIL.Image
 import tyro
 from pydantic import Field
 from rich import box
@@ -37,8 +37,8 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.figures import plots
-from train.report import require_jinja2, require_plotly
-from train.runs.console import make_table
+from train.report.write import require_libraries
+from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 
@@ -54,8 +54,7 @@ _POSES_SHOWN = 2
 
 
 class Robot(Model):
-    """Try a robot of your own: make its joints elastic, play it with and without compensation, and
-    say what it gains.
+    """Try a robot of your own: make its joints elastic and say what compensation gains.
 
     Plays static poses and a motion with the policies uncompensated, input and dynamic, in the
     scenario nominal: with friction and encoders as the joints file has them. Prints the error of
@@ -98,75 +97,18 @@ class Robot(Model):
 
     def run(self, console: Console) -> None:
         """Play, write, print."""
-        result = try_robot(self, console)
-        console.print(f"Results in {result.folder}:", soft_wrap=True)
-        for path in result.files:
-            console.print(f"  {path}", soft_wrap=True)
+        print_files(*try_robot(self, console), console)
 
 
-@dataclass(frozen=True)
-class Placed:
-    """How far the end effector is from where it should be, as it was played.
-
-    Attributes:
-        motion: Reference that was played.
-        policy: Policy that commanded.
-        error_rms_m: Distance, rms over what is scored [m]; nan where the episode failed.
-        error_peak_m: Its largest [m].
-    """
-
-    motion: str
-    policy: str
-    error_rms_m: float
-    error_peak_m: float
-
-
-@dataclass(frozen=True)
-class JointShare:
-    """Share of a joint in the error of the end effector at rest, uncompensated and without
-    friction.
-
-    Attributes:
-        joint: Its name.
-        stiffness_Nm_per_rad: K of its transmission.
-        position_gain_Nm_per_rad: k_p of a servo that gives way; infinite where the servo holds its
-            angle.
-        gravity_torque_rms_Nm: Torque that it carries, rms over the poses.
-        deflection_rms_rad: How far its link is from the command, rms over the poses; a servo that
-            gives way adds to it.
-        end_effector_rms_m: How far that alone moves the end effector, rms over the poses.
-        share: Part of the error that it explains; the joints together make 1, and one that helps
-            another is negative.
-        friction_leaves_m: How far friction F can hold the end effector off by F/K, rms over the
-            poses.
-    """
-
-    joint: str
-    stiffness_Nm_per_rad: float
-    position_gain_Nm_per_rad: float
-    gravity_torque_rms_Nm: float
-    deflection_rms_rad: float
-    end_effector_rms_m: float
-    share: float
-    friction_leaves_m: float
-
-
-@dataclass(frozen=True)
-class RobotResult:
-    """Results of the trial, and its files."""
-
-    folder: Path
-    placed: list[Placed]
-    shares: list[JointShare]
-    files: list[Path]
-
-
-def try_robot(trial: Robot, console: Console) -> RobotResult:
+def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     """Make a robot elastic, play it with every policy, write its folder, and print its tables.
 
     Args:
         trial: The robot and its motion.
         console: Where progress and tables go.
+
+    Returns:
+        The folder and its files.
 
     Raises:
         ConfigurationError: The model, its joints or the motion cannot be used; found before a
@@ -175,8 +117,7 @@ def try_robot(trial: Robot, console: Console) -> RobotResult:
         MissingExtraError: A package for reports or videos is missing.
     """
     plots.require_matplotlib()
-    require_plotly()
-    require_jinja2()
+    require_libraries()
     arguments = robot_arguments(trial)
     moving, config = (
         configure_robot(**arguments, reference=reference, scenario=SCENARIO)
@@ -191,20 +132,35 @@ def try_robot(trial: Robot, console: Console) -> RobotResult:
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
-        comparison = compare(_comparison(trial, file), console, folder / "comparison")
+        played = CompareConfig(
+            name="robot",
+            env=str(file),
+            references=[trial.poses.model_dump(mode="json"), trial.motion],
+            scenarios=[SCENARIO],
+            policies=[PolicySpec(name=name) for name in POLICIES],
+            seed=trial.seed,
+        )
+        comparison = compare(played, console, folder / "comparison")
         placed = [_placement(one) for one in comparison.evaluations]
         shares = joint_shares(plant)
         files = [
             file,
             comparison.folder / "report.html",
-            write_records([asdict(one) for one in placed], folder / "end_effector.csv"),
-            write_records([asdict(one) for one in shares], folder / "joints.csv"),
-            *_pictures(config, plant, folder, console),
-            *(_films(trial, file, folder, console) if trial.video else []),
+            write_records(placed, folder / "end_effector.csv"),
+            write_records(shares.to_dict("records"), folder / "joints.csv"),
         ]
-    for table in (_placed_table(placed), _shares_table(shares)):
-        console.print(table)
-    return RobotResult(folder, placed, shares, files)
+        try:
+            image = picture(config, plant)
+        except ElasticError as error:  # this machine cannot draw
+            console.print(f"no picture: {error}")
+        else:
+            files.append(folder / "picture.png")
+            PIL.Image.fromarray(image).save(files[-1], optimize=True)
+        if trial.video:
+            files += _films(trial, file, folder, console)
+    console.print(_placed_table(placed))
+    console.print(_shares_table(shares))
+    return folder, files
 
 
 def robot_arguments(trial: Robot) -> dict[str, Any]:
@@ -214,8 +170,15 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
         ConfigurationError: There is no such file or robot, or the stiffness is missing.
     """
     arguments = _of_model(trial.model)
-    if trial.stiffness is not None:
-        arguments["joints"] = _given_joints(trial.stiffness)
+    stiffness = trial.stiffness
+    if isinstance(stiffness, str):
+        arguments["joints"] = dict(read_mapping(Path(stiffness)))
+    elif stiffness is not None:
+        if not stiffness > 0.0:
+            raise ConfigurationError(
+                f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
+            )
+        arguments["joints"] = {"*": stiffness}
     if trial.end_effector is not None:
         arguments["end_effector"] = trial.end_effector
     return arguments
@@ -251,10 +214,9 @@ def _of_gallery(name: str) -> dict[str, Any]:
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
-    joints = {name: _settings(joint) for name, joint in gallery_joints(name).items()}
     return {
         "model": model,
-        "joints": joints,
+        "joints": {name: _settings(joint) for name, joint in gallery_joints(name).items()},
         "end_effector": end_effector,
         "home": dict(known.home),
     }
@@ -271,20 +233,8 @@ def _settings(joint: ElasticJoint) -> dict[str, Any]:
     }
 
 
-def _given_joints(stiffness: str | float) -> dict[str, Any]:
-    """Elastic joints of a file, or of one K."""
-    if isinstance(stiffness, str):
-        return dict(read_mapping(Path(stiffness)))
-    if not stiffness > 0.0:
-        raise ConfigurationError(
-            f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
-        )
-    return {"*": stiffness}
-
-
 def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
-    """Write a robot's file and its joints into a folder; the model stays where it is, unless it is
-    text.
+    """Write a robot's file and its joints into a folder; the model stays, unless it is text.
 
     Args:
         arguments: Of `elastic_env/Robot-v0`.
@@ -308,29 +258,18 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
     return folder / "robot.yaml"
 
 
-def _comparison(trial: Robot, file: Path) -> CompareConfig:
-    references = [trial.poses.model_dump(mode="json"), trial.motion]
-    return CompareConfig(
-        name="robot",
-        env=str(file),
-        references=references,
-        scenarios=[SCENARIO],
-        policies=[PolicySpec(name=name) for name in POLICIES],
-        seed=trial.seed,
-    )
+def _placement(evaluation: Evaluation) -> dict[str, Any]:
+    """Distance of the end effector from its target, rms and peak [m]; nan for a failed episode."""
 
-
-def _placement(evaluation: Evaluation) -> Placed:
     def only(metric: str) -> float:
-        values = evaluation.values(metric)
-        return float(values[0]) if len(values) else float("nan")
+        return next(map(float, evaluation.values(metric)), float("nan"))
 
-    return Placed(
-        evaluation.condition.reference_name,
-        evaluation.condition.policy.title,
-        only("end_effector_error_rms_m"),
-        only("end_effector_error_peak_m"),
-    )
+    return {
+        "motion": evaluation.condition.reference_name,
+        "policy": evaluation.condition.policy.title,
+        "error_rms_m": only("end_effector_error_rms_m"),
+        "error_peak_m": only("end_effector_error_peak_m"),
+    }
 
 
 def rest_poses(plant: JointPlant) -> Array:
@@ -339,7 +278,7 @@ def rest_poses(plant: JointPlant) -> Array:
     return plan.q[np.unique(plan.rest, return_index=True)[1][int(plan.rest.min() < 0) :]]
 
 
-def joint_shares(plant: JointPlant) -> list[JointShare]:
+def joint_shares(plant: JointPlant) -> pd.DataFrame:
     r"""Shares of the joints in the error of the end effector at rest, in closed form.
 
     Nothing is played: a link rests where spring and weight balance, K(θ − q) = τ_g(q), with θ =
@@ -348,37 +287,40 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
 
     .. math:: e = \sum_j J_j(q_{ref}) (q_j - q_{ref,j}), \quad s_j = \frac{\sum e \cdot e_j}{\sum e \cdot e}
 
-    with e_j the term of joint j, and sums over the poses. The shares s_j add up to 1.
+    with e_j the term of joint j, and sums over the poses. The shares s_j add up to 1; that of a
+    joint that helps another is negative.
 
     Args:
         plant: A robot with an end effector, and static poses as its reference.
+
+    Returns:
+        A row for each joint: K; the gain k_p of its servo, infinite where that holds its angle;
+        rms over the poses of gravity torque, of deflection from the command, of what that alone
+        moves the end effector, and of how far friction F can hold it off by F/K; and its share.
     """  # noqa: E501
     tool = plant.end_effector
     assert tool is not None
     q_ref = rest_poses(plant)
     q = plant.rest_angle(q_ref)
     parts = tool.parts(q_ref, q)
-    torque = plant.static_torque(q)
     error = parts.sum(axis=-1)
-    shares = np.einsum("pi,pij->j", error, parts) / max(
-        float(np.sum(error**2)), np.finfo(np.float64).tiny
-    )
+    whole = max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
     lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
     friction = lever * plant.true.coulomb_friction / plant.true.rest_stiffness("tendon")
     with np.errstate(divide="ignore"):
         position_gain = 1.0 / plant.true.servo_compliance
-    columns = zip(
-        plant.joint_names,
-        plant.true.stiffness,
-        position_gain,
-        _rms(torque),
-        _rms(q - q_ref),
-        _rms(np.linalg.norm(parts, axis=1)),
-        shares,
-        _rms(friction),
-        strict=True,
+    return pd.DataFrame(
+        {
+            "joint": plant.joint_names,
+            "stiffness_Nm_per_rad": plant.true.stiffness,
+            "position_gain_Nm_per_rad": position_gain,
+            "gravity_torque_rms_Nm": _rms(plant.static_torque(q)),
+            "deflection_rms_rad": _rms(q - q_ref),
+            "end_effector_rms_m": _rms(np.linalg.norm(parts, axis=1)),
+            "share": np.einsum("pi,pij->j", error, parts) / whole,
+            "friction_leaves_m": _rms(friction),
+        }
     )
-    return [JointShare(name, *map(float, values)) for name, *values in columns]
 
 
 def _rms(values: Array) -> Array:
@@ -386,23 +328,8 @@ def _rms(values: Array) -> Array:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def _pictures(config: RobotConfig, plant: JointPlant, folder: Path, console: Console) -> list[Path]:
-    """The picture, or none on a machine that cannot draw."""
-    try:
-        image = picture(config, plant)
-    except ElasticError as error:
-        console.print(f"no picture: {error}", soft_wrap=True, markup=False)
-        return []
-    import PIL.Image
-
-    path = folder / "picture.png"
-    PIL.Image.fromarray(image).save(path, optimize=True)
-    return [path]
-
-
 def picture(config: RobotConfig, plant: JointPlant) -> Image:
-    """The poses with the largest sag, in rows: left without, right with the command of
-    `PositionCompensator`.
+    """The poses with the largest sag, in rows: left without compensation, right with it.
 
     It is in closed form, as `joint_shares`. Deviations from the translucent reference are enlarged.
 
@@ -412,9 +339,7 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     tool = plant.end_effector
     assert tool is not None
     known = plant.assumed
-    in_series = known.rest_stiffness(
-        "tendon"
-    ).tolist()  # of spring and servo, as the command has to lead both
+    in_series = known.rest_stiffness("tendon").tolist()  # spring and servo: the command leads both
     compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
     q_ref = rest_poses(plant)
     order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
@@ -426,12 +351,10 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
         errors = 1e3 * tool.errors(twice, links)[0]
         caption = [
             f"end effector off by {errors[0]:.2f} mm without, {errors[1]:.3f} mm with compensation",
-            (
-                "at rest without friction; deviations from the translucent reference drawn x"
-                f" {ENLARGED:g}"
-            ),
+            "at rest without friction; deviations from the translucent reference drawn x"
+            f" {ENLARGED:g}",
         ]
-        rows.append(with_text(views.drawn(twice, links), caption))
+        rows.append(with_text(views.draw(twice, links), caption))
     return np.concatenate(rows)
 
 
@@ -451,41 +374,43 @@ def _films(trial: Robot, file: Path, folder: Path, console: Console) -> list[Pat
     return films
 
 
-def _placed_table(placed: Sequence[Placed]) -> Table:
+def _placed_table(placed: Sequence[dict[str, Any]]) -> Table:
     rows = []
-    for motion in dict.fromkeys(one.motion for one in placed):
-        errors = [1e3 * one.error_rms_m for one in placed if one.motion == motion]
+    for motion in dict.fromkeys(one["motion"] for one in placed):
+        errors = [1e3 * one["error_rms_m"] for one in placed if one["motion"] == motion]
         best = min((error for error in errors[1:] if not np.isnan(error)), default=np.nan)
         left = best / errors[0] if errors[0] > 0.0 else np.nan
         cells = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
         rows.append([motion, *cells, "-" if np.isnan(left) else f"{100.0 * left:.1f} %"])
-    return make_table(
-        "end effector, rms error [mm]", ["motion", *POLICIES, "left by the best"], rows, **_STYLE
-    )
+    head = ["motion", *POLICIES, "left by the best"]
+    return make_table("end effector, rms error [mm]", head, rows, **_STYLE)
 
 
-def _shares_table(shares: Sequence[JointShare]) -> Table:
-    gives_way = any(np.isfinite(one.position_gain_Nm_per_rad) for one in shares)
-    columns = {
-        "joint": [one.joint for one in shares],
-        "K\nNm/rad": [f"{one.stiffness_Nm_per_rad:.4g}" for one in shares],
-        "k_p\nNm/rad": [f"{one.position_gain_Nm_per_rad:.4g}" for one in shares],
-        "torque\nNm": [f"{one.gravity_torque_rms_Nm:.2f}" for one in shares],
-        "deflection\nmrad": [f"{1e3 * one.deflection_rms_rad:.2f}" for one in shares],
-        "alone\nmm": [f"{1e3 * one.end_effector_rms_m:.2f}" for one in shares],
-        "share\n%": [f"{100.0 * one.share:.1f}" for one in shares],
-        "F/K\nmm": [f"{1e3 * one.friction_leaves_m:.2f}" for one in shares],
-    }
-    if not gives_way:
+_SHARES = {
+    "K\nNm/rad": ("stiffness_Nm_per_rad", 1.0, ".4g"),
+    "k_p\nNm/rad": ("position_gain_Nm_per_rad", 1.0, ".4g"),
+    "torque\nNm": ("gravity_torque_rms_Nm", 1.0, ".2f"),
+    "deflection\nmrad": ("deflection_rms_rad", 1e3, ".2f"),
+    "alone\nmm": ("end_effector_rms_m", 1e3, ".2f"),
+    "share\n%": ("share", 100.0, ".1f"),
+    "F/K\nmm": ("friction_leaves_m", 1e3, ".2f"),
+}
+"""Columns of the table of joints: figure, factor and format."""
+
+
+def _shares_table(shares: pd.DataFrame) -> Table:
+    columns = {"joint": list(shares["joint"])}
+    for head, (name, factor, form) in _SHARES.items():
+        columns[head] = [format(factor * value, form) for value in shares[name]]
+    if not np.isfinite(shares["position_gain_Nm_per_rad"]).any():
         del columns["k_p\nNm/rad"]
     caption = (
         "closed form, uncompensated: springs and servos that give way; F/K is what friction can"
         " leave"
     )
     rows = zip(*columns.values(), strict=True)
-    table = make_table(
-        "where the error at rest comes from", list(columns), rows, caption=caption, **_STYLE
-    )
+    title = "where the error at rest comes from"
+    table = make_table(title, list(columns), rows, caption=caption, **_STYLE)
     for column in table.columns[1:]:
         column.vertical = "bottom"
     return table

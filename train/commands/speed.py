@@ -1,6 +1,4 @@
-"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO, in
-one run.
-"""
+"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO."""
 
 import cProfile
 import importlib
@@ -8,15 +6,13 @@ import io
 import json
 import os
 import pstats
-import statistics
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 from rich.console import Console
-from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
@@ -25,15 +21,16 @@ from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
 from train.speed.contenders import (
+    IN_PROCESSES,
+    IN_THIS_PROCESS,
     Contender,
-    GymnasiumLoop,
+    ForeignLoop,
     PPOLoop,
     RawWorlds,
-    SB3Loop,
     ScalarLoop,
     VectorLoop,
 )
-from train.speed.real_time import measure_real_time
+from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2
 
@@ -99,115 +96,141 @@ class Speed(Model):
         return self.policy or environment(self.env).looped_policy
 
     def run(self, console: Console) -> None:
-        """Measure and report."""
+        """Measure, print, and write what was measured."""
         if self.real_time:
-            path = measure_real_time(self.env, self.policy, self.seconds, console, self.output)
+            path = measure_real_time(self, console)
         else:
-            path = measure_all(self, console)
-        console.print(f"wrote {path}", soft_wrap=True)
+            path = measure_throughput(self, console)
+        console.print(f"wrote {path}")
 
 
-@dataclass(frozen=True)
-class SpeedResult:
-    """Medians over the rounds of one interleaved run.
-
-    Attributes:
-        env: Environment.
-        contender: What was timed.
-        num_envs: Its worlds.
-        threads: Threads of the physics.
-        steps_per_s: Control steps per second, all worlds together.
-        ratio: Median of the rounds' ratios to `against`.
-        against: What the ratio refers to, with its worlds.
-    """
-
-    env: str
-    contender: str
-    num_envs: int
-    threads: int
-    steps_per_s: float
-    ratio: float
-    against: str
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A contender, and the number of the one that it is compared with."""
-
-    contender: Contender
-    against: int
+def measure_real_time(config: Speed, console: Console) -> Path:
+    """Time a policy against the clock, print its latencies, and write them as JSON."""
+    recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
+    with run_folder("speed", recorded, 0, config.output) as folder:
+        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
+        found = play_against_the_clock(config.env, config.policy, config.seconds)
+        path = folder / "real_time.json"
+        path.write_text(json.dumps(found, indent=2) + "\n")
+    title = f"{found['policy']} on the {config.env}, once in {found['period_us']:.0f} µs"
+    rows = [
+        (label, *(f"{found[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
+        for label, key in (("from due to command", "latency"), ("in the policy", "policy"))
+    ]
+    head = ["", "median", "99 %", "99.9 %", "longest"]
+    console.print(make_table(f"{title}; times in µs", head, rows))
+    share = 100.0 * found["late_share"]
+    console.print(f"late: {found['late']} of {found['cycles']} cycles, {share:.3f} %")
+    if not found["is_real_time"]:
+        console.print("without real-time scheduling, to which this user has no right")
+    return path
 
 
-def measure(config: Speed, progress: Callable[[float], None] | None = None) -> list[SpeedResult]:
+def measure_throughput(config: Speed, console: Console) -> Path:
+    """Time all contenders, print their ratios, and write them as JSON and CSV."""
+    if config.others or config.ppo:
+        importlib.import_module("stable_baselines3")  # what is missing is said before the work
+    VectorLoop(config.env, 1, 1, config.policy)
+    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
+    with run_folder("speed", recorded, None, config.output) as folder:
+        console.print("measuring every contender in turn, round by round")
+        results = measure(config, plain_progress(console))
+        path = folder / "speed.json"
+        path.write_text(json.dumps(results, indent=2) + "\n")
+        write_records(results, folder / "speed.csv")
+        if config.profile:
+            text = profile(config)
+            (folder / "profile.txt").write_text(text)
+            console.print(text)
+    title = f"{config.env}: control steps per second, medians of one interleaved run"
+    rows = [
+        (
+            one["contender"],
+            str(one["num_envs"]),
+            f"{one['steps_per_s']:,.0f}",
+            f"{one['ratio']:.3f}",
+            one["against"],
+        )
+        for one in results
+    ]
+    table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
+    table.columns[-1].justify = "left"
+    console.print(table)
+    return path
+
+
+def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, Any]]:
     """Time all contenders in turn, round by round; the first round warms up.
 
     Args:
-        config: What to measure.
+        config: Options of the command.
         progress: Called after every contender of every round with the share of the work that is
             done.
 
-    Raises:
-        ConfigurationError: Environment or policy does not exist.
+    Returns:
+        For every contender the medians over the rounds: control steps per second of all its worlds,
+        and the ratio to the one that it is compared with.
     """
-    entries = _entries(config)
+    contenders, against = _contenders(config)
+    rates = np.empty((config.rounds + 1, len(contenders)))
     try:
-        rates: list[list[float]] = [[] for _ in entries]
-        turns = [*zip(entries, rates, strict=True)] * (config.rounds + 1)
-        for done, (entry, found) in enumerate(turns, 1):
-            found.append(entry.contender.run(config.steps))
-            if progress is not None:
-                progress(done / len(turns))
+        for turn in range(rates.size):
+            number = turn % len(contenders)
+            rates[turn // len(contenders), number] = contenders[number].run(config.steps)
+            progress((turn + 1) / rates.size)
     finally:
-        for entry in entries:
-            entry.contender.close()
-    return [_result(config, entries, rates, number) for number in range(len(entries))]
+        for contender in contenders:
+            contender.close()
+    medians = np.median(rates[1:], axis=0)
+    ratios = np.median(rates[1:] / rates[1:, against], axis=0)
+    return [
+        {
+            "env": config.env,
+            "contender": contender.title,
+            "num_envs": contender.num_envs,
+            "threads": config.threads_used,
+            "steps_per_s": float(medians[number]),
+            "ratio": float(ratios[number]),
+            "against": f"{contenders[other].title}, {contenders[other].num_envs}",
+        }
+        for number, (contender, other) in enumerate(zip(contenders, against, strict=True))
+    ]
 
 
-def _entries(config: Speed) -> list[_Entry]:
-    """Everything that is timed, every reference before or right after what is compared with it."""
-    threads = config.threads_used
+def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
+    """Contenders, and for each the number of the one that it is compared with.
+
+    The two are beside each other in turn, where that one is for it alone.
+    """
     env = config.env
     policy = config.looped_policy
-    entries: list[_Entry] = []
+    contenders: list[Contender] = []
+    against: list[int] = []
     for n in config.num_envs:
-        loop = VectorLoop(env, n, min(threads, n))
-        raw = len(entries) + 1
-        entries.append(_Entry(loop, raw))
-        entries.append(_Entry(RawWorlds(loop, min(threads, n)), raw))
-        entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy), raw))
-        entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy, residual=True), raw))
+        threads = min(config.threads_used, n)
+        loop = VectorLoop(env, n, threads)
+        against += [len(contenders) + 1] * 4
+        contenders += [
+            loop,
+            RawWorlds(loop, threads),
+            VectorLoop(env, n, threads, policy),
+            VectorLoop(env, n, threads, policy, residual=True),
+        ]
     if config.others:
         scalar = ScalarLoop(env)
-        raw = len(entries) + 1
-        entries += [_Entry(scalar, raw), _Entry(RawWorlds(scalar, 1), raw)]
-        for count in config.processes:
-            entries.append(_Entry(GymnasiumLoop(env, "async", count), 0))
-            entries.append(_Entry(SB3Loop(env, "SubprocVecEnv", count), 0))
-        entries.append(_Entry(GymnasiumLoop(env, "sync", config.processes[0]), 0))
-        entries.append(_Entry(SB3Loop(env, "DummyVecEnv", config.processes[0]), 0))
+        against += [len(contenders) + 1] * 2
+        contenders += [scalar, RawWorlds(scalar, 1)]
+        counted = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
+        foreign = [*counted, *((kind, config.processes[0]) for kind in IN_THIS_PROCESS)]
+        against += [0] * len(foreign)
+        contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
-        ours = len(entries)
-        entries.append(_Entry(PPOLoop(env, policy, 64, threads), ours))
-        entries.append(_Entry(PPOLoop(env, policy, _PPO_PROCESSES, 1, processes=True), ours))
-    return entries
-
-
-def _result(
-    config: Speed, entries: Sequence[_Entry], rates: list[list[float]], number: int
-) -> SpeedResult:
-    entry = entries[number]
-    reference = entries[entries[number].against]
-    mine = rates[number][1:]
-    others = rates[entry.against][1:]
-    return SpeedResult(
-        env=config.env,
-        contender=entry.contender.title,
-        num_envs=entry.contender.num_envs,
-        threads=config.threads_used,
-        steps_per_s=statistics.median(mine),
-        ratio=statistics.median(a / b for a, b in zip(mine, others, strict=True)),
-        against=f"{reference.contender.title}, {reference.contender.num_envs}",
-    )
+        against += [len(contenders)] * 2
+        contenders += [
+            PPOLoop(env, policy, 64, config.threads_used),
+            PPOLoop(env, policy, _PPO_PROCESSES, 1, processes=True),
+        ]
+    return contenders, against
 
 
 def profile(config: Speed) -> str:
@@ -216,54 +239,7 @@ def profile(config: Speed) -> str:
     loop = VectorLoop(config.env, n, min(config.threads_used, n), config.looped_policy)
     loop.run(config.steps)
     profiler = cProfile.Profile()
-    profiler.enable()
-    loop.run(config.steps * config.rounds)
-    profiler.disable()
+    profiler.runcall(loop.run, config.steps * config.rounds)
     text = io.StringIO()
     pstats.Stats(profiler, stream=text).strip_dirs().sort_stats("cumulative").print_stats(40)
     return text.getvalue()
-
-
-def measure_all(config: Speed, console: Console) -> Path:
-    """Measure, print the ratios, and write them as JSON and CSV.
-
-    Args:
-        config: What to measure.
-        console: Where progress and table go.
-
-    Returns:
-        The file.
-
-    Raises:
-        ConfigurationError: Environment or policy does not exist; found before the work begins.
-        ModuleNotFoundError: Stable-Baselines3 is not installed, and a contender needs it; found
-            before, too.
-        ResultsExistError: The output folder holds results.
-    """
-    if config.others or config.ppo:
-        importlib.import_module("stable_baselines3")
-    VectorLoop(config.env, 1, 1, config.policy)
-    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
-    with run_folder("speed", recorded, None, config.output) as folder:
-        console.print("measuring every contender in turn, round by round")
-        results = measure(config, plain_progress(console))
-        path = folder / "speed.json"
-        path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
-        write_records([asdict(r) for r in results], folder / "speed.csv")
-        if config.profile:
-            text = profile(config)
-            (folder / "profile.txt").write_text(text)
-            console.print(text, highlight=False, markup=False)
-    console.print(_table(config, results))
-    return path
-
-
-def _table(config: Speed, results: Sequence[SpeedResult]) -> Table:
-    title = f"{config.env}: control steps per second, medians of one interleaved run"
-    rows = [
-        (r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against)
-        for r in results
-    ]
-    table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
-    table.columns[-1].justify = "left"
-    return table

@@ -70,4 +70,4 @@ class Train(Model):
                 configs = [config.replace(**changes) for config in configs]
             folders = start(configs, console, self.output, executors)
         for folder in folders:
-            console.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
+            console.print(f"policies in {folder}/seed_*/best and last")

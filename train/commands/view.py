@@ -1,6 +1,4 @@
-"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side
-by side.
-"""
+"""`elastic view`: reference, motor side and link side, side by side in MuJoCo's web viewer."""
 
 import bisect
 import contextlib
@@ -44,8 +42,9 @@ LARGEST_FACTOR = 20.0
 _FRAMES_PER_S = 50
 _PAUSE_S = 0.01
 _SHORT = "/tmp"
-"""Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
+"""Folder of a socket: its path has at most about 100 characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
+_FACTOR = "deviations drawn x"
 _PLACE = (16.0, 40.0)
 _SIZE = (400.0, 130.0)
 """Of the window of sliders [pixels]."""
@@ -72,9 +71,7 @@ class Recording:
 
 @dataclass
 class Playback:
-    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether
-    time stands still.
-    """
+    """State of the page, which sliders set and the drawing reads: time [s], factor, pause."""
 
     recording: Recording
     time_s: float = 0.0
@@ -117,9 +114,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
                 f"{type(picture).__name__} has no sides: see HasSides in"
                 " elastic_env.rendering.side_by_side"
             )
-        for step, now in episode(
-            env, make_policy(condition.policy, env), condition, steps, console
-        ):
+        policy = make_policy(condition.policy, env)
+        for step, now in episode(env, policy, condition, steps, console):
             if step % every == 0:
                 times_s.append(float(now["time_s"]))
                 frames.append(picture.sides(now))
@@ -135,21 +131,17 @@ class _Poses(plugin.SimPlugin):
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
-        """Keep the three robots: no file of a page, nor its button to reload, puts another model
-        in their place.
-        """
+        """Keep the three robots: no file of a page, nor its button to reload, replaces them."""
         return True
 
     @messages.handler
     def _on_step(self, event: messages.StepEvent) -> None:
-        if event.model is not self._scene.model:
-            time.sleep(_PAUSE_S)
-            return
-        self._playback.tick()
-        event.data.time = self._playback.time_s
-        self._scene.pose(
-            event.data, self._playback.recording.at(self._playback.time_s), self._playback.factor
-        )
+        playback = self._playback
+        if event.model is self._scene.model:
+            playback.tick()
+            event.data.time = playback.time_s
+            frame = playback.recording.at(playback.time_s)
+            self._scene.pose(event.data, frame, playback.factor)
         time.sleep(_PAUSE_S)
 
 
@@ -165,19 +157,15 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.Once)
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
-            _, play.factor = imgui.SliderFloat(
-                "deviations drawn x", play.factor, 0.0, LARGEST_FACTOR
-            )
-            _, play.time_s = imgui.SliderFloat(
-                "time [s]", play.time_s, 0.0, play.recording.times_s[-1]
-            )
+            end_s = play.recording.times_s[-1]
+            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, LARGEST_FACTOR)
+            _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, end_s)
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
 
 
 class _PrivateViewer(web_viewer.WebViewer):
-    """MuJoCo's web viewer at a socket of ours, in place of a port that everybody reaches; it takes
-    no models.
+    """MuJoCo's web viewer at a socket of ours, in place of a public port; it takes no models.
 
     Args:
         endpoint: To the side that poses the robots.
@@ -187,10 +175,8 @@ class _PrivateViewer(web_viewer.WebViewer):
 
     def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
         self._listener = listener
-        config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=_free_port())
-        with contextlib.redirect_stdout(
-            io.StringIO()
-        ):  # the address that it prints is not the page's
+        config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address that is not ours
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
@@ -201,11 +187,6 @@ class _PrivateViewer(web_viewer.WebViewer):
     def get_drop_file(self) -> str:
         """No file is taken from the page."""
         return ""
-
-
-def _free_port() -> int:
-    with socket.create_server(("", 0)) as free:
-        return free.getsockname()[1]
 
 
 @dataclass(frozen=True)
@@ -239,12 +220,10 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
     with (
         contextlib.closing(browsers),
         tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder,
+        _launch(recording, f"{folder}/viewer") as handle,
+        contextlib.closing(Proxy(browsers, f"{folder}/viewer", access)),
     ):
-        place = f"{folder}/viewer"
-        with _launch(recording, place) as handle:
-            proxy = Proxy(browsers, place, access)
-            with contextlib.closing(proxy):
-                yield Page(handle, access)
+        yield Page(handle, access)
 
 
 def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
@@ -276,8 +255,7 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
 
 
 class View(WatchedEpisode):
-    """Look at one episode in the browser: reference, motor side and link side of the robot, side by
-    side.
+    """Look at one episode in the browser: reference, motor side and link side, side by side.
 
     The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C.
     Sliders set the time, and the factor by which deviations from the reference are enlarged. The
@@ -300,17 +278,16 @@ class View(WatchedEpisode):
         """Play an episode, then show it until Ctrl-C."""
         listen(self.host, self.port).close()  # what cannot be is said before the episode
         condition = self.condition
-        console.print(f"playing {self.policy} first", soft_wrap=True)
+        console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)
         with show(recording, self.host, self.port) as page:
-            console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False)
+            console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
                 console.print(
                     "who has this address sees the page and moves its sliders; nothing on the way"
                     " is encrypted",
-                    soft_wrap=True,
                 )
-            console.print("Ctrl-C ends it", soft_wrap=True)
+            console.print("Ctrl-C ends it")
             _open_tab(page.access.address)
             while page.handle.is_running():
                 page.handle.sync()
@@ -318,9 +295,6 @@ class View(WatchedEpisode):
 
 def _open_tab(address: str) -> None:
     """Open a tab of the browser, where there is a display."""
-    if (
-        not sys.platform.startswith("linux")
-        or os.environ.get("DISPLAY")
-        or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if has_display or not sys.platform.startswith("linux"):
         threading.Thread(target=webbrowser.open, args=(address, 2), daemon=True).start()

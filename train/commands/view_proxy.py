@@ -17,14 +17,13 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 
 LOOPBACK = "127.0.0.1"
-"""Where a page listens unless somebody asks for another address."""
+"""The address of a page unless somebody asks for another one."""
 
 _FIRST_PORT = 8080
 _PORTS_TRIED = 20
@@ -33,7 +32,8 @@ _LARGEST_HEAD = 32768
 """Of a request or a response [bytes]."""
 _HEAD_S = 10.0
 """For a request to arrive [s]."""
-_TOKEN = "token"
+_TOKEN = "token="
+_CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
 _UPGRADED = (
@@ -96,7 +96,7 @@ class Head:
     def encode(self) -> bytes:
         """As it is sent."""
         lines = [self.line, *(f"{name}: {value}" for name, value in self.headers)]
-        return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
+        return "\r\n".join([*lines, "", ""]).encode("latin-1")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Access:
         """Address that a browser opens."""
         name = socket.gethostname() if self._is_everywhere else self.host
         name = f"[{name}]" if ":" in name else name
-        return f"http://{name}:{self.port}/?{_TOKEN}={self.token}"
+        return f"http://{name}:{self.port}/?{_TOKEN}{self.token}"
 
     @property
     def cookie(self) -> str:
@@ -157,34 +157,32 @@ class Access:
         """
         method, _, rest = request.line.partition(" ")
         target, _, version = rest.partition(" ")
-        if version not in ("HTTP/1.1", "HTTP/1.0") or not target.startswith("/"):
-            raise RefusedError("the request is malformed")
         path, _, query = target.partition("?")
+        is_http = version in ("HTTP/1.1", "HTTP/1.0") and target.startswith("/")
+        _require(is_http, "the request is malformed")
         self._require_own_host(request)
-        parts = query.split("&")
-        given = [part.removeprefix(f"{_TOKEN}=") for part in parts if part.startswith(f"{_TOKEN}=")]
-        has_address = any(self._is_token(value) for value in given)
-        if not has_address and not any(self._is_token(value) for value in self._cookies(request)):
-            raise RefusedError(
-                "the token is missing: open the address that elastic view has printed"
-            )
+        parts = [part for part in query.split("&") if part]
+        others = [part for part in parts if not part.startswith(_TOKEN)]
+        tokens = [part.removeprefix(_TOKEN) for part in parts if part.startswith(_TOKEN)]
+        has_address = any(map(self._is_token, tokens))
+        has_cookie = any(map(self._is_token, self._cookies(request)))
+        _require(has_address or has_cookie, f"the token is missing: {_CURE}")
         is_socket = bool(request.values("Upgrade"))
-        _require_download(method, path, request, is_socket)
-        query = "&".join(part for part in parts if part and not part.startswith(f"{_TOKEN}="))
-        return Asked(f"{path}?{query}" if query else path, is_socket, has_address)
+        _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
+        has_body = request.values("Content-Length") or request.values("Transfer-Encoding")
+        is_download = method == "GET" and not has_body
+        _require(is_download, "this page only answers GET without a body")
+        is_known = not is_socket or path in _SOCKETS
+        _require(is_known, f"WebSockets are {', '.join(_SOCKETS)}")
+        return Asked(f"{path}?{'&'.join(others)}" if others else path, is_socket, has_address)
 
     def _require_own_host(self, request: Head) -> None:
-        hosts = request.values("Host")
-        if len(hosts) != 1 or not self._is_own(hosts[0].lower()):
-            raise RefusedError(
-                "the Host is not this page's: open the address that elastic view has printed"
-            )
-        origins = request.values("Origin")
-        if (
-            any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins)
-            or len(origins) > 1
-        ):
-            raise RefusedError("the request comes from another page")
+        hosts = [host.lower() for host in request.values("Host")]
+        origins = [origin.lower() for origin in request.values("Origin")]
+        is_own = len(hosts) == 1 and self._is_own(hosts[0])
+        _require(is_own, f"the Host is not this page's: {_CURE}")
+        is_here = origins in ([], [f"http://{hosts[0]}"])
+        _require(is_here, "the request comes from another page")
 
     def _is_own(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
@@ -204,21 +202,16 @@ class Access:
         return secrets.compare_digest(value.encode(), self.token.encode())
 
     def _cookies(self, request: Head) -> list[str]:
-        pairs = [
-            pair.strip().partition("=")
-            for line in request.values("Cookie")
-            for pair in line.split(";")
+        cookies = [
+            cookie.strip() for line in request.values("Cookie") for cookie in line.split(";")
         ]
-        return [value for name, _, value in pairs if name == self.cookie]
+        prefix = f"{self.cookie}="
+        return [one.removeprefix(prefix) for one in cookies if one.startswith(prefix)]
 
 
-def _require_download(method: str, path: str, request: Head, is_socket: bool) -> None:
-    if path.rstrip("/").lower() == _UPLOAD:
-        raise RefusedError("this page takes no uploads")
-    if method != "GET" or request.values("Content-Length") or request.values("Transfer-Encoding"):
-        raise RefusedError("this page only answers GET without a body")
-    if is_socket and path not in _SOCKETS:
-        raise RefusedError(f"WebSockets are {', '.join(_SOCKETS)}")
+def _require(holds: bool, reason: str) -> None:
+    if not holds:
+        raise RefusedError(reason)
 
 
 def _is_address(name: str) -> bool:
@@ -230,9 +223,8 @@ def _is_address(name: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
-    return host.lower() == "localhost" or (
-        _is_address(host) and ipaddress.ip_address(host).is_loopback
-    )
+    is_name = host.lower() == "localhost"
+    return is_name or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
@@ -250,10 +242,9 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         raise ConfigurationError(
             f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
         )
+    kind = {"type": socket.SOCK_STREAM, "flags": socket.AI_PASSIVE}
     try:
-        family, *_ = socket.getaddrinfo(
-            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
+        family = socket.getaddrinfo(host or None, port, **kind)[0][0]
     except (socket.gaierror, UnicodeError):
         raise ConfigurationError(
             f"--host must be an address or a name of this machine, such as {LOOPBACK}, got"
@@ -296,17 +287,10 @@ class Proxy:
         self._listener.close()
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            start = asyncio.start_server(self._answer, sock=self._listener, limit=_LARGEST_HEAD)
-            self._loop.run_until_complete(start)
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            limit = _LARGEST_HEAD
+            runner.run(asyncio.start_server(self._answer, sock=self._listener, limit=limit))
             self._loop.run_forever()
-        finally:
-            tasks = asyncio.all_tasks(self._loop)
-            for task in tasks:
-                task.cancel()
-            self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-            self._loop.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """One connection, which is for one request."""
@@ -328,29 +312,34 @@ class Proxy:
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> None:
-        viewer_reader, viewer_writer = await asyncio.open_unix_connection(
-            self._viewer, limit=_LARGEST_HEAD
-        )
+        viewer, to_viewer = await asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
         try:
-            viewer_writer.write(_for_viewer(request, asked).encode())
-            answer = Head.parse(await viewer_reader.readuntil(b"\r\n\r\n"))
+            to_viewer.write(_for_viewer(request, asked).encode())
+            answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))
             writer.write(self._for_browser(answer, asked).encode())
-            ways: list[Coroutine[Any, Any, None]] = [_copy(viewer_reader, writer)]
+            ways = [asyncio.ensure_future(_copy(viewer, writer))]
             if asked.is_socket:
-                ways.append(_copy(reader, viewer_writer))
-            await _run_until_one_ends(ways)
+                ways.append(asyncio.ensure_future(_copy(reader, to_viewer)))
+            try:
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
         finally:
-            viewer_writer.close()
+            to_viewer.close()
 
     def _for_browser(self, answer: Head, asked: Asked) -> Head:
         """An answer that no other page may read, and with the cookie where a page begins."""
-        kept = [(name, value) for name, value in answer.headers if not _opens_page(name)]
-        headers = [*kept, *_PRIVATE]
+        left_out = () if asked.is_socket else ("connection",)
+        headers = [
+            (name, value)
+            for name, value in answer.headers
+            if not _opens_page(name) and name.lower() not in left_out
+        ]
+        headers += _PRIVATE
         if not asked.is_socket:
-            headers = [
-                *(header for header in headers if header[0].lower() != "connection"),
-                ("Connection", "close"),
-            ]
+            headers.append(("Connection", "close"))
         if asked.has_address:
             kind = "Path=/; HttpOnly; SameSite=Strict"
             headers.append(("Set-Cookie", f"{self._access.cookie}={self._access.token}; {kind}"))
@@ -359,7 +348,8 @@ class Proxy:
 
 async def _read_head(reader: asyncio.StreamReader) -> Head:
     try:
-        return Head.parse(await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_S))
+        async with asyncio.timeout(_HEAD_S):
+            return Head.parse(await reader.readuntil(b"\r\n\r\n"))
     except asyncio.LimitOverrunError:
         raise RefusedError(f"a request may have {_LARGEST_HEAD} bytes of headers") from None
 
@@ -374,31 +364,22 @@ def _for_viewer(request: Head, asked: Asked) -> Head:
 
 def _opens_page(name: str) -> bool:
     """True if a header of the viewer lets other pages read an answer."""
-    return (
-        name.lower().startswith("access-control-") or name.lower() == "cross-origin-resource-policy"
-    )
+    name = name.lower()
+    return name.startswith("access-control-") or name == "cross-origin-resource-policy"
 
 
 def _refusal(reason: str) -> bytes:
-    body = f"403: {reason}\n".encode()
-    headers = [("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))]
-    return (
-        Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encode()
-        + body
-    )
+    body = f"403: {reason}\n"
+    headers = [
+        ("Content-Type", "text/plain; charset=utf-8"),
+        ("Content-Length", str(len(body.encode()))),
+        ("Connection", "close"),
+        *_PRIVATE,
+    ]
+    return Head("HTTP/1.1 403 Forbidden", headers).encode() + body.encode()
 
 
 async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
     while data := await source.read(_LARGEST_HEAD):
         target.write(data)
         await target.drain()
-
-
-async def _run_until_one_ends(ways: Sequence[Coroutine[Any, Any, None]]) -> None:
-    tasks = [asyncio.ensure_future(way) for way in ways]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,3 +1,1 @@
-"""Runs: their folders, processes beside each other, code of the user, and what is said of
-failures.
-"""
+"""Runs: their folders, their progress, code of the user, and how failures are explained."""

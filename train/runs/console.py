@@ -1,15 +1,18 @@
-"""The terminal: whatever a text holds, nothing of it is a command."""
+"""The terminal: whatever a text or a warning holds, nothing of it is a command."""
 
 import traceback
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 
 from train.runs.escaping import visible
 
@@ -19,21 +22,21 @@ class PlainConsole(Console):
 
     Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that
     was received. A text that is printed is no markup of Rich's either, unless `markup=True` asks
-    for it.
+    for it, and is one line however long it is.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(emoji=False, **options)  # a policy of the user may be called mine:zero
 
-    def print(self, *objects: Any, markup: bool | None = None, **options: Any) -> None:
-        """Print texts as they are, without markup."""
+    def print(self, *objects: Any, markup: bool = False, **options: Any) -> None:
+        """Print texts as they are: without markup, colours or line breaks of our own."""
+        if all(isinstance(part, str | Text) for part in objects):
+            options = {"soft_wrap": True, "highlight": False, **options}
         highlight = options.get("highlight")
         parts = [
-            (
-                self.render_str(part, markup=markup is True, highlight=highlight)
-                if isinstance(part, str)
-                else part
-            )
+            self.render_str(part, markup=markup, highlight=highlight)
+            if isinstance(part, str)
+            else part
             for part in objects
         ]
         super().print(*parts, **options)
@@ -66,6 +69,13 @@ def make_table(
     return table
 
 
+def print_files(folder: Path, files: Iterable[Path], console: Console) -> None:
+    """Say what was written."""
+    console.print(f"Results in {folder}:")
+    for path in files:
+        console.print(f"  {path}")
+
+
 def traceback_of(error: BaseException) -> str:
     """The traceback of an error as text for a terminal."""
     return visible("".join(traceback.format_exception(error)))
@@ -80,3 +90,37 @@ def visible_warnings() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning = before
+
+
+_SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
+
+
+def shown_warnings() -> frozenset[str]:
+    """Texts that were shown within `warn_once`, for processes that shall not show them again."""
+    return frozenset(_SAID.get() or ())
+
+
+@contextmanager
+def warn_once(said: Iterable[str] = ()) -> Iterator[None]:
+    """Show each warning within once.
+
+    Args:
+        said: Texts that were shown before, such as in the process that started this one.
+    """
+    outer = _SAID.get()
+    known = {*said} if outer is None else outer
+    known.update(said)
+    token = _SAID.set(known)
+    before = warnings.showwarning
+
+    def show(message: Warning | str, *where: Any) -> None:
+        if str(message) not in known:
+            known.add(str(message))
+            before(message, *where)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+        _SAID.reset(token)

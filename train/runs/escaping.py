@@ -1,5 +1,4 @@
-"""Text of a user, such as the label of a policy, in the formats of results: each has signs that
-mean something.
+"""Text of a user, such as the label of a policy, in the formats of results.
 
 All outlets go through `visible`: the console, tables of CSV, Markdown and the page of a report.
 What a terminal would obey, and what turns the order of letters around, is shown as �.
@@ -35,16 +34,12 @@ _IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
 
 
 def visible(text: str) -> str:
-    """Text without anything that a terminal obeys or that turns letters around; tabs and
-    newlines stay.
-    """
+    """Text without what a terminal obeys or what turns letters around; tabs and newlines stay."""
     return _COMMANDS.sub("�", text)
 
 
 def csv_cell(value: Any) -> Any:
-    """A cell of a CSV file; text that a spreadsheet would take for a formula gets an apostrophe
-    in front.
-    """
+    """A cell of a CSV file; text that looks like a formula gets an apostrophe in front."""
     if not isinstance(value, str):
         return value
     text = visible(value)
@@ -94,9 +89,7 @@ def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Seq
 
 
 def script_json(value: Any) -> str:
-    """JSON that can stand in a script element: nothing in it ends the element or begins a
-    comment.
-    """
+    """JSON within a script element: nothing in it ends the element or begins a comment."""
     text = json.dumps(
         _visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False
     )
@@ -113,9 +106,7 @@ def _visible_data(value: Any) -> Any:
 
 
 def template_value(value: Any) -> Any:
-    """A value for a page: plain text is made visible; HTML that a template made is a type of its
-    own.
-    """
+    """A value for a page: plain text is made visible; HTML of a template is a type of its own."""
     return visible(value) if type(value) is str else value
 
 

@@ -39,15 +39,11 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class EndedError(KeyboardInterrupt):
-    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off,
-    and saying so.
-    """
+    """A signal that asks to end; all is done for it that is done at Ctrl-C, such as torque off."""
 
 
 def explain(error: BaseException) -> tuple[str, int] | None:
-    """Sentence and exit code of a failure; None for a defect, of which the traceback is worth
-    having.
-    """
+    """Sentence and exit code of a failure; None for a defect, which needs its traceback."""
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
     from elastic_env.core.errors import ElasticError, missing_extra, shorten
@@ -69,18 +65,14 @@ def explain(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """True if it is Ctrl-C, which a module that is being loaded or a call of C may turn into an
-    error of its own.
-    """
+    """True if it is Ctrl-C, which a loading module or a call of C may turn into another error."""
     return any(
         isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error)
     )
 
 
 def _quotes_interrupt(error: BaseException) -> bool:
-    """True if `ctypes` met Ctrl-C while it converted an argument: its error only quotes the
-    exception.
-    """
+    """True if `ctypes` met Ctrl-C while it converted an argument: its error quotes it."""
     names = (KeyboardInterrupt.__name__, EndedError.__name__)
     return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
 

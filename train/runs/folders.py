@@ -1,6 +1,4 @@
-"""Result folders: never overwritten, each with the configuration, seed, versions and commit that
-made it.
-"""
+"""Result folders: never overwritten, each with configuration, seed, versions and commit."""
 
 import contextlib
 import errno
@@ -12,7 +10,7 @@ import platform
 import stat
 import subprocess
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -29,68 +27,22 @@ from elastic_env.core.files import leads_out, write_whole
 from elastic_env.core.yaml_text import yaml_of
 
 RUNS = Path("runs")
-"""Where results go unless a folder is named."""
+"""Folder of results unless one is named."""
 
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
+_METADATA = "metadata.json"
 _LOCK = ".lock"
 _RETRY_S = 0.2
 _LONGEST_HOLDER = 200
 """Characters of a lock that say who holds it."""
-_PACKAGES = (
-    "elastic-env",
-    "mujoco",
-    "gymnasium",
-    "pin",
-    "numpy",
-    "scipy",
-    "stable-baselines3",
-    "torch",
-)
-
-
-def new_run(
-    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
-) -> Path:
-    """Create a result folder and write down what its results depend on.
-
-    Args:
-        name: Name of the run; a taken name gets the next free number.
-        configuration: Resolved configuration, written as `config.yaml`.
-        seed: First seed, written with versions and commit as `metadata.json`.
-        output: Folder to use instead; it must not hold anything yet.
-
-    Returns:
-        The folder.
-
-    Raises:
-        ResultsExistError: The named output folder is not empty.
-    """
-    folder = free_folder(name, output)
-    texts = _description(configuration, seed)
-    try:
-        for file, text in texts.items():
-            write_whole(folder / file, text)
-    except BaseException:
-        _remove(folder, texts)
-        raise
-    return folder
+_LIBRARIES = ("mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
-    """Write down anew what the results of a run depend on, when it is gone on with; arguments as
-    `new_run`.
-    """
-    for file, text in _description(configuration, seed).items():
-        write_whole(folder / file, text)
-
-
-def _description(configuration: dict[str, Any], seed: int | None) -> dict[str, str]:
-    """Texts of the files that describe a run."""
-    return {
-        CONFIG: yaml_of(configuration),
-        "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
-    }
+    """Write configuration (`config.yaml`), first seed, versions and commit (`metadata.json`)."""
+    write_whole(folder / CONFIG, yaml_of(configuration))
+    write_whole(folder / _METADATA, json.dumps(provenance(seed), indent=2) + "\n")
 
 
 def require_run(folder: Path, what: str, writer: str) -> Path:
@@ -127,8 +79,7 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:
-    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if
-    taken.
+    """A new folder for results: the one that is named, or runs/<name>, numbered if taken.
 
     It is made in one step, so that of several programs each gets another one.
 
@@ -137,13 +88,13 @@ def free_folder(name: str, output: Path | None = None) -> Path:
         ResultsExistError: The named folder is not empty.
         SystemFailedError: The folder cannot be made.
     """
+    place = RUNS if output is None else output
     try:
         return _next_free(require_name(name)) if output is None else _empty(output)
     except OSError as error:
-        place = RUNS if output is None else output
-        what = f"{shorten(error.filename or place)}: {error.strerror or error}"
+        cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
         raise SystemFailedError(
-            f"no folder for results can be made at {shorten(place)} ({what}); name one by --output"
+            f"no folder for results can be made at {shorten(place)} ({cause}); name one by --output"
         ) from None
 
 
@@ -194,10 +145,9 @@ def _open_lock(path: Path) -> TextIO:
     Raises:
         ConfigurationError: It is one of these.
     """
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        descriptor = os.open(
-            path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666
-        )
+        descriptor = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise _no_lock(path) from None
@@ -226,65 +176,46 @@ def _take_lock(lock: TextIO) -> bool:
 
 @contextmanager
 def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
-    """`lock_run` for a part of a run, whose folder is made; it goes again if the work fails
-    without a result.
-    """
+    """`lock_run` for a part of a run, whose folder is made, and removed without a result."""
     folder.mkdir(parents=True, exist_ok=True)
-    with lock_run(folder, patience_s):
-        try:
-            yield
-        except BaseException:
-            if set(folder.iterdir()) == {folder / _LOCK}:
-                _remove(folder, [_LOCK])
-            raise
+    with lock_run(folder, patience_s), _removed_without_result(folder):
+        yield
 
 
 @contextmanager
 def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
-    """`free_folder` for the work within; it goes again if that fails without having written
-    anything.
-    """
+    """`free_folder` for the work within, removed if that fails without a result."""
     folder = free_folder(name, output)
-    try:
+    with _removed_without_result(folder):
         yield folder
-    except BaseException:
-        with contextlib.suppress(OSError):  # it holds something
-            folder.rmdir()
-            folder.parent.rmdir()
-        raise
 
 
 @contextmanager
 def run_folder(
     name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:
-    """A new run for the work within; it goes again if the work is interrupted or fails without a
-    result.
-
-    Arguments and errors as `new_run`.
-    """
-    folder = new_run(name, configuration, seed, output)
-    described = set(folder.iterdir())
-    try:
+    """`own_folder` for a new run, described; arguments as there and in `describe`."""
+    with own_folder(name, output) as folder:
+        describe(folder, configuration, seed)
         yield folder
+
+
+@contextmanager
+def _removed_without_result(folder: Path) -> Iterator[None]:
+    """Remove a folder that holds nothing but what describes it, if the work within fails."""
+    try:
+        yield
     except BaseException:
-        made = described | {folder / _LOCK}
-        if set(folder.iterdir()) <= made:
-            _remove(folder, [file.name for file in made])
+        files = list(folder.iterdir())
+        if {file.name for file in files} <= {CONFIG, _METADATA, _LOCK}:
+            for file in files:
+                file.unlink()
+            folder.rmdir()
         raise
 
 
-def _remove(folder: Path, files: Iterable[str]) -> None:
-    """Remove a folder with the files that it may have."""
-    for name in files:
-        (folder / name).unlink(missing_ok=True)
-    folder.rmdir()
-
-
 def _next_free(name: str) -> Path:
-    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one
-    program alone.
-    """
+    """runs/<name>, or the first of its numbers that is free; `mkdir` makes it for one program."""
     RUNS.mkdir(parents=True, exist_ok=True)
     for number in itertools.count(1):
         folder = RUNS / (name if number == 1 else f"{name}-{number}")
@@ -297,25 +228,24 @@ def _next_free(name: str) -> Path:
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
         raise ResultsExistError(f"{shorten(folder)} is a file; name a folder that is new or empty")
-    if folder.exists() and any(folder.iterdir()):
+    folder.mkdir(parents=True, exist_ok=True)
+    if names := sorted(path.name for path in folder.iterdir()):
         raise ResultsExistError(
-            f"{folder} already holds results"
-            f" ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), which are never"
+            f"{folder} already holds results ({', '.join(names[:3])}, ...), which are never"
             " overwritten; name another folder, or leave --output out"
         )
-    folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def provenance(seed: int | None) -> dict[str, Any]:
     """When, from which commit and with which versions something is made."""
     return {
-        "created": (datetime.now(UTC).isoformat(timespec="seconds")),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": seed,
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in _PACKAGES},
+        "versions": {name: installed_version(name) for name in ("elastic-env", *_LIBRARIES)},
     }
 
 
@@ -328,9 +258,7 @@ def installed_version(package: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the source tree, with a + where it has uncommitted changes; None outside a
-    repository.
-    """
+    """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str:
@@ -339,8 +267,7 @@ def _commit() -> str | None:
         ).stdout.strip()
 
     try:
-        return git("rev-parse", "HEAD") + (
-            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
-        )
+        is_changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if is_changed else "")
     except (OSError, subprocess.SubprocessError):
         return None

@@ -51,9 +51,7 @@ def _require_ours() -> None:
 
 @contextmanager
 def safe_children() -> Iterator[None]:
-    """Processes of Python that are started within do not look for modules in the working folder
-    first.
-    """
+    """Processes of Python that start within do not look for modules in the working folder first."""
     before = os.environ.get(_SAFE)
     os.environ[_SAFE] = "1"
     try:

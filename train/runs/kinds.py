@@ -6,39 +6,15 @@ from typing import Any
 TELLING = {
     "comparison": (
         "elastic compare",
-        {
-            "references",
-            "policies",
-            "episodes",
-            "scenario_episodes",
-            "reference_scenarios",
-            "figure_policies",
-            "sweep",
-            "map",
-            "groups",
-            "leaderboard",
-        },
+        "references policies episodes scenario_episodes reference_scenarios figure_policies sweep"
+        " map groups leaderboard",
     ),
     "training": (
         "elastic train",
-        {
-            "weights",
-            "base",
-            "base_options",
-            "settings",
-            "algorithm",
-            "algorithm_options",
-            "anneal",
-            "clip",
-            "worlds",
-            "decisions",
-            "seeds",
-            "evaluate_every",
-            "evaluation_episodes",
-            "checkpoint_every",
-        },
+        "weights base base_options settings algorithm algorithm_options anneal clip worlds"
+        " decisions seeds evaluate_every evaluation_episodes checkpoint_every",
     ),
-    "bench": ("elastic bench", {"cases", "margin"}),
+    "bench": ("elastic bench", "cases margin"),
 }
 """Command of each kind, and keys that no other kind has."""
 
@@ -52,7 +28,7 @@ def is_a(kind: str) -> Callable[[Any], Any]:
 
     def check(values: Any) -> Any:
         given = set(values) if isinstance(values, dict) else set()
-        count = {name: len(given & keys) for name, (_, keys) in TELLING.items()}
+        count = {name: len(given & set(keys.split())) for name, (_, keys) in TELLING.items()}
         likely = max(count, key=lambda name: count[name])
         if count[likely] > count[kind]:
             raise ValueError(f"this is the configuration of a {likely}: {TELLING[likely][0]} FILE")

@@ -5,7 +5,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -27,29 +26,16 @@ _LONG_S = 30.0
 _COMPILER = logging.getLogger("elastic_env.core.compiled")
 
 
-class Show(Protocol):
-    """Shows how far a task is."""
-
-    def __call__(self, number: int, amount: int, note: str = "", /) -> None:
-        """Show it.
-
-        Args:
-            number: Of the task.
-            amount: How much of it has been done.
-            note: What else is to be said, such as how many calls are running.
-        """
+Show = Callable[..., None]
+"""Takes the number of a task, how much of it has been done, and a note, such as how many calls are
+running.
+"""
 
 
-class Say(Protocol):
-    """Says how much of the work has been done."""
-
-    def __call__(self, share: float, note: str = "", /) -> None:
-        """Say it: the share, from 0 to 1, and a note behind it."""
-
-
-def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -> Say:
-    """A function that takes the share of the work that is done, and says each tenth of it in a
-    line.
+def plain_progress(
+    console: Console, least_s: float = 0.0, unit: str = "work"
+) -> Callable[..., None]:
+    """A function that takes share of the work, 0 to 1, and note, and prints each tenth in a line.
 
     Long work is announced early, with the time that it will take. A line with a note ends with the
     time to go.
@@ -84,7 +70,7 @@ def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -
             said = int(10 * share)
             when = time.monotonic()
             more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
-            console.print(f"  {10 * said} %{more}", soft_wrap=True)
+            console.print(f"  {10 * said} %{more}")
 
     return say
 
@@ -101,8 +87,7 @@ def duration(seconds: float) -> str:
 def show_progress(
     console: Console, totals: Mapping[str, int], transient: bool = False, unit: str = "work"
 ) -> Iterator[Show]:
-    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there
-    is none.
+    """Show the progress of tasks: by a bar each on a terminal, else by a line now and then.
 
     Args:
         console: Where it is shown.
@@ -114,16 +99,24 @@ def show_progress(
         A function that takes the number of a task, how much of it has been done, and a note.
     """
     if not console.is_terminal:
-        yield _lines(console, totals, unit)
+        say = plain_progress(console, _LEAST_S, unit)
+        done = [0] * len(totals)
+
+        def count(number: int, amount: int, note: str = "") -> None:
+            done[number] = amount
+            say(sum(done) / sum(totals.values()), note)
+
+        yield count
         return
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
     )
-    noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
-    with Progress(*columns, *noted, console=console, transient=transient) as bar:
+    with Progress(*columns, console=console, transient=transient) as bar:
         tasks = [
             bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()
         ]
@@ -135,21 +128,9 @@ def show_progress(
         yield draw
 
 
-def _lines(console: Console, totals: Mapping[str, int], unit: str) -> Callable[..., None]:
-    say = plain_progress(console, _LEAST_S, unit)
-    done = [0] * len(totals)
-
-    def count(number: int, amount: int, note: str = "") -> None:
-        done[number] = amount
-        say(sum(done) / sum(totals.values()), note)
-
-    return count
-
-
 @contextmanager
 def say_what_is_compiled(console: Console) -> Iterator[None]:
-    """Say in one line that functions are compiled, when the first one is within; nothing where all
-    are loaded.
+    """Say in one line that functions are compiled, when the first one is; nothing if none is.
 
     Args:
         console: Where it is said.
@@ -175,8 +156,7 @@ class _FirstRecord(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print the first record."""
-        if self._is_said:
-            return
-        self._is_said = True
-        with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
-            self._console.print(record.getMessage(), highlight=False, soft_wrap=True)
+        if not self._is_said:
+            self._is_said = True
+            with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
+                self._console.print(record.getMessage(), soft_wrap=True)

@@ -2,7 +2,7 @@
 
 Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual
 folder runs code. A configuration that was found in the folder of a run, rather than named by the
-user, is read within `code_refused`: all imports go through `named_object`, which then imports
+user, is read within `refuse_code`: all imports go through `named_object`, which then imports
 nothing.
 """
 
@@ -24,7 +24,7 @@ _REFUSED_IN: ContextVar[Path | None] = ContextVar("refused_in", default=None)
 
 
 @contextmanager
-def code_refused(file: Path) -> Iterator[None]:
+def refuse_code(file: Path) -> Iterator[None]:
     """Refuse to import within what names stand for.
 
     Args:
@@ -38,7 +38,7 @@ def code_refused(file: Path) -> Iterator[None]:
 
 
 def require_no_code(file: Path, names: Iterable[str]) -> None:
-    """Refuse names that stand for code; arguments as `code_refused`, and the names.
+    """Refuse names that stand for code; arguments as `refuse_code`, and the names.
 
     Raises:
         ConfigurationError: One of them does.
@@ -78,9 +78,9 @@ def named_object(name: str) -> Any:
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
         own = [
-            f.__name__
-            for f in vars(module).values()
-            if inspect.isfunction(f) and f.__module__ == module.__name__
+            name
+            for name, found in inspect.getmembers(module, inspect.isfunction)
+            if found.__module__ == module.__name__
         ]
         raise ConfigurationError(
             f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
@@ -89,9 +89,7 @@ def named_object(name: str) -> Any:
 
 
 def _require_unshadowed(module: ModuleType, attribute: str) -> None:
-    """Refuse a module that was meant to be a file of the working folder, which is looked at
-    last.
-    """
+    """Refuse a module that was meant to be a file of the working folder, which comes last."""
     file = Path(f"{module.__name__.replace('.', '/')}.py")
     found = getattr(module, "__file__", None)
     if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):

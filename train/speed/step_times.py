@@ -1,6 +1,4 @@
-"""How much processor time policies take for a control step of one world, measured in turn on one
-thread.
-"""
+"""Processor time of policies for a control step of one world, in turn on one thread."""
 
 import statistics
 import time
@@ -21,8 +19,7 @@ median counts.
 def step_times(
     conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS
 ) -> dict[str, float]:
-    """Median processor time of every policy alone for a control step of one world [µs], by its
-    title.
+    """Median processor time of every policy alone for a control step of one world [µs], by title.
 
     The policies play in turn, round by round, so that what else the computer does concerns all of
     them alike. The first round compiles and warms up, and does not count. Of a residual the first

@@ -1,3 +1,1 @@
-"""Calls that run beside this program: in processes of this machine, on a dask cluster, as jobs
-of Slurm.
-"""
+"""Calls beside this program: in processes of this machine, on a dask cluster, as jobs of Slurm."""

@@ -1,5 +1,4 @@
-"""Calls of one function beside each other, by any `concurrent.futures.Executor`: faults, reports
-and Ctrl-C.
+"""Calls beside each other by any `concurrent.futures.Executor`: faults, reports and Ctrl-C.
 
 A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew
 elsewhere.
@@ -14,7 +13,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,33 +94,32 @@ class Pool:
     events: "queue.SimpleQueue[Any]" = field(default_factory=queue.SimpleQueue)
 
 
-@dataclass(frozen=True)
-class Home:
-    """Folder and versions of the program, which its workers take over.
+@dataclass
+class Tally:
+    """How many calls are where.
 
     Attributes:
-        folder: Working folder, from which configurations name files.
-        versions: See `everything`.
+        total: All of them.
+        done: Those that returned.
+        failed: Those that raised.
+        running: Numbers of those that have begun.
     """
 
-    folder: Path
-    versions: Mapping[str, str]
+    total: int = 0
+    done: int = 0
+    failed: int = 0
+    running: set[int] = field(default_factory=set)
 
-    @staticmethod
-    def here() -> "Home":
-        """That of this program."""
-        return Home(Path.cwd(), everything())
+    def end(self, number: int, outcome: Outcome) -> None:
+        """Count the outcome of a call."""
+        self.running.discard(number)
+        self.done += outcome.error is None
+        self.failed += outcome.error is not None
 
-    def enter(self) -> None:
-        """In a worker: work where the program does, if this machine has that folder.
-
-        Raises:
-            VersionsDifferError: This machine has other versions.
-        """
-        require_same(self.versions, everything(), platform.node())
-        if self.folder.is_dir():
-            os.chdir(self.folder)
-            look_last_in(self.folder)
+    def in_words(self, unit: str) -> str:
+        """Such as: 3 of 8 cells done, 2 running, 0 failed."""
+        running = len(self.running)
+        return f"{self.done} of {self.total} {unit} done, {running} running, {self.failed} failed"
 
 
 @dataclass(frozen=True)
@@ -131,30 +129,14 @@ class Watch:
     Attributes:
         reported: Takes the number of a call and what it reports.
         ended: Takes the number of a call and its outcome, as soon as it has one.
-        tallied: Takes how many are done, running, failed, and there at all.
         moved: Takes the number of a call that begins anew.
+        tally: How many calls are where, before and after each of these.
     """
 
     reported: Callable[[int, Any], None] = lambda *_: None
     ended: Callable[[int, Outcome], None] = lambda *_: None
-    tallied: Callable[["Tally"], None] = lambda _: None
     moved: Callable[[int], None] = lambda _: None
-
-
-@dataclass(frozen=True)
-class Tally:
-    """How many calls are where."""
-
-    done: int
-    running: int
-    failed: int
-    total: int
-
-    def in_words(self, what: str) -> str:
-        """Such as: 3 of 8 cells done, 2 running, 0 failed."""
-        return (
-            f"{self.done} of {self.total} {what} done, {self.running} running, {self.failed} failed"
-        )
+    tally: Tally = field(default_factory=Tally)
 
 
 def run_calls(
@@ -185,10 +167,7 @@ def run_calls(
         KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
     """
     run = _Run(function, arguments, pool, watch)
-    if not finishes:
-        run.go(threading.Event())
-        return run.outcomes
-    with _first_ctrl_c() as asked:
+    with _first_ctrl_c() if finishes else nullcontext(threading.Event()) as asked:
         run.go(asked)
     return run.outcomes
 
@@ -207,14 +186,11 @@ class _Run:
         self._arguments = arguments
         self._pool = pool
         self._watch = watch
-        self._home = Home.here()
         self._futures = dict[Future[Any], int]()
         self._tries = [0] * len(arguments)
-        self._running = set[int]()
         self._is_ending = False
-        self._done = 0
-        self._failed = 0
         self.outcomes: list[Outcome | None] = [None] * len(arguments)
+        watch.tally.total = len(arguments)
 
     def go(self, asked: threading.Event) -> None:
         """To the end of all calls, or once `asked` to, of those that run."""
@@ -229,15 +205,9 @@ class _Run:
 
     def _submit(self, number: int) -> None:
         self._tries[number] += 1
+        call = (self._function, self._arguments[number], number, Path.cwd(), everything())
         try:
-            future = self._pool.executor.submit(
-                carry_out,
-                self._function,
-                self._arguments[number],
-                number,
-                self._home,
-                self._pool.reporter,
-            )
+            future = self._pool.executor.submit(carry_out, *call, self._pool.reporter)
         except RuntimeError as error:  # it was shut down
             raise ExecutorLostError(f"the workers are gone: {error}") from None
         self._futures[future] = number
@@ -245,7 +215,7 @@ class _Run:
 
     def _cancel_waiting(self) -> None:
         for future, number in list(self._futures.items()):
-            if number not in self._running and future.cancel():
+            if number not in self._watch.tally.running and future.cancel():
                 self._futures.pop(future, None)
 
     def _take(self, event: Any) -> None:
@@ -253,23 +223,20 @@ class _Run:
         if isinstance(event, Future):
             if event in self._futures:
                 self._end(self._futures.pop(event), event)
-        else:
-            number, report = event
-            if self.outcomes[number] is None:  # a report may come behind the end
-                self._running.add(number)
-            self._watch.reported(number, report)
-        self._watch.tallied(
-            Tally(self._done, len(self._running), self._failed, len(self._arguments))
-        )
+            return
+        number, report = event
+        if self.outcomes[number] is None:  # a report may come behind the end
+            self._watch.tally.running.add(number)
+        self._watch.reported(number, report)
 
     def _end(self, number: int, future: Future[Any]) -> None:
-        self._running.discard(number)
         outcome = _outcome(future)
         if isinstance(
             outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError
         ):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
+            self._watch.tally.running.discard(number)
             if self._is_ending:
                 return
             if self._tries[number] <= MOST_MOVES:
@@ -278,8 +245,7 @@ class _Run:
                 return
             outcome = Outcome(error=WorkerKilledError())
         self.outcomes[number] = outcome
-        self._done += outcome.error is None
-        self._failed += outcome.error is not None
+        self._watch.tally.end(number, outcome)
         self._watch.ended(number, outcome)
 
 
@@ -287,16 +253,24 @@ def carry_out(
     function: Callable[..., Any],
     given: tuple[Any, ...],
     number: int,
-    home: Home,
+    folder: Path,
+    versions: Mapping[str, str],
     reporter: Reporter,
 ) -> Outcome:
-    """In a worker: the outcome of a call, which never raises."""
+    """In a worker: the outcome of a call, which never raises.
+
+    It works in the folder of the program, from which configurations name files, if this machine has
+    it. A machine with other versions than the program's is refused.
+    """
 
     def report(value: Any) -> None:
         reporter(number, value)
 
     try:
-        home.enter()
+        require_same(versions, everything(), platform.node())
+        if folder.is_dir():
+            os.chdir(folder)
+            look_last_in(folder)
         report(0)
         return Outcome(function(*given, report))
     except Exception as error:
@@ -319,9 +293,8 @@ def _portable(error: Exception) -> Exception:
 
 def _outcome(future: Future[Any]) -> Outcome:
     if future.cancelled():
-        return Outcome(
-            error=ExecutorLostError("the workers are gone: they dropped what was to be done")
-        )
+        lost = "the workers are gone: they dropped what was to be done"
+        return Outcome(error=ExecutorLostError(lost))
     error = future.exception()
     if error is None:
         return future.result()

@@ -58,8 +58,7 @@ def dask_pool(address: str) -> Iterator[Pool]:
 
 
 def warn_of_public(address: str) -> None:
-    """Warn where a scheduler, which runs the code of whoever reaches it, has an address of the
-    Internet.
+    """Warn of a scheduler, which runs the code of whoever reaches it, at a public address.
 
     Args:
         address: HOST:PORT; a name stands for all of its addresses.
@@ -69,11 +68,8 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    public = [
-        str(place[0])
-        for *_, place in found
-        if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_global
-    ]
+    addresses = [str(place[0]) for *_, place in found]
+    public = [one for one in addresses if ipaddress.ip_address(one.partition("%")[0]).is_global]
     if public:
         warnings.warn(
             f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"

@@ -48,12 +48,10 @@ class Executors:
         return self.on == _LOCAL
 
     def threads_per_call(self, calls: int) -> int:
-        """Threads for each of some calls: an equal share of the cores of this machine; elsewhere
-        one.
-        """
-        return (
-            max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls)) if self.is_local else 1
-        )
+        """Threads for each of some calls: an equal share of this machine's cores; elsewhere one."""
+        if not self.is_local:
+            return 1
+        return max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls))
 
     def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.

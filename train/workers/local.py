@@ -48,9 +48,8 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
         calls: How many calls there will be; there are no more processes than that.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        sys.exit(
-            1
-        )  # this is a worker that imports the script of its parent, which says why it ended
+        # this is a worker that imports the script of its parent, which says why it ended
+        sys.exit(1)
     with safe_children():
         # its start lets SIGINT through; the threads that start workers block it
         resource_tracker.ensure_running()
@@ -151,11 +150,9 @@ class _Worker:
         self._reader.join()
         while (code := self.process.exitcode) is None:  # another thread is about to learn it
             time.sleep(0.01)
-        return (
-            WorkerLostError("a worker process was killed")
-            if self._has_begun or code < 0
-            else UnguardedScriptError()
-        )
+        if self._has_begun or code < 0:
+            return WorkerLostError("a worker process was killed")
+        return UnguardedScriptError()
 
     def _read(self, reports: "Connection[Any, Any]", events: "queue.SimpleQueue[Any]") -> None:
         """In a thread: hand on what is reported, as long as the process lives."""

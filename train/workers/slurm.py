@@ -1,6 +1,4 @@
-"""Workers as jobs of Slurm, by submitit: an array of jobs, which needs a folder that all
-machines see.
-"""
+"""Workers as jobs of Slurm, by submitit; they need a folder that all machines see."""
 
 import os
 import queue
@@ -40,18 +38,15 @@ class SlurmConfig(Model):
 
     def parameters(self) -> dict[str, Any]:
         """As submitit calls them."""
-        own = {
-            "partition": self.partition,
-            "account": self.account,
-            "array_parallelism": self.at_once,
-        }
-        named = {f"slurm_{name}": value for name, value in own.items() if value is not None}
-        limits = {
+        named = {
+            "slurm_partition": self.partition,
+            "slurm_account": self.account,
+            "slurm_array_parallelism": self.at_once,
             "timeout_min": self.time_min,
             "mem_gb": self.memory_gb,
             "cpus_per_task": self.cores,
         }
-        return {"name": "elastic", **limits, **named}
+        return {"name": "elastic", **{key: own for key, own in named.items() if own is not None}}
 
 
 @contextmanager
@@ -141,9 +136,8 @@ class Jobs(Executor):
                 self._submit_waiting()
                 self._read_reports()
                 self._settle_done()
-            except (
-                Exception
-            ) as error:  # Slurm refuses, or the folder is full: that is the end of all calls
+            except Exception as error:
+                # Slurm refuses, or the folder is full: that is the end of all calls
                 lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
                 for future in [*self._jobs, *(future for future, *_ in self._waiting)]:
                     if not future.cancelled():

@@ -40,9 +40,9 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
     """
     names = dict.fromkeys([*ours, *theirs])
     different = [
-        f"{n} {theirs.get(n)} there, {ours.get(n)} here"
-        for n in names
-        if ours.get(n) != theirs.get(n)
+        f"{name} {theirs.get(name)} there, {ours.get(name)} here"
+        for name in names
+        if ours.get(name) != theirs.get(name)
     ]
     if different:
         raise VersionsDifferError(
@@ -53,16 +53,12 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
 
 def _library_versions() -> dict[str, str]:
     """Python and the libraries that calculate."""
-    return {
-        "python": platform.python_version(),
-        **{name: installed_version(name) or "none" for name in _LIBRARIES},
-    }
+    versions = {name: installed_version(name) or "none" for name in _LIBRARIES}
+    return {"python": platform.python_version(), **versions}
 
 
 def _digest(folders: Sequence[str]) -> str:
-    """SHA-256 digest of modules and tables in some folders, with their paths; its first 16
-    characters.
-    """
+    """The first 16 characters of the SHA-256 digest of modules and tables in some folders."""
     digest = hashlib.sha256()
     for folder in folders:
         for file in sorted((_ROOT / folder).rglob("*")):

@@ -2,7 +2,7 @@
 the package.
 
     make residuals                                       # or, for some of them:
-    python -m train.commands.residuals testbed walker_3s_posture --seeds 0 1 --jobs 2
+    python -m tests.residuals_anew testbed walker_3s_posture --seeds 0 1 --jobs 2
 
 Training and comparison of each are runs in runs/residuals. A call goes on where the last one was
 interrupted.
@@ -17,10 +17,11 @@ from rich.console import Console
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
-from train.commands.compare import CompareConfig, Comparison, Work, compare
+from train.commands.compare import CompareConfig, Comparison, compare
 from train.evaluate.conditions import PolicySpec
 from train.learn.run_training import resume, start
 from train.learn.train_config import TrainConfig
+from train.runs.console import PlainConsole
 from train.runs.folders import CONFIG, RUNS
 from train.workers.executors import Executors
 
@@ -45,9 +46,8 @@ _SHIPPED = Path("baselines/trained")
 
 def shipped_seeds(name: str) -> list[int]:
     """Training seeds of a residual that the package has."""
-    return sorted(
-        int(folder.name.removeprefix("seed_")) for folder in (_SHIPPED / name).glob("seed_*")
-    )
+    folders = (_SHIPPED / name).glob("seed_*")
+    return sorted(int(folder.name.removeprefix("seed_")) for folder in folders)
 
 
 def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> CompareConfig:
@@ -62,16 +62,14 @@ def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> Compa
     Raises:
         ConfigurationError: The residual is not among the policies.
     """
-    (shipped,) = [
-        policy for policy in config.policies if policy.name.startswith(f"residual:{name}/")
-    ] or [None]
-    if shipped is None:
+    others = [one for one in config.policies if not one.name.startswith(f"residual:{name}/")]
+    shipped = [one for one in config.policies if one not in others]
+    if not shipped:
         raise ConfigurationError(
             f"{config.name} does not compare residual:{name}/seed_*; add it to its policies"
         )
+    own = shipped[0].replace(label="of the package")
     anew = PolicySpec(name=f"residual:{trained}/seed_*/last", label="trained anew")
-    others = [policy for policy in config.policies if policy is not shipped]
-    own = shipped.replace(label="of the package")
     return config.replace(
         name=f"residuals_{name}", policies=[*others, own, anew], figure_policies=[]
     )
@@ -103,8 +101,9 @@ def reproduce(
     else:
         start([config], console, training, executors)
     compared = load_yaml(configs / f"{RESIDUALS[name]}.yaml", CompareConfig)
-    work = Work(executors, resumes=(comparison / CONFIG).is_file())
-    return compare(beside_the_shipped(compared, name, training), console, comparison, work)
+    both = beside_the_shipped(compared, name, training)
+    is_begun = (comparison / CONFIG).is_file()
+    return compare(both, console, comparison, executors, resumes=is_begun)
 
 
 def main(
@@ -124,8 +123,9 @@ def main(
     """
     try:
         require_known("residual of the package", names, RESIDUALS)
+        console = PlainConsole()
         for name in names or RESIDUALS:
-            reproduce(name, output, Console(), seeds or shipped_seeds(name), Executors(jobs=jobs))
+            reproduce(name, output, console, seeds or shipped_seeds(name), Executors(jobs=jobs))
     except ElasticError as error:
         raise SystemExit(f"error: {error}") from None
 
