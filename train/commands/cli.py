@@ -23,7 +23,7 @@ import elastic_env
 from elastic_env.core.errors import shortened
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explain
-from train.runs.import_path import look_last_in
+from train.runs.import_path import leave
 from train.runs.progress import say_what_is_compiled
 
 COMMANDS = (
@@ -172,7 +172,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            look_last_in(Path.cwd())  # for --policy module:function
+            leave(Path.cwd())
             command = parse(sys.argv[1:] if arguments is None else arguments)
             with say_what_is_compiled(CONSOLE), visible_warnings():
                 command.run(CONSOLE)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from train.runs.escaping import visible
 from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explain, is_interrupt, is_unread
-from train.runs.import_path import ShadowedError, look_last_in, safe_children
+from train.runs.import_path import ShadowedError, leave, safe_children
 
 _UNREAD = 128 + signal.SIGPIPE
 
@@ -47,13 +47,15 @@ def _leave_working_folder() -> None:
     """Import nothing from the working folder that is installed, here and in the processes that
     are started.
     """
-    look_last_in(Path.cwd())
+    leave(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
     kept = child_environment()
     if "PYTHONPATH" not in kept:
         os.environ.pop("PYTHONPATH", None)
     os.environ.update(kept)
+    # else Numba's configuration in the working folder could name a cache, and Numba unpickles it
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")
 
 
 def _have_streams() -> None:

@@ -21,7 +21,7 @@ from train.learn.trainer import Trainer
 from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
-from train.runs.user_code import code_refused, require_no_code
+from train.runs.user_code import TRUST, load_without_code
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.executors import Executors
 
@@ -114,10 +114,12 @@ def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     file = require_run(folder, "training run", "train printed")
     if trust_code:
         return load_yaml(file, TrainConfig)
-    with code_refused(file):
-        config = load_yaml(file, TrainConfig)
-    require_no_code(file, [config.algorithm, config.env, config.base])
-    return config
+    return load_without_code(file, TrainConfig, _names_of_code, TRUST)
+
+
+def _names_of_code(config: TrainConfig) -> list[str]:
+    """Names that may stand for code; that of the base never does."""
+    return [config.algorithm, config.env]
 
 
 def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:

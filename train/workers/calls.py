@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
-from train.runs.import_path import look_last_in
+from train.runs.import_path import leave
 from train.workers.versions import VersionsDifferError, everything, require_same
 
 MOST_MOVES = 2
@@ -121,7 +121,7 @@ class Home:
         require_same(self.versions, everything(), platform.node())
         if self.folder.is_dir():
             os.chdir(self.folder)
-            look_last_in(self.folder)
+            leave(self.folder)
 
 
 @dataclass(frozen=True)
