@@ -15,6 +15,7 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
+from train.runs.escaping import visible
 
 MRAD = 1e3
 MM = 1e3
@@ -47,9 +48,17 @@ def require_matplotlib() -> Any:
             "axes.titlesize": 11,
             "axes.titleweight": "bold",
             "axes.titlelocation": "left",
+            "text.parse_math": False,  # a label of the user's is no formula
+            "text.usetex": False,
         }
     )
     return plt
+
+
+def label_text(name: str) -> str:
+    """A text of the user's as a label, which Matplotlib leaves out if it begins with "_"."""
+    shown = visible(name)
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def columns_of(entries: int, widest: int = 5) -> int:
@@ -60,6 +69,8 @@ def columns_of(entries: int, widest: int = 5) -> int:
 
 def save(figure: Any, path: Path) -> Path:
     """Write a figure and forget it."""
+    for text in figure.findobj(lambda part: hasattr(part, "set_text")):
+        text.set_text(visible(text.get_text()))
     content = io.BytesIO()
     figure.savefig(content, format=path.suffix[1:], bbox_inches="tight")
     write_whole(path, content.getvalue())
@@ -124,7 +135,7 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
     style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
     marker = {"marker": "o", "ms": 4} if curve.has_points else {}
-    name = curve.name or "_"  # without a name Matplotlib has it in no legend
+    name = label_text(curve.name) or "_"  # without a name Matplotlib has it in no legend
     axis.plot(curve.x, curve.y, color=curve.colour, lw=curve.width, ls=style, label=name, **marker)
     if curve.band is not None:
         axis.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.18, lw=0)
@@ -151,7 +162,9 @@ def _draw_failing(axis: Any, chart: Chart) -> None:
             policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0
         )
     axis.set_yticks(
-        range(len(chart.failing)), [policy.name for policy in reversed(chart.failing)], fontsize=8
+        range(len(chart.failing)),
+        [label_text(policy.name) for policy in reversed(chart.failing)],
+        fontsize=8,
     )
     axis.set_ylim(-0.7, len(chart.failing) - 0.3)
     axis.set_ylabel(chart.failure)
@@ -246,7 +259,7 @@ def _draw_bars(
             axis.scatter(x, 0.035, marker="X", s=26, edgecolors="white", lw=0.5, **shown)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
-    axis.set_xticks(range(len(groups)), list(groups), **slanted)
+    axis.set_xticks(range(len(groups)), [label_text(name) for name in groups], **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)
 
@@ -256,7 +269,7 @@ def _legend(
 ) -> None:
     """Policies, and the mark of failures if there are any."""
     handles = [
-        axis.bar(np.nan, 0.0, color=shade, label=policy)
+        axis.bar(np.nan, 0.0, color=shade, label=label_text(policy))
         for policy, shade in policy_colours(policies).items()
     ]
     if any(evaluation.num_failed for evaluation in evaluations):
