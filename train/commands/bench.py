@@ -15,6 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from baselines.policies import is_saved
 from elastic_env.core.config import (
     LARGEST_SEED,
     MOST_ENTRIES,
@@ -34,6 +35,7 @@ from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
+from train.runs.user_code import load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """Where a configuration is looked for; in a checkout it is that of the package."""
@@ -97,7 +99,13 @@ class Figure:
     problem: str
 
 
-def bench(path: Path, console: Console, update: bool = False, output: Path | None = None) -> bool:
+def bench(
+    path: Path,
+    console: Console,
+    update: bool = False,
+    output: Path | None = None,
+    is_named: bool = True,
+) -> bool:
     """Play the rollouts of a configuration, write and print their figures.
 
     Args:
@@ -105,15 +113,22 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
         console: Where progress and results go.
         update: Accept what is measured now.
         output: Folder for bench.json and bench.md; default runs/bench, numbered if taken.
+        is_named: Whether the user named the configuration; of another one no code is imported.
 
     Returns:
         Whether all figures kept their bounds; with `update` whether all have a value.
 
     Raises:
-        ConfigurationError: Names or options that do not exist.
+        ConfigurationError: Names or options that do not exist, or code in a configuration that
+            nobody named.
         ResultsExistError: The output folder holds results.
     """
-    config = load_yaml(path, BenchConfig)
+    cure = f"name it: elastic bench {path}"
+    config = (
+        load_yaml(path, BenchConfig)
+        if is_named
+        else load_without_code(path, BenchConfig, _names_of_code, cure)
+    )
     with run_folder(config.name, config.model_dump(mode="json"), None, output) as folder:
         evaluations = run_conditions([case.condition for case in config.cases], console)
         figures = [
@@ -144,6 +159,12 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
             f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False
         )
     return not short
+
+
+def _names_of_code(config: BenchConfig) -> list[str]:
+    """Names that may stand for code."""
+    policies = [case.policy for case in config.cases if not is_saved(case.policy)]
+    return [*policies, *(case.env for case in config.cases)]
 
 
 def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Figure]:
@@ -274,9 +295,9 @@ class Bench(Model):
     $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench --update
     """
 
-    config: Annotated[Path, tyro.conf.Positional] = USUAL
-    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml,
-    that of the package.
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """Configuration with rollouts and accepted figures. Without one configs/bench.yaml, whose code
+    does not run unless it is named; where that does not exist, the configuration of the package.
     """
     update: bool = False
     """Accept what is measured now: the figures in the configuration change, and nothing else of
@@ -287,5 +308,7 @@ class Bench(Model):
 
     def run(self, console: Console) -> None:
         """Play and compare."""
-        if not bench(configuration(self.config, self.update), console, self.update, self.output):
+        path = configuration(self.config or USUAL, self.update)
+        is_named = self.config is not None
+        if not bench(path, console, self.update, self.output, is_named):
             sys.exit(1)

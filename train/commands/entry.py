@@ -1,11 +1,10 @@
-"""The command `elastic` around its modules: what ends it while they load, and output that nobody
-takes.
-"""
+"""A program around its modules: what ends it while they load, and output that nobody takes."""
 
 import contextlib
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from train.runs.escaping import visible
@@ -17,12 +16,25 @@ _UNREAD = 128 + signal.SIGPIPE
 
 def main() -> None:
     """Entry point of the command `elastic`."""
+
+    def run() -> None:
+        from train.commands.cli import main as elastic
+
+        elastic()
+
+    start(run)
+
+
+def start(run: Callable[[], None]) -> None:
+    """Run a program, which ends with exit code 141 where nobody reads what it says.
+
+    Args:
+        run: The program. What it imports itself does not come from the working folder.
+    """
     _have_streams()
     try:
         try:
             _leave_working_folder()  # before anything else is imported
-            from train.commands.cli import main as run
-
             with safe_children():
                 run()
         finally:
