@@ -19,7 +19,7 @@ from baselines.catalogue import (
 from baselines.compensation.policy import Policy
 from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
-from elastic_env.core.errors import ConfigurationError, shortened, unknown_name
+from elastic_env.core.errors import ConfigurationError, shorten, unknown_name
 from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
 ITERATIVE = "iterative:"
@@ -143,13 +143,13 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     task = env.unwrapped.task.name
     if description.robot != task:
         raise ConfigurationError(
-            f"{shortened(folder)} is a residual for the {description.robot}, the environment is the"
+            f"{shorten(folder)} is a residual for the {description.robot}, the environment is the"
             f" {task}"
         )
     joints = env.unwrapped.assumed_model.joint_names
     if description.joints not in ([], joints):
         raise ConfigurationError(
-            f"{shortened(folder)} was trained on a robot with the joints"
+            f"{shorten(folder)} was trained on a robot with the joints"
             f" {', '.join(description.joints)}; the environment's has {', '.join(joints)}"
         )
     base = make(description.base, env, **{**description.base_options, **options})

@@ -21,7 +21,7 @@ from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import Bound, ResidualSettings
-from elastic_env.core.errors import ActionError, ConfigurationError, shown
+from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.envs import final_of, reset_mask
 from elastic_env.world.task import Transition
@@ -77,7 +77,7 @@ class _Deciding:
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(
                 f"a residual must be finite numbers of shape {shape} within ±1, got"
-                f" {shown(residual)}"
+                f" {quote(residual)}"
             )
         clipped = np.clip(given, -1.0, 1.0)
         return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)

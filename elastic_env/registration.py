@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.rendering.picture import Picture
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.world.task import Task
@@ -63,7 +63,7 @@ class Robot:
         for name, number, least, note in bounds:
             if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
                 raise ConfigurationError(
-                    f"{name} must be a whole number >= {least}{note}, got {shown(number)}"
+                    f"{name} must be a whole number >= {least}{note}, got {quote(number)}"
                 )
         require_memory("num_envs", num_envs, _LEAST_WORLD_BYTES)
         task = self.task(self._configured(arguments), num_envs)
@@ -95,7 +95,7 @@ def require_models(**arguments: tuple[Any, type[Any]]) -> None:
         if not isinstance(given, dict | model | None):
             raise ConfigurationError(
                 f"{name} must be a {model.__name__} or a mapping of its parameters, got"
-                f" {shown(given)}"
+                f" {quote(given)}"
             )
 
 
@@ -114,6 +114,6 @@ def require_memory(name: str, worlds: int, world_bytes: int) -> None:
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > there:
         raise ConfigurationError(
-            f"{shown(worlds)} worlds take about {shown(needed // 10**9)} GB of memory, this"
+            f"{quote(worlds)} worlds take about {quote(needed // 10**9)} GB of memory, this"
             f" computer has {there / 1e9:.1f} GB; set {name} to at most {there // world_bytes}"
         )

@@ -16,10 +16,10 @@ from elastic_env.core import installed
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import (
     ElasticError,
-    listed,
+    list_names,
     missing_extra,
-    shortened,
-    shown,
+    quote,
+    shorten,
     unknown_name,
 )
 from elastic_env.robots.gallery import gallery_robot
@@ -135,12 +135,12 @@ def test_what_is_shown_has_its_begin_and_end() -> None:
         "\x00" * 190,
         {str(i): i for i in range(1000)},
     ):
-        assert len(shown(value)) <= MOST
+        assert len(quote(value)) <= MOST
     path = "/" + "a" * 300 + "/run.yaml"
-    assert len(shortened(path)) == MOST
-    assert shortened(path).startswith("/aaa")
-    assert shortened(path).endswith("/run.yaml")
-    assert shortened("x" * MOST) == "x" * MOST
+    assert len(shorten(path)) == MOST
+    assert shorten(path).startswith("/aaa")
+    assert shorten(path).endswith("/run.yaml")
+    assert shorten("x" * MOST) == "x" * MOST
 
 
 def test_our_own_words_are_not_cut() -> None:
@@ -148,8 +148,8 @@ def test_our_own_words_are_not_cut() -> None:
     said = f"unknown 'x.'; {'choose one of these, ' * 40} or 'y'"
     assert str(ElasticError(said)) == said
     names = [f"joint_{i}" for i in range(1000)]
-    assert listed(["a", "b"]) == "a, b"
-    assert listed(names).endswith(f" and {1000 - listed(names).count('joint_')} more")
+    assert list_names(["a", "b"]) == "a, b"
+    assert list_names(names).endswith(f" and {1000 - list_names(names).count('joint_')} more")
     assert "Did you mean 'joint_7'?" in str(unknown_name("joint", "jiont_7", names))
 
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save_file
 
 from baselines.residual.residual import load_residual, read_description
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.json_text import parse_json
 from elastic_env.world.physics import substeps
 from tests.mutations import RESIDUALS
@@ -233,8 +233,8 @@ def test_a_function_that_makes_no_policy_is_explained(name: str) -> None:
 def test_what_an_error_shows_is_short() -> None:
     """Catches a terminal that is flooded, and an integer that Python does not turn into text."""
     for value in (10**5000, "x" * 10**6, [[1] * 1000] * 1000, {str(i): i for i in range(1000)}):
-        assert len(shown(value)) < 300
-    assert shown("nominal") == "'nominal'"
+        assert len(quote(value)) < 300
+    assert quote("nominal") == "'nominal'"
     with pytest.raises(ConfigurationError) as caught:
         environment("walker").arguments({str(i): i for i in range(2000)})
     assert len(str(caught.value)) < 500

@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from baselines.adaptation.learned_signals import LearningGains
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
@@ -98,7 +98,7 @@ def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
     tensors, _ = read_tensors(folder / OFFSETS)
     if set(tensors) != {_TENSOR}:
         raise ConfigurationError(
-            f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {shown(sorted(tensors))}"
+            f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {quote(sorted(tensors))}"
         )
     table = np.asarray(tensors[_TENSOR], dtype=np.float64)
     try:
@@ -138,6 +138,6 @@ def _require_same(folder: Path, description: TableDescription, table: Array, env
         given = motion.get(key)
         if learned != given:
             raise ConfigurationError(
-                f"{folder} was learned for a motion with {key} {shown(learned)}, the environment"
-                f" has {shown(given)}; learn it anew: offsets of one motion are wrong in another"
+                f"{folder} was learned for a motion with {key} {quote(learned)}, the environment"
+                f" has {quote(given)}; learn it anew: offsets of one motion are wrong in another"
             )

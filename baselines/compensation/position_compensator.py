@@ -25,8 +25,8 @@ from elastic_env.core.errors import (
     ActionError,
     ConfigurationError,
     ElasticError,
+    quote,
     require_known,
-    shown,
     unknown_name,
 )
 from elastic_env.core.signals import Array, BoolArray
@@ -441,7 +441,7 @@ class PositionCompensator:
             size = f", an array of shape {values.shape}" if isinstance(given, np.ndarray) else ""
             raise ActionError(
                 f"{name} must be {n} numbers [{unit}], of {', '.join(self.joints)}; got"
-                f" {shown(given)}{size}"
+                f" {quote(given)}{size}"
             )
         if not np.isfinite(values).all():
             bad = [
@@ -450,7 +450,7 @@ class PositionCompensator:
                 if not np.isfinite(value)
             ]
             raise ActionError(
-                f"{name} must be finite [{unit}], got {shown(values.tolist())}; see"
+                f"{name} must be finite [{unit}], got {quote(values.tolist())}; see"
                 f" {', '.join(bad)}"
             )
         return values
@@ -605,7 +605,7 @@ def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
         values = [_of_joint(name, given, joint) for joint in joints]
     elif isinstance(given, str | Path):
         raise ConfigurationError(
-            f"{name} must be numbers [N·m/rad], got {shown(str(given))}; {_HOW_TO_GIVE}"
+            f"{name} must be numbers [N·m/rad], got {quote(str(given))}; {_HOW_TO_GIVE}"
         )
     elif isinstance(given, list | tuple | np.ndarray):
         values = list(given)
@@ -653,7 +653,7 @@ def _number(
     if isinstance(value, bool | str) or not isinstance(
         value, int | float | np.integer | np.floating
     ):
-        raise ConfigurationError(f"{name} must be a number [{unit}], got {shown(value)}")
+        raise ConfigurationError(f"{name} must be a number [{unit}], got {quote(value)}")
     number = float(value)
     if (
         np.isnan(number)
@@ -679,6 +679,6 @@ def _finite(name: str, given: Any, size: int, unit: str) -> Array:
     values = _array(given)
     if values.shape != (size,) or not np.isfinite(values).all():
         raise ConfigurationError(
-            f"{name} must be {size} finite numbers [{unit}], got {shown(given)}"
+            f"{name} must be {size} finite numbers [{unit}], got {quote(given)}"
         )
     return values

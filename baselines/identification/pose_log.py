@@ -14,7 +14,7 @@ from typing import Literal, NoReturn
 import numpy as np
 
 from elastic_env.core.csv_table import read_table
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array
 
 Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
@@ -180,7 +180,7 @@ def _name(path: Path, text: str) -> str:
     found = _HEADER.match(text)
     if found is None or found[1] not in UNITS:
         raise ConfigurationError(
-            f"{path} has the column {shown(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
+            f"{path} has the column {quote(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
             " direction.JOINT, end_effector.x, .y, .z, imu.roll and imu.pitch"
         )
     quantity = found[1]
@@ -188,8 +188,8 @@ def _name(path: Path, text: str) -> str:
     unit = found[3]
     if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
-            f"{path}, column {quantity}.{shown(of)[1:-1]}: the unit must be [{UNITS[quantity]}],"
-            f" got [{shown(unit)[1:-1]}]; convert the column"
+            f"{path}, column {quantity}.{quote(of)[1:-1]}: the unit must be [{UNITS[quantity]}],"
+            f" got [{quote(unit)[1:-1]}]; convert the column"
         )
     return f"{quantity}.{of}"
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.compiled import compiled
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.signals import Array
 
 Single = npt.NDArray[np.float32]
@@ -50,7 +50,7 @@ def require_network(tensors: Tensors) -> int:
     if not 1 <= depth <= _MOST_LAYERS or set(tensors) != names:
         raise ConfigurationError(
             f"weights must be mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers; "
-            f"got {shown(sorted(tensors))}"
+            f"got {quote(sorted(tensors))}"
         )
     for name, tensor in tensors.items():
         _require_numbers(name, tensor)

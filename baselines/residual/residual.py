@@ -23,7 +23,7 @@ from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network, Tensors
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.core.tensors import read_tensors
@@ -107,7 +107,7 @@ def require_plain_base(name: str) -> str:
         )
     if ":" in name:
         raise ValueError(
-            f"the base of a residual must be no residual and no code, got {shown(name)}; name a "
+            f"the base of a residual must be no residual and no code, got {quote(name)}; name a "
             "baseline, as a residual plays without code of its own"
         )
     return name
@@ -268,7 +268,7 @@ def _none_at(folder: Path, why: str) -> str:
     }
     names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())
     return (
-        f"no residual at {shown(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is"
+        f"no residual at {quote(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is"
         f" needed ({why}), or the name of one that comes with the package: {names}"
     )
 
@@ -289,9 +289,7 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     try:
         network = Network(description, tensors)
     except ConfigurationError as error:
-        raise ConfigurationError(
-            f"{shortened(folder / WEIGHTS)} holds no network: {error}"
-        ) from None
+        raise ConfigurationError(f"{shorten(folder / WEIGHTS)} holds no network: {error}") from None
     found = sha256(content).hexdigest()
     if description.weights_sha256 not in (None, found):
         raise ConfigurationError(

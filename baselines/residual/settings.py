@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.errors import require_known, shown
+from elastic_env.core.errors import quote, require_known
 
 Bound = float | dict[str, float]
 """Value at a residual of 1: for all columns of an input, or by joint or axis."""
@@ -62,7 +62,7 @@ class ResidualSettings(Model):
         space = values.get("space", "model")
         if not isinstance(space, str) or space not in _OLD_SPACES:
             raise ValueError(
-                f"space must be one of {', '.join(_OLD_SPACES)}, got {shown(space)}; better give"
+                f"space must be one of {', '.join(_OLD_SPACES)}, got {quote(space)}; better give"
                 " acts_on"
             )
         others = {key: value for key, value in values.items() if key not in ("space", "scale")}
@@ -81,7 +81,7 @@ class ResidualSettings(Model):
             if not given or not all(0.0 < one < kind.limit for one in given):
                 limit = f"{kind.limit:g} {kind.unit}".removesuffix(" 1")
                 raise ValueError(
-                    f"the bound of {name} must be positive and below {limit}, got {shown(bound)}"
+                    f"the bound of {name} must be positive and below {limit}, got {quote(bound)}"
                 )
         return self
 

@@ -24,7 +24,7 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
 from elastic_env.core.config_problems import ModelError, problems_of
-from elastic_env.core.errors import ConfigurationError, listed, shortened, shown
+from elastic_env.core.errors import ConfigurationError, list_names, quote, shorten
 from elastic_env.core.files import read_bounded
 from elastic_env.core.installed import configurations_are
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
@@ -146,7 +146,7 @@ class Model(BaseModel):
 def _is_text(value: str) -> str:
     if NO_TEXT.search(value):
         raise ValueError(
-            f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}"
+            f"a name must hold neither zero bytes nor halves of characters, got {quote(value)}"
         )
     return value
 
@@ -182,9 +182,9 @@ def load_yaml(
     try:
         return model(**{**content, **(changes or {})})
     except ModelError as error:
-        raise ConfigurationError(f"in {shortened(file)}: {error.named()}") from None
+        raise ConfigurationError(f"in {shorten(file)}: {error.named()}") from None
     except ConfigurationError as error:
-        raise ConfigurationError(f"in {shortened(file)}: {error}") from None
+        raise ConfigurationError(f"in {shorten(file)}: {error}") from None
 
 
 def load_json(
@@ -214,17 +214,13 @@ def load_json(
     except OSError as error:
         raise ConfigurationError(missing(str(error.strerror))) from None
     except ValueError as error:
-        raise ConfigurationError(f"{shortened(path)} is not JSON: {error}") from None
+        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(
-            f"{shortened(path)} must be a mapping, got {type(content).__name__}"
-        )
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(
-            f"{shortened(path)} describes no {what}: {error.named()}"
-        ) from None
+        raise ConfigurationError(f"{shorten(path)} describes no {what}: {error.named()}") from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
@@ -240,13 +236,13 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     try:
         content = parse_yaml(_text_of(file))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{shortened(file)} is not valid YAML: {error}") from None
+        raise ConfigurationError(f"{shorten(file)} is not valid YAML: {error}") from None
     if content is None and empty:
         content = {}
     if not isinstance(content, dict):
         got = "an empty file" if content is None else type(content).__name__
         raise ConfigurationError(
-            f"{shortened(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
+            f"{shorten(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
         )
     return content
 
@@ -259,13 +255,15 @@ def _text_of(file: Path) -> str:
     """
     try:
         if file.is_dir():
-            raise ConfigurationError(f"{shortened(file)} is a folder, a YAML file is needed")
+            raise ConfigurationError(f"{shorten(file)} is a folder, a YAML file is needed")
         if not file.exists():
             known = (
                 sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
             )
-            listing = f"; found beside it: {listed(known)}" if known else configurations_are(file)
-            raise ConfigurationError(f"no configuration file at {shortened(file)}{listing}")
+            listing = (
+                f"; found beside it: {list_names(known)}" if known else configurations_are(file)
+            )
+            raise ConfigurationError(f"no configuration file at {shorten(file)}{listing}")
         return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")
     except OSError as error:
-        raise ConfigurationError(f"{shortened(file)} cannot be read: {error.strerror}") from None
+        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None

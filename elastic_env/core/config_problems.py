@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from elastic_env.core.errors import ConfigurationError, choices_listed, readable, shown
+from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
 """Where a value stands: the keys and numbers of entries that lead to it."""
@@ -43,7 +43,7 @@ class Problem:
             between = ": " if self.form == "rule" and name else " " if name else ""
             return f"{prefix}{name}{between}{self.text}"
         owner = spelt(self.path[:-1]) or of_all
-        own = shown(self.path[-1])
+        own = quote(self.path[-1])
         if self.form == "unknown":
             return f"unknown parameter {f'of {owner} ' if owner else ''}{own}; {self.text}"
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
@@ -57,7 +57,7 @@ _LONGEST_SAID = 1900
 def dotted(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
     return ".".join(
-        part if isinstance(part, str) and len(part) < 100 else shown(part) for part in path
+        part if isinstance(part, str) and len(part) < 100 else quote(part) for part in path
     )
 
 
@@ -120,7 +120,7 @@ def _problems(
 
 
 def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
-    given = shown(problem["input"])
+    given = quote(problem["input"])
     match problem["type"]:
         case "extra_forbidden":
             return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))

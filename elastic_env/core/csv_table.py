@@ -14,7 +14,7 @@ from typing import TextIO
 
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.signals import Array
 
 LARGEST_BYTES = 20_000_000
@@ -57,21 +57,21 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
     size = _size(file, what, example)
     if size > LARGEST_BYTES:
         raise ConfigurationError(
-            f"{shortened(file)} must have at most {LARGEST_BYTES} bytes, it has {size}"
+            f"{shorten(file)} must have at most {LARGEST_BYTES} bytes, it has {size}"
         )
     try:
         with file.open(newline="", encoding="utf-8-sig") as text:
             return _parsed(file, text, row, most_rows, example)
     except UnicodeDecodeError as error:
         raise ConfigurationError(
-            f"{shortened(file)} is no text in UTF-8: {error.reason}; save it as CSV in UTF-8"
+            f"{shorten(file)} is no text in UTF-8: {error.reason}; save it as CSV in UTF-8"
         ) from None
     except csv.Error as error:
         raise ConfigurationError(
-            f"{shortened(file)} is no CSV file: {error}; check quotation marks and line ends"
+            f"{shorten(file)} is no CSV file: {error}; check quotation marks and line ends"
         ) from None
     except OSError as error:
-        raise ConfigurationError(f"{shortened(file)} cannot be read: {error.strerror}") from None
+        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None
 
 
 def _size(file: Path, what: str, example: str) -> int:
@@ -80,11 +80,11 @@ def _size(file: Path, what: str, example: str) -> int:
         found = file.stat()
     except (OSError, ValueError):
         raise ConfigurationError(
-            f"no {what} at {shown(str(file))[1:-1]}; give a CSV file with columns such as {example}"
+            f"no {what} at {quote(str(file))[1:-1]}; give a CSV file with columns such as {example}"
         ) from None
     if not stat.S_ISREG(found.st_mode):
         raise ConfigurationError(
-            f"{shortened(file)} must be a plain file, it is a folder, a pipe or a device; give a"
+            f"{shorten(file)} must be a plain file, it is a folder, a pipe or a device; give a"
             " CSV file"
         )
     return found.st_size
@@ -97,7 +97,7 @@ def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) ->
     header = next(lines, None)
     if header is None:
         raise ConfigurationError(
-            f"{shortened(file)} is empty; its first line must name columns such as {example}"
+            f"{shorten(file)} is empty; its first line must name columns such as {example}"
         )
     names = _names(file, header)
     values = array("d")
@@ -109,7 +109,7 @@ def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) ->
     if not 0 < count <= most_rows:
         more = f"more than {most_rows}" if count else "0"
         raise ConfigurationError(
-            f"{shortened(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
+            f"{shorten(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
         )
     return Table(names, np.frombuffer(values, dtype=np.float64).reshape(count, len(names)).copy())
 
@@ -119,7 +119,7 @@ def _bounded(file: Path, text: TextIO) -> Iterator[str]:
     while line := text.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
             raise ConfigurationError(
-                f"{shortened(file)} must have lines of at most {_LONGEST_LINE} characters; is it a"
+                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it a"
                 " CSV file?"
             )
         yield line
@@ -136,21 +136,21 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
         for separator, called in _SEPARATORS.items():
             if separator in names[0]:
                 raise ConfigurationError(
-                    f"the columns of {shortened(file)} are separated by {called}; {_CURE}"
+                    f"the columns of {shorten(file)} are separated by {called}; {_CURE}"
                 )
     if len(names) > MOST_COLUMNS:
         raise ConfigurationError(
-            f"{shortened(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
+            f"{shorten(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
         )
     if "" in names:
         raise ConfigurationError(
-            f"column {names.index('') + 1} of {shortened(file)} has no name; give it one, or take"
+            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one, or take"
             " the column out"
         )
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
         raise ConfigurationError(
-            f"{shortened(file)} has the column {shown(name)[1:-1]} twice; keep one of them"
+            f"{shorten(file)} has the column {quote(name)[1:-1]} twice; keep one of them"
         )
     return names
 
@@ -160,7 +160,7 @@ def _append(
 ) -> None:
     """Add the finite numbers of a row."""
     if len(cells) != len(names):
-        raise ConfigurationError(f"{shortened(file)}, {where}: {_ragged(names, cells)}")
+        raise ConfigurationError(f"{shorten(file)}, {where}: {_ragged(names, cells)}")
     for name, cell in zip(names, cells, strict=True):
         try:
             value = math.nan if "_" in cell else float(cell)
@@ -168,8 +168,8 @@ def _append(
             value = math.nan
         if not math.isfinite(value):
             raise ConfigurationError(
-                f"{shortened(file)} must hold a header and rows of numbers: {where}, column"
-                f" {shown(name)[1:-1]}: a finite number is needed, got {shown(cell)};"
+                f"{shorten(file)} must hold a header and rows of numbers: {where}, column"
+                f" {quote(name)[1:-1]}: a finite number is needed, got {quote(cell)};"
                 f" {_cure_of(cell)}"
             )
         values.append(value)

@@ -82,12 +82,12 @@ class _Shown(reprlib.Repr):
 _SHOWN = _Shown()
 
 
-def shown(value: Any) -> str:
+def quote(value: Any) -> str:
     """A given value as an error shows it: its representation, at most 200 characters."""
-    return shortened(_SHOWN.repr(value))
+    return shorten(_SHOWN.repr(value))
 
 
-def shortened(text: object, longest: int = _LONGEST_SHOWN) -> str:
+def shorten(text: object, longest: int = _LONGEST_SHOWN) -> str:
     """Text of a user's as an error shows it without quotes, such as a path: its begin and end,
     where it is long.
 
@@ -113,8 +113,8 @@ def readable(text: str) -> str:
     """A message without words, quoted texts or lines that would flood a terminal."""
     if len(text) <= _LONGEST_SHOWN:
         return text
-    short = _PIECE.sub(lambda found: shortened(found[0]), text)
-    return "\n".join(shortened(line, _LONGEST_LINE) for line in short.split("\n"))
+    short = _PIECE.sub(lambda found: shorten(found[0]), text)
+    return "\n".join(shorten(line, _LONGEST_LINE) for line in short.split("\n"))
 
 
 def unknown_name(kind: str, name: object, choices: Iterable[str]) -> ConfigurationError:
@@ -125,7 +125,7 @@ def unknown_name(kind: str, name: object, choices: Iterable[str]) -> Configurati
         name: The name that was given.
         choices: The names that exist.
     """
-    return ConfigurationError(f"unknown {kind} {shown(name)}; {choices_listed(name, choices)}")
+    return ConfigurationError(f"unknown {kind} {quote(name)}; {choices_listed(name, choices)}")
 
 
 def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> None:
@@ -147,13 +147,13 @@ def choices_listed(name: object, choices: Iterable[str]) -> str:
         if isinstance(name, str)
         else []
     )
-    hint = f" Did you mean {shown(close[0])}?" if close else ""
-    return f"choose one of: {listed(known)}.{hint}"
+    hint = f" Did you mean {quote(close[0])}?" if close else ""
+    return f"choose one of: {list_names(known)}.{hint}"
 
 
-def listed(names: Iterable[object]) -> str:
+def list_names(names: Iterable[object]) -> str:
     """Names as an error lists them: the first ones, and how many more there are."""
-    known = [shortened(name) for name in names]
+    known = [shorten(name) for name in names]
     lengths = itertools.accumulate(len(name) + 2 for name in known)
     fitting = max(sum(length <= _LONGEST_LIST for length in lengths), 1)
     more = f" and {len(known) - fitting} more" if fitting < len(known) else ""

@@ -5,7 +5,7 @@ import os
 import stat
 from pathlib import Path
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 
 
 def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> bytes:
@@ -59,7 +59,7 @@ def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
 
 
 def _short_path(path: Path) -> str:
-    return shown(str(path))[1:-1]
+    return quote(str(path))[1:-1]
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from safetensors import SafetensorError, deserialize
 from safetensors.numpy import load
 
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.files import read_bounded
 
 _MOST_BYTES = 100_000_000
@@ -26,15 +26,15 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
     try:
         content = read_bounded(path, _MOST_BYTES, within=path.parent)
         for name, tensor in deserialize(content):
-            kind = shown(tensor["dtype"])[1:-1]
+            kind = quote(tensor["dtype"])[1:-1]
             if kind not in _FILE_TYPES:
                 raise ConfigurationError(
-                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)},"
+                    f"{path}: the tensor {quote(name)} must be of type {' or '.join(_FILE_TYPES)},"
                     f" got {kind}"
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(
-            f"{shortened(path)} cannot be read: it is missing, cut short or something else"
+            f"{shorten(path)} cannot be read: it is missing, cut short or something else"
             f" ({error}); copy it anew"
         ) from None

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity, read_mapping
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 
 GivenJoints = str | Path | Mapping[str, Any]
 """A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad],
@@ -192,7 +192,7 @@ def _mapping(given: GivenJoints) -> Mapping[str, Any]:
     if not isinstance(given, str | Path):
         raise ConfigurationError(
             "joints must be a YAML file or a mapping such as {'*': {'stiffness': 1000}}, got"
-            f" {shown(given)}. {CURE}"
+            f" {quote(given)}. {CURE}"
         )
     return read_mapping(Path(given))
 
@@ -209,7 +209,7 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         else {"stiffness": np.inf if _is(value, RIGID) else value}
     )
     if own.get("stiffness") is None:
-        beside = f" beside {shown(list(own))}" if isinstance(value, Mapping) else ""
+        beside = f" beside {quote(list(own))}" if isinstance(value, Mapping) else ""
         raise ConfigurationError(
             f"stiffness of joint {name!r} is missing{beside}; write 'stiffness: K' [N·m/rad]: joint"
             f" {name!r} needs its stiffness K, or the value {HELD} or {RIGID}. {CURE}"

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import require_sound
 
@@ -207,7 +207,7 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
     require_known("joint", joints, known)
     if len(set(joints)) != len(joints) or not joints:
         raise ConfigurationError(
-            f"joints must name at least one joint, and each once, got {shown(list(joints))}"
+            f"joints must name at least one joint, and each once, got {quote(list(joints))}"
         )
     require_few(joints)
     for name in joints:
@@ -273,7 +273,7 @@ def _ends_of(model: mujoco.MjModel, equality: int) -> str:
     elif kind not in (_EQ_JOINT, _EQ_TENDON) and of != mujoco.mjtObj.mjOBJ_BODY:
         return "a deformable body"
     ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
-    return " and ".join(shown(read(i).name)[1:-1] or f"number {i}" for i in ends)
+    return " and ".join(quote(read(i).name)[1:-1] or f"number {i}" for i in ends)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> set[int]:

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.model_text import (
     DEEPEST,
     LARGEST_BYTES,
@@ -235,7 +235,7 @@ class _Counts:
                 self._bound(f"{name} of <{tag}>", _product(_numbers(value)), _MOST_OF_OTHERS)
             if name != "name" and _has_nan(value):
                 raise ConfigurationError(
-                    f"{name} of <{tag}> in {self.model.name} must be numbers, got {shown(value)}"
+                    f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
                 )
         if tag == "texture" and {"width", "height"} <= set(values):
             self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.model_bounds import require_bounds
 from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
@@ -122,7 +122,7 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     if not isinstance(model, str | Path):
         raise ConfigurationError(
             "a model must be a file of MJCF (.xml) or URDF (.urdf), the text of one, a"
-            f" mujoco.MjSpec or a mujoco.MjModel, got {shown(model)}"
+            f" mujoco.MjSpec or a mujoco.MjModel, got {quote(model)}"
         )
     text = read_model_text(model)
     require_bounds(text)
@@ -165,11 +165,11 @@ def require_sound(model: mujoco.MjModel, name: str) -> None:
             kind = "body" if element == model.body else "joint"
             raise ConfigurationError(
                 f"{what} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite and >="
-                f" 0, got {shown(np.ravel(values[wrong[0]]).tolist())}"
+                f" 0, got {quote(np.ravel(values[wrong[0]]).tolist())}"
             )
     if not np.isfinite(model.opt.gravity).all():
         raise ConfigurationError(
-            f"gravity of {name} must be finite [m/s²], got {shown(model.opt.gravity.tolist())}"
+            f"gravity of {name} must be finite [m/s²], got {quote(model.opt.gravity.tolist())}"
         )
     for j in range(model.njnt):
         low, high = map(float, model.jnt_range[j])
@@ -261,7 +261,7 @@ def _require_unique_names(text: ModelText) -> None:
         twice = [name for name, count in names.items() if count > 1 and name]
         if twice:
             raise ConfigurationError(
-                f"{text.name} has the {kind} {shown(twice[0])} {names[twice[0]]} times; give each"
+                f"{text.name} has the {kind} {quote(twice[0])} {names[twice[0]]} times; give each"
                 f" {kind} its own name"
             )
 
@@ -271,7 +271,7 @@ def _require_tree(text: ModelText) -> None:
     links = {link.get("name", "") for link in text.root.findall("link")}
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):
-        name = shown(joint.get("name", ""))
+        name = quote(joint.get("name", ""))
         ends = [
             element.get("link", "") if (element := joint.find(end)) is not None else ""
             for end in _ENDS
@@ -280,11 +280,11 @@ def _require_tree(text: ModelText) -> None:
             if link not in links:
                 raise ConfigurationError(
                     f"joint {name} of {text.name} needs a {end} that is a link of it, got"
-                    f" {shown(link)}"
+                    f" {quote(link)}"
                 )
         if ends[1] in parents:
             raise ConfigurationError(
-                f"link {shown(ends[1])} of {text.name} is the child of two joints; a URDF is a"
+                f"link {quote(ends[1])} of {text.name} is the child of two joints; a URDF is a"
                 " tree, cut the loop"
             )
         parents[ends[1]] = ends[0]
@@ -295,7 +295,7 @@ def _require_tree(text: ModelText) -> None:
             link = parents[link]
         if link in seen:
             raise ConfigurationError(
-                f"the links of {text.name} are joined in a circle at {shown(link)}; cut the loop"
+                f"the links of {text.name} are joined in a circle at {quote(link)}; cut the loop"
             )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 
 LARGEST_BYTES = 50_000_000
 """Of a model's file, and of its text."""
@@ -140,7 +140,7 @@ def is_file(path: str | Path) -> bool:
 def name_of(path: str | Path) -> str:
     """A path as errors show it: as it is, or shortened and escaped."""
     text = str(path)
-    return text if len(text) <= LONGEST_NAME and text.isprintable() else shown(text)
+    return text if len(text) <= LONGEST_NAME and text.isprintable() else quote(text)
 
 
 def read_bytes(path: Path, what: str = "model") -> bytes:
@@ -193,7 +193,7 @@ def parse_xml(text: str, name: str) -> ET.Element:
 
     def refuse_entity(entity: str, *_: Any) -> None:
         raise ConfigurationError(
-            f"{name} declares the entity {shown(entity)}, which is not read; write its text out"
+            f"{name} declares the entity {quote(entity)}, which is not read; write its text out"
             " where it is used"
         )
 
@@ -260,11 +260,11 @@ def _require_model(found: ModelText) -> None:
         if prefix in aliases or of_xacro is not None:
             what = f"<{element.tag}>" if prefix in aliases else f"the attribute {of_xacro}"
             raise ConfigurationError(
-                f"{name} is a file of xacro, it has {shown(what)[1:-1]}; {_EXPAND}"
+                f"{name} is a file of xacro, it has {quote(what)[1:-1]}; {_EXPAND}"
             )
     if root.tag not in _KINDS:
         raise ConfigurationError(
-            f"the root of {name} must be <mujoco> or <robot>, got {shown(root.tag)}; {_FILE}"
+            f"the root of {name} must be <mujoco> or <robot>, got {quote(root.tag)}; {_FILE}"
         )
     if found.is_urdf:
         for element in _parts(root):
@@ -273,7 +273,7 @@ def _require_model(found: ModelText) -> None:
             )
             if unread is not None:
                 raise ConfigurationError(
-                    f"{name} has {shown(unread)} in <{element.tag}>, of xacro; {_EXPAND}"
+                    f"{name} has {quote(unread)} in <{element.tag}>, of xacro; {_EXPAND}"
                 )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:

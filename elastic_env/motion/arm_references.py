@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
 from elastic_env.core.csv_table import read_table
-from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, require_known, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import (
@@ -364,7 +364,7 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     rows = table.values
     if names[0] != "time_s":
         raise ConfigurationError(
-            f"the first column of {file} must be time_s, got {shown(names[0])}"
+            f"the first column of {file} must be time_s, got {quote(names[0])}"
         )
     require_known(f"column of {file}", names[1:], joints)
     if len(rows) < 2 or len(names) < 2:

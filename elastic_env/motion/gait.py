@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, plain_numbers, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.trajectory import STAND_S, control_times, minimum_jerk
 
@@ -104,7 +104,7 @@ def make_gait(
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
             f"step_period must be one of {known} [s], or the three durations of double, single and"
-            f" double support [s] such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
+            f" double support [s] such as [0.8, 0.6, 0.8]; got {quote(step_period)}"
         )
     return Gait(**dict(zip(_DURATIONS, durations, strict=True)), **parameters)
 

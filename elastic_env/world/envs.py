@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from elastic_env.core.episode_random import EpisodeRandom
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.rendering.picture import Picture
 from elastic_env.world.physics import Simulation
@@ -334,7 +334,7 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
         return [int(seed) + i for i in range(num_envs)]
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
         raise ConfigurationError(
-            f"{name} must be a whole number, one per world ({num_envs}), or None; got {shown(seed)}"
+            f"{name} must be a whole number, one per world ({num_envs}), or None; got {quote(seed)}"
         )
     if len(seed) != num_envs:
         raise ConfigurationError(
@@ -354,7 +354,7 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
     if given.dtype != np.bool_ or given.shape != (num_envs,):
         raise ConfigurationError(
             f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got"
-            f" {shown(mask)}"
+            f" {quote(mask)}"
         )
     return given
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.config import plain_numbers
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
@@ -184,11 +184,11 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
             raise ConfigurationError(
-                f"stiffness must be numbers [N·m/rad], got {shown(given)}"
+                f"stiffness must be numbers [N·m/rad], got {quote(given)}"
             ) from None
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(
-            f"stiffness must be a number [N·m/rad] or an identification file, got {shown(value)}"
+            f"stiffness must be a number [N·m/rad] or an identification file, got {quote(value)}"
         )
     try:
         return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
@@ -199,7 +199,7 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     except (OSError, ValueError):
         raise ConfigurationError(
             "stiffness must be a number [N·m/rad] or an identification file, found no file"
-            f" {shortened(path)}"
+            f" {shorten(path)}"
         ) from None
     try:
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from baselines.identification.static_points import StaticPoints
-from elastic_env.core.errors import ElasticError, shown
+from elastic_env.core.errors import ElasticError, quote
 from elastic_env.core.files import read_bounded, write_whole
 from train.cells.key import cell_key
 from train.evaluate.conditions import Condition
@@ -71,7 +71,7 @@ class Store:
             raise UnfitCellError(f"{file.name}: {error}") from None
         except Exception as error:  # whatever a reader of archives makes of a foreign file
             raise UnfitCellError(
-                f"{file.name}: {type(error).__name__}: {shown(str(error))}"
+                f"{file.name}: {type(error).__name__}: {quote(str(error))}"
             ) from None
 
     def keep(self, evaluation: Evaluation, key: str | None = None) -> bool:
@@ -194,14 +194,14 @@ def _require_record(condition: Condition, number: int, record: dict[str, Any]) -
         own = record.get(name)
         same = type(own) is type(value) and own == value
         _require(
-            same, f"{name} of episode {number} is {shown(own)}, in the cell it is {shown(value)}"
+            same, f"{name} of episode {number} is {quote(own)}, in the cell it is {quote(value)}"
         )
     _require(
         isinstance(record.get("termination"), str), f"episode {number} does not say how it ended"
     )
     for name, value in record.items():
         _require(
-            isinstance(value, str | int | float), f"{name} of episode {number} is {shown(value)}"
+            isinstance(value, str | int | float), f"{name} of episode {number} is {quote(value)}"
         )
     if record["termination"]:
         return
@@ -210,7 +210,7 @@ def _require_record(condition: Condition, number: int, record: dict[str, Any]) -
         is_score = isinstance(value, float) and math.isfinite(value)
         _require(
             is_score,
-            f"{column.metric} of episode {number} must be a finite number, it is {shown(value)}",
+            f"{column.metric} of episode {number} must be a finite number, it is {quote(value)}",
         )
 
 
@@ -220,7 +220,7 @@ def _require_arrays(evaluation: Evaluation) -> None:
     traced = list(evaluation.condition.environment.traced)
     _require(
         list(trace) == traced,
-        f"it has the signals {shown(list(trace))}, the cell has {shown(traced)}",
+        f"it has the signals {quote(list(trace))}, the cell has {quote(traced)}",
     )
     for name, values in {**trace, "rest_references": evaluation.rest_references}.items():
         _require(values.ndim == 1 and values.dtype.kind == "f", f"{name} is no series of numbers")

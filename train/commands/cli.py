@@ -20,7 +20,7 @@ import tyro
 from rich.text import Text
 
 import elastic_env
-from elastic_env.core.errors import shortened
+from elastic_env.core.errors import shorten
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explain
 from train.runs.import_path import leave
@@ -110,7 +110,7 @@ def parse(arguments: list[str]) -> Any:
     if arguments == ["--version"]:
         print(f"elastic-env {elastic_env.__version__}")
         sys.exit()
-    short = [shortened(argument).replace("\n", " ") for argument in arguments]
+    short = [shorten(argument).replace("\n", " ") for argument in arguments]
     if short != arguments:
         _parse(short)  # what is wrong with them is said without a flood
     return _parse(arguments)

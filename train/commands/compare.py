@@ -12,7 +12,7 @@ from rich.console import Console
 
 from baselines.policies import is_saved
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, load_yaml, quantity
-from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.commands.options import OnHardware
@@ -152,14 +152,14 @@ class CompareConfig(Model):
             if not 1 <= episodes <= MOST_EPISODES:
                 raise ConfigurationError(
                     f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got"
-                    f" {shown(episodes)}"
+                    f" {quote(episodes)}"
                 )
         self._require_reference_scenarios()
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
                     f"group {name!r} must have a name that no scenario has, and scenarios, each"
-                    f" once; got {shown(scenarios)}"
+                    f" once; got {quote(scenarios)}"
                 )
             require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
         return self
@@ -199,7 +199,7 @@ class CompareConfig(Model):
         if self.map.motion is not None and self.references != self.map.motion.values:
             raise ConfigurationError(
                 f"an axis of the map varies the {self.map.motion.what}, so its values are the"
-                f" references; leave out references, got {shown(self.references)}"
+                f" references; leave out references, got {quote(self.references)}"
             )
 
     def conditions(self, with_bases: bool = True) -> list[Condition]:
@@ -435,7 +435,7 @@ def _require_each_once(what: str, values: Sequence[object]) -> None:
     for value in values:
         if values.count(value) > 1:
             raise ConfigurationError(
-                f"the {what} {shown(value)} stands twice; its episodes would count double"
+                f"the {what} {quote(value)} stands twice; its episodes would count double"
             )
 
 

@@ -18,7 +18,7 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model
-from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import RATES, require_ids
 from elastic_env.hardware.buses.servo_models import servo_models
@@ -332,7 +332,7 @@ def emulate(
     """
     if not 0.0 <= after_s <= _LATEST_FAULT_S:
         raise ConfigurationError(
-            f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {shown(after_s)}"
+            f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {quote(after_s)}"
         )
     with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
         console.print(

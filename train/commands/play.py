@@ -18,7 +18,7 @@ from elastic_env.core.errors import (
     ResultsExistError,
     SystemFailedError,
     missing_extra,
-    shortened,
+    shorten,
 )
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options, reference_of
 from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
@@ -117,7 +117,7 @@ def _film(
 ) -> None:
     if video.exists() or video.is_symlink():
         raise ResultsExistError(
-            f"{shortened(video)} exists and is not overwritten; name another file"
+            f"{shorten(video)} exists and is not overwritten; name another file"
         )
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from baselines import PositionCompensator
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read_mapping
-from elastic_env.core.errors import ConfigurationError, ElasticError, shown
+from elastic_env.core.errors import ConfigurationError, ElasticError, quote
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
 from elastic_env.joint.elasticity import ElasticJoint
@@ -277,7 +277,7 @@ def _given_joints(stiffness: str | float) -> dict[str, Any]:
         return dict(read_mapping(Path(stiffness)))
     if not stiffness > 0.0:
         raise ConfigurationError(
-            f"stiffness must be > 0 N·m/rad or a file of joints, got {shown(stiffness)}"
+            f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
         )
     return {"*": stiffness}
 

@@ -21,7 +21,7 @@ from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from elastic_env.core.errors import ConfigurationError, SystemFailedError, shown
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 
 LOOPBACK = "127.0.0.1"
 """Where a page listens unless somebody asks for another address."""
@@ -248,7 +248,7 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
     """
     if not 0 <= port <= _LARGEST_PORT:
         raise ConfigurationError(
-            f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {shown(port)}"
+            f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
         )
     try:
         family, *_ = socket.getaddrinfo(
@@ -257,7 +257,7 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
     except (socket.gaierror, UnicodeError):
         raise ConfigurationError(
             f"--host must be an address or a name of this machine, such as {LOOPBACK}, got"
-            f" {shown(host)}"
+            f" {quote(host)}"
         ) from None
     problem = OSError()
     for one in [port] if port else [*range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED), 0]:
@@ -266,7 +266,7 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         except OSError as error:
             problem = error
     raise SystemFailedError(
-        f"the page cannot listen at {shown(host)}, port {port}: {problem.strerror}; name another"
+        f"the page cannot listen at {quote(host)}, port {port}: {problem.strerror}; name another"
         " --port, or 0 for a free one"
     ) from None
 

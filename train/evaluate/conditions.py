@@ -12,7 +12,7 @@ from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.config_problems import meaning_of
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.world.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import (
@@ -40,7 +40,7 @@ def _reference(value: Any) -> Reference:
     if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
         raise ValueError(
             "a reference is a name, a step period [s], three durations [s] or a mapping of"
-            f" parameters, got {shown(value)}"
+            f" parameters, got {quote(value)}"
         )
     if isinstance(value, dict):
         _refuse(value.keys() & set(RESERVED), "part of a reference")
@@ -55,7 +55,7 @@ def _refuse(taken: set[str], what: str) -> None:
             if name in UNPLACED
             else "it has a key, or an option, of its own"
         )
-        raise ValueError(f"{name} cannot be {what}; {shortened(place)}")
+        raise ValueError(f"{name} cannot be {what}; {shorten(place)}")
 
 
 GivenReference = Annotated[Any, AfterValidator(_reference)]
@@ -85,7 +85,7 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     if ranges and not any(len(make_scenario(scenario).ranges) == 1 for scenario in scenarios):
         raise ConfigurationError(
             "ranges need a scenario whose robots are drawn from them, such as 'drawn', got"
-            f" {shown(list(scenarios))}"
+            f" {quote(list(scenarios))}"
         )
 
 

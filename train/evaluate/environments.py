@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any, TypeAlias
 
 from elastic_env import IDS
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.motion.arm_references import make_arm_reference
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
@@ -245,7 +245,7 @@ def _step_period(reference: Reference) -> Any:
     if "step_period" not in reference:
         raise ConfigurationError(
             "a reference of the walker that is a mapping needs the key 'step_period', got"
-            f" {shown(reference)}; for example {{step_period: 24, num_steps: 2}}"
+            f" {quote(reference)}; for example {{step_period: 24, num_steps: 2}}"
         )
     return reference["step_period"]
 

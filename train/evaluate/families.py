@@ -17,7 +17,7 @@ from typing import Any
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
 from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
 
@@ -138,7 +138,7 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
         )
         if not folders:
             raise ConfigurationError(
-                f"no folder matches {shown(pattern)}; {_nearest(Path(pattern))}"
+                f"no folder matches {quote(pattern)}; {_nearest(Path(pattern))}"
             )
     descriptions = [read_description(folder) for folder in folders]
     members = [
@@ -158,7 +158,7 @@ def _matching(pattern: str) -> list[Path]:
     """
     if "**" in pattern:
         raise ConfigurationError(
-            f"* stands for one part of a path, got {shown(pattern)}; leave ** out"
+            f"* stands for one part of a path, got {quote(pattern)}; leave ** out"
         )
     anchor = Path(pattern).anchor
     try:
@@ -183,7 +183,7 @@ def _require_motion(folder: Path, description: ResidualDescription) -> None:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
         raise ConfigurationError(
-            f"{shortened(folder / DESCRIPTION)}: training.config.reference: {error}"
+            f"{shorten(folder / DESCRIPTION)}: training.config.reference: {error}"
         ) from None
 
 
@@ -231,7 +231,7 @@ def _require_one_family(
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
                     f"{pattern!r} must match training seeds of one configuration, but {what} of"
-                    f" {shortened(folder)} is {mine.get(what)!r} and of {first}"
+                    f" {shorten(folder)} is {mine.get(what)!r} and of {first}"
                     f" {theirs.get(what)!r}; give each an entry of its own"
                 )
         if seed is None:
@@ -242,7 +242,7 @@ def _require_one_family(
         if seed in seen:
             raise ConfigurationError(
                 f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and"
-                f" {shortened(folder)}"
+                f" {shorten(folder)}"
             )
         seen[seed] = folder
 

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from baselines.catalogue import Track
 from baselines.options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Title
-from elastic_env.core.errors import ConfigurationError, choices_listed, shown
+from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, Pairings
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
@@ -115,12 +115,12 @@ class MapConfig(Model):
                 )
             for value in axis.values:
                 if axis.values.count(value) > 1:
-                    raise ConfigurationError(f"the value {shown(value)} of map.{name} stands twice")
+                    raise ConfigurationError(f"the value {quote(value)} of map.{name} stands twice")
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
                     raise ConfigurationError(
-                        f"values of map.{name} must be numbers, got {shown(value)}"
+                        f"values of map.{name} must be numbers, got {quote(value)}"
                     )
                 varied(GROUNDS["nominal"], {axis.what: value})
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from elastic_env.core.config import Locator, Model, load_yaml, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 
 ENDINGS = (".yaml", ".yml")
 """Of files of robots."""
@@ -58,7 +58,7 @@ def read_robot_file(name: str) -> dict[str, Any]:
         return load_yaml(name, RobotFile).arguments(Path(name).parent)
     except ConfigurationError as error:
         raise ConfigurationError(
-            f"--env {shown(name)[1:-1]} must be a file of a robot, with the keys model and joints:"
+            f"--env {quote(name)[1:-1]} must be a file of a robot, with the keys model and joints:"
             f" {error}"
         ) from None
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.errors import shown
+from elastic_env.core.errors import quote
 
 CONSTANTS = "CMA-ES"
 """Algorithm that searches constants instead of training a network."""
@@ -41,7 +41,7 @@ def _network(*parts: str) -> Any:
             raise ValueError(
                 f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <="
                 f" {_WIDEST}, or a mapping of such lists by {' and '.join(parts)}, got"
-                f" {shown(given)}"
+                f" {quote(given)}"
             )
         return given
 
@@ -65,7 +65,7 @@ def _entropy_weight(given: Any) -> Any:
     if not is_right:
         raise ValueError(
             f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn"
-            f" it, or such as auto_0.1 to begin with it, got {shown(given)}"
+            f" it, or such as auto_0.1 to begin with it, got {quote(given)}"
         )
     return given
 

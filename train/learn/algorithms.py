@@ -6,7 +6,7 @@ from typing import Any
 
 import stable_baselines3
 
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from train.learn.algorithm_options import CONSTANTS
 from train.runs.user_code import named_object
 
@@ -55,6 +55,6 @@ def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
         raise
     except _BAD_OPTIONS as error:
         raise ConfigurationError(
-            f"{algorithm} cannot be built with algorithm_options {shown(dict(options))}: "
+            f"{algorithm} cannot be built with algorithm_options {quote(dict(options))}: "
             f"{error or type(error).__name__}"
         ) from error

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from elastic_env.core.errors import ElasticError, shortened
+from elastic_env.core.errors import ElasticError, shorten
 from elastic_env.core.files import flush, read_bounded
 from elastic_env.core.json_text import LARGEST_JSON
 
@@ -81,7 +81,7 @@ def require_whole(checkpoint: Path) -> None:
 def damage_error(checkpoint: Path, why: object) -> ElasticError:
     """The error of a checkpoint that cannot be gone on with."""
     return ElasticError(
-        f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to"
+        f"the checkpoint {shorten(checkpoint)} is damaged or not whole ({why}); remove it to"
         " begin this seed anew"
     )
 

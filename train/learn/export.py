@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from baselines.residual.residual import save_residual
-from elastic_env.core.errors import ConfigurationError, shortened
+from elastic_env.core.errors import ConfigurationError, shorten
 from train.learn.algorithms import algorithm_class
 from train.learn.train_config import TrainConfig, joints_of, training_worlds
 from train.runs.folders import provenance
@@ -109,7 +109,7 @@ def export_zip(
         )
     for file in (path, normaliser):
         if file is not None and not file.is_file():
-            raise ConfigurationError(f"no model at {shortened(file)}")
+            raise ConfigurationError(f"no model at {shorten(file)}")
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
         statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())

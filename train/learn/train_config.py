@@ -10,7 +10,7 @@ from baselines.residual.residual import ResidualDescription, require_plain_base
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
     MOST_EPISODES,
@@ -94,8 +94,8 @@ class TrainConfig(Model):
         for name in self.weights:
             if name not in self.scenarios:
                 raise ValueError(
-                    f"weights must be of scenarios that are learned from, {shown(self.scenarios)},"
-                    f" got {shown(name)}"
+                    f"weights must be of scenarios that are learned from, {quote(self.scenarios)},"
+                    f" got {quote(name)}"
                 )
         return self
 
@@ -117,7 +117,7 @@ class TrainConfig(Model):
         if len(set(seeds)) < len(seeds):
             raise ValueError(
                 "every training seed has a folder of its own and can stand but once, got"
-                f" {shown(seeds)}"
+                f" {quote(seeds)}"
             )
         return seeds
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.residual.residual import ResidualDescription
-from elastic_env.core.errors import ElasticError, shortened
+from elastic_env.core.errors import ElasticError, shorten
 from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
 from train.learn.finite import DivergedError
 from train.learn.scores import Scores
@@ -96,7 +96,7 @@ class Trainer(ABC):
         """The sentence for a quantity that is no longer finite."""
         kept = (
             f"the checkpoint of decision {self._kept} is kept in"
-            f" {shortened(self.folder / CHECKPOINT)}"
+            f" {shorten(self.folder / CHECKPOINT)}"
         )
         if self._kept is None:
             kept = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"

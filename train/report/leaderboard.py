@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from baselines.catalogue import Track
-from elastic_env.core.errors import ConfigurationError, shortened
+from elastic_env.core.errors import ConfigurationError, shorten
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
@@ -287,11 +287,11 @@ def read_leaderboard(path: Path) -> list[Standing]:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != _HEAD:
             raise ConfigurationError(
-                f"{shortened(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}"
+                f"{shorten(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}"
             )
         found = [_standing(row) for row in reader]
     if not found:
-        raise ConfigurationError(f"{shortened(path)} has no rows")
+        raise ConfigurationError(f"{shorten(path)} has no rows")
     return found
 
 

@@ -50,7 +50,7 @@ def explain(error: BaseException) -> tuple[str, int] | None:
     """
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
-    from elastic_env.core.errors import ElasticError, missing_extra, shortened
+    from elastic_env.core.errors import ElasticError, missing_extra, shorten
 
     if is_interrupt(error):
         return "interrupted", 130
@@ -62,7 +62,7 @@ def explain(error: BaseException) -> tuple[str, int] | None:
         return "there is not enough memory; take fewer worlds or fewer --jobs", SYSTEM_FAILED
     for cause in _causes(error):
         if isinstance(cause, OSError) and cause.errno is not None:
-            place = f"{shortened(cause.filename)}: " if cause.filename else ""
+            place = f"{shorten(cause.filename)}: " if cause.filename else ""
             cure = _CURES.get(cause.errno)
             return f"{place}{cause.strerror}" + (f"; {cure}" if cure else ""), SYSTEM_FAILED
     return None

@@ -23,7 +23,7 @@ from elastic_env.core.errors import (
     ConfigurationError,
     ResultsExistError,
     SystemFailedError,
-    shortened,
+    shorten,
 )
 from elastic_env.core.files import leads_out, write_whole
 from elastic_env.core.yaml_text import yaml_of
@@ -141,10 +141,9 @@ def free_folder(name: str, output: Path | None = None) -> Path:
         return _next_free(require_name(name)) if output is None else _empty(output)
     except OSError as error:
         place = RUNS if output is None else output
-        what = f"{shortened(error.filename or place)}: {error.strerror or error}"
+        what = f"{shorten(error.filename or place)}: {error.strerror or error}"
         raise SystemFailedError(
-            f"no folder for results can be made at {shortened(place)} ({what}); name one by"
-            " --output"
+            f"no folder for results can be made at {shorten(place)} ({what}); name one by --output"
         ) from None
 
 
@@ -297,9 +296,7 @@ def _next_free(name: str) -> Path:
 
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
-        raise ResultsExistError(
-            f"{shortened(folder)} is a file; name a folder that is new or empty"
-        )
+        raise ResultsExistError(f"{shorten(folder)} is a file; name a folder that is new or empty")
     if folder.exists() and any(folder.iterdir()):
         raise ResultsExistError(
             f"{folder} already holds results"

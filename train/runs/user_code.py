@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from elastic_env.core.config import Model, load_yaml
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.runs.import_path import look_last_in
 
 _Config = TypeVar("_Config", bound=Model)
@@ -38,7 +38,7 @@ class _Untrusted:
     def error(self, name: str) -> ConfigurationError:
         """The error for a name of the file that stands for code."""
         return ConfigurationError(
-            f"{self.file} names {shown(name)}, whose code would run; look at it, then {self.cure}"
+            f"{self.file} names {quote(name)}, whose code would run; look at it, then {self.cure}"
         )
 
 
@@ -87,7 +87,7 @@ def named_object(name: str) -> Any:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
     except (Exception, SystemExit) as error:
         raise ConfigurationError(
-            f"{shortened(place)} cannot be imported: {type(error).__name__}: {error}"
+            f"{shorten(place)} cannot be imported: {type(error).__name__}: {error}"
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
@@ -97,8 +97,7 @@ def named_object(name: str) -> Any:
             if inspect.isfunction(f) and f.__module__ == module.__name__
         ]
         raise ConfigurationError(
-            f"{shortened(place)} has no {attribute!r}; its functions are:"
-            f" {', '.join(own) or 'none'}"
+            f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
         )
     return getattr(module, attribute)
 
@@ -130,7 +129,7 @@ def _from_file(path: Path) -> ModuleType:
     if known is not None and known.__file__ == str(resolved):
         return known
     if not resolved.is_file():
-        raise FileNotFoundError(f"there is no file {shortened(path)}")
+        raise FileNotFoundError(f"there is no file {shorten(path)}")
     spec = importlib.util.spec_from_file_location(name, resolved)
     assert spec is not None
     assert spec.loader is not None

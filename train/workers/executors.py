@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from train.workers.calls import Pool
 from train.workers.dask_cluster import dask_pool
 from train.workers.local import local_pool, num_processes, require_jobs
@@ -39,7 +39,7 @@ class Executors:
         if not (self.is_local or is_dask or self.on == _SLURM or self.on.startswith(f"{_SLURM}:")):
             raise ConfigurationError(
                 f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or"
-                f" {_SLURM}:FILE.yaml with what a job asks for, got {shown(self.on)}"
+                f" {_SLURM}:FILE.yaml with what a job asks for, got {quote(self.on)}"
             )
 
     @property

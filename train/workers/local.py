@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, cast
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 from train.runs.import_path import safe_children
 from train.workers.calls import Pool, UnguardedScriptError, WorkerLostError
 
@@ -31,7 +31,7 @@ def require_jobs(jobs: int) -> None:
     """
     if not 0 <= jobs <= _MOST_JOBS:
         bound = ">= 0" if jobs < 0 else f"<= {_MOST_JOBS}"
-        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {shown(jobs)}")
+        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {quote(jobs)}")
 
 
 def num_processes(jobs: int, calls: int) -> int:

@@ -9,7 +9,7 @@ there; length and checksum count what is sent.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, quote
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -71,7 +71,7 @@ def require_ids(ids: Sequence[int]) -> None:
     """
     if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
         raise ConfigurationError(
-            f"ids must be different numbers from 0 to {LARGEST_ID}, got {shown(list(ids))}"
+            f"ids must be different numbers from 0 to {LARGEST_ID}, got {quote(list(ids))}"
         )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
-from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.live import ID
 from elastic_env.hardware.live.task import HardwareTestbedTask
@@ -46,7 +46,7 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(
-            f"a scenario is of a simulation; on hardware it is what it is, got {shown(scenario)}"
+            f"a scenario is of a simulation; on hardware it is what it is, got {quote(scenario)}"
         )
     settings = {name: arguments.pop(name) for name in of_settings if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
@@ -73,7 +73,7 @@ def make_vector(
     """
     if num_envs != 1:
         raise ConfigurationError(
-            f"there is one testbed at a port: num_envs must be 1, got {shown(num_envs)}"
+            f"there is one testbed at a port: num_envs must be 1, got {quote(num_envs)}"
         )
     task = configure_hardware(**arguments)
     picture = partial(TestbedPicture, task.config.pendulum)

@@ -6,7 +6,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import shown
+from elastic_env.core.errors import quote
 from elastic_env.joint.frozen import frozen
 from elastic_env.joint.model_file import GivenModel, compiled_spec, read_model
 from elastic_env.rendering.simple_bodies import add_simple_bodies
@@ -32,7 +32,7 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     if read.lost:
         warnings.warn(
             f"{len(read.lost)} meshes of {read.name} are missing or in a format that MuJoCo cannot"
-            f" read, such as {shown(read.lost[0])[1:-1]}; rods between the joints are drawn in"
+            f" read, such as {quote(read.lost[0])[1:-1]}; rods between the joints are drawn in"
             " their place",
             stacklevel=4,
         )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.registration import Robot, require_models
@@ -64,7 +64,7 @@ def configure_walk(
     )
     if not isinstance(gait, dict | None):
         raise ConfigurationError(
-            f"gait must be a mapping of {', '.join(_GAIT)}, got {shown(gait)}; see also step_period"
+            f"gait must be a mapping of {', '.join(_GAIT)}, got {quote(gait)}; see also step_period"
         )
     require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT)
     chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
