@@ -97,6 +97,53 @@ def refusals(model: Any) -> list[str]:
     return said
 
 
+SLIDES = mjcf(first='name="j1" type="slide"').replace('name="j2"', 'name="j2" type="slide"')
+SLIDES_AND_A_HINGE = SLIDES.replace('name="j2" type="slide"', "")
+FLOATS = mjcf(first='type="free"').replace('axis="0 1 0"', "", 1)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (SLIDES, "the model has no hinge"),
+        (SLIDES_AND_A_HINGE, "a hinge of the model has no name"),
+        (FLOATS, "free or a ball joint.*Without compensation elastic_env.make_elastic takes it"),
+    ],
+)
+@pytest.mark.parametrize("joints", [{"*": 400.0}, {"nobody": 400.0}, "nowhere.yaml"])
+def test_what_no_joint_of_a_model_can_cure_is_said_first(
+    model: str, message: str, joints: Any
+) -> None:
+    """Catches two readers that name different faults, such as "unknown joint '*'" of a model
+    without hinges."""
+    with pytest.raises(ConfigurationError, match=message) as one:
+        gymnasium.make("elastic_env/Robot-v0", model=model, joints=joints)
+    with pytest.raises(ConfigurationError, match=message) as other:
+        PositionCompensator.from_model(model, joints)
+    assert str(one.value) == str(other.value)
+
+
+LOOPED = mjcf(HAND, LOOP)
+DRIVEN = mjcf(also=tied("j1", "j2") + '<actuator><motor name="m" tendon="cord"/></actuator>')
+BLOWN = mjcf(head='<option wind="9 0 0" density="1.2"/>')
+SPRUNG = mjcf(also=tied("j1", "j2", attributes='stiffness="3"'))
+BALL = FLOATS.replace("free", "ball")
+WEIGHTLESS = mjcf(head='<option><flag gravity="disable"/></option>')
+CURVED = mjcf(first='name="j1" stiffness="3 2"')
+
+
+@pytest.mark.parametrize("model", [FLOATS, BALL, LOOPED, DRIVEN, BLOWN, SPRUNG, WEIGHTLESS, CURVED])
+def test_make_elastic_takes_what_nobody_can_compensate(model: str) -> None:
+    """Catches a list of the docs that is not true: MuJoCo computes what is not known in
+    advance."""
+    for read in (robot, PositionCompensator.from_model):
+        with pytest.raises(ConfigurationError):
+            read(model, {"*": 400.0})
+    joint = ElasticJoint(stiffness=400.0, damping=2.0, rotor_inertia=0.05)
+    elastic = make_elastic(model, {"j2": joint}).compile()
+    assert elastic.joint("j2_motor").id >= 0
+
+
 def torque(model: Any, **options: Any) -> list[float]:
     return PositionCompensator.from_model(model, 400.0, **options).torque([0.5, 0.5]).tolist()
 

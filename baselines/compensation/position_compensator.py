@@ -44,6 +44,7 @@ from elastic_env.joint.known_torque import (
     hinges_of,
     home_of,
     require_known_torque,
+    require_robot,
 )
 from elastic_env.joint.load_path import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
@@ -130,6 +131,7 @@ class PositionCompensator:
         period_s: float = 0.01,
     ) -> None:
         self._model = model
+        require_robot(model)
         known = _known_joints(model, stiffness, joints)
         if joints is None:
             hinges = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
@@ -185,6 +187,7 @@ class PositionCompensator:
             UserWarning: See the class; or hinges are taken for rigid.
         """
         compiled = compiled_model(model)
+        require_robot(compiled)
         if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
             return cls(
                 compiled, _of_file(compiled, Path(stiffness), options.get("joints")), **options

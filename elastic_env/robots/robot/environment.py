@@ -20,7 +20,7 @@ from elastic_env.joint.known_torque import (
     has_nameless_hinge,
     hinges_of,
     nameless_hinge,
-    require_fixed_base,
+    require_robot,
     without_fingers,
 )
 from elastic_env.joint.model_file import GivenModel, compiled_spec
@@ -128,7 +128,7 @@ def joint_robot(
     """
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
-    require_fixed_base(whole)
+    require_robot(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
     moving = frozen(spec, settings)
@@ -152,8 +152,6 @@ def joint_robot(
 def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
     hinges = hinges_of(model)
-    if has_nameless_hinge(model) and not hinges:
-        raise nameless_hinge()
     given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
     others = [name for j in range(model.njnt) if (name := model.joint(j).name) not in hinges]
     settings = elastic_settings(given, hinges, others)
