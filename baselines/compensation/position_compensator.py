@@ -10,6 +10,7 @@ it. Damping and friction of the model are not in it. What a motor encoder shows 
 link angle by Eq. 10.
 """
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -387,11 +388,10 @@ class PositionCompensator:
             self._said.add("range")
             worst = int(over.argmax())
             ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
-            warnings.warn(
+            _warn(
                 f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond"
                 f" its range of {ends} in the model: its link stays {over[worst]:.2g} rad short;"
-                " keep q_desired that far from the end",
-                stacklevel=4,
+                " keep q_desired that far from the end"
             )
 
     def _warn_of_offset(self, joint: int, needed: float, when: str) -> None:
@@ -401,11 +401,10 @@ class PositionCompensator:
         self._said.add("limit_rad")
         digit = 10.0 ** (np.floor(np.log10(needed)) - 1.0)
         enough = np.ceil(1.05 * needed / digit) * digit
-        warnings.warn(
+        _warn(
             f"the load needs an offset of {needed:.3g} rad of joint {self.joints[joint]!r} {when},"
             f" and commands are cut at limit_rad = {self._limit:g}: the link ends short of where it"
-            f" should be; limit_rad={enough:.3g} is enough",
-            stacklevel=4,
+            f" should be; limit_rad={enough:.3g} is enough"
         )
 
     def _warn_of_jump(self, jump: Array) -> None:
@@ -423,10 +422,9 @@ class PositionCompensator:
             cure = (
                 "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
             )
-        warnings.warn(
+        _warn(
             f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
-            f" mrad at once; {cure}",
-            stacklevel=3,
+            f" mrad at once; {cure}"
         )
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
@@ -478,6 +476,16 @@ class PositionCompensator:
             self._links.set_load(self._carrier, self._load, self._place)
 
 
+def _warn(message: str) -> None:
+    """Warn at the line of the program that called this module."""
+    level = 2
+    frame = sys._getframe(1)
+    while frame is not None and frame.f_code.co_filename == __file__:
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, stacklevel=level)
+
+
 def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
     """A place in the frame of a site in that of its body, (3,) [m]."""
     turned = np.empty(3)
@@ -511,10 +519,9 @@ def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None)
     said = [name for name in left_out if commanded is None or name in commanded]
     if not said or len(left_out) == len(names):
         return mapping
-    warnings.warn(
+    _warn(
         f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}:"
-        f" {HELD} or its stiffness K [N·m/rad] there",
-        stacklevel=4,
+        f" {HELD} or its stiffness K [N·m/rad] there"
     )
     return mapping | dict.fromkeys(said, RIGID)
 
@@ -591,11 +598,10 @@ def _servo_gains(
             unsaid[joint] = gain
     if unsaid:
         listed = ", ".join(f"{name}: {gain:g}" for name, gain in unsaid.items())
-        warnings.warn(
+        _warn(
             "the model has position servos that give way under a load, which is not compensated;"
             f" give position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that"
-            " hold their angle",
-            stacklevel=4,
+            " hold their angle"
         )
     return gains
 
