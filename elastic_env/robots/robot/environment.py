@@ -34,6 +34,7 @@ from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, ho
 from elastic_env.robots.robot.model import RigidModel, read_robot
 from elastic_env.world.joint_config import RewardWeights
 from elastic_env.world.joint_task import JointTask, stiffest
+from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
@@ -114,10 +115,23 @@ def configure_robot(
             compiled_spec(robot.elastic(settings), "the model with elastic joints"),
             settings.scenario,
         )
-        settings = settings.replace(timestep_s=stable_timestep(played, settings.control_period_s))
+        timestep_s = stable_timestep(played, settings.control_period_s)
+        _require_step(timestep_s, settings.control_period_s)
+        settings = settings.replace(timestep_s=timestep_s)
     return RobotConfig(
         robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields}
     )
+
+
+def _require_step(timestep_s: float, control_period_s: float) -> None:
+    """Refuse joints that only a physics step follows which is too short to be played."""
+    shortest_s = control_period_s / MOST_SUBSTEPS
+    if timestep_s < shortest_s:
+        raise ConfigurationError(
+            "the joints are too stiff, or their links or rotors too light: they explode with a"
+            f" physics step of {shortest_s:g} s, the shortest that is played; give them less"
+            " stiffness, or more rotor_inertia"
+        )
 
 
 def joint_robot(
