@@ -97,6 +97,34 @@ def refusals(model: Any) -> list[str]:
     return said
 
 
+LOST_MESH = '<asset><mesh name="lost" file="nowhere.stl"/></asset>'
+VISUAL = '<geom type="mesh" mesh="lost" mass="0"/>'
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ('<actuator><motor name="m" joint="nobody"/></actuator>', "unknown transmission target"),
+        ('<equality><joint joint1="j2" joint2="j2"/></equality>', "'j2' is repeated in equality"),
+        ('<sensor><jointpos joint="nobody"/></sensor>', "unrecognized name 'nobody'"),
+        (tied("nobody"), "joint 'nobody' not found in tendon"),
+        ('<contact><exclude body1="a" body2="nobody"/></contact>', "'nobody' not found"),
+    ],
+)
+@pytest.mark.parametrize("lost", [True, False])
+def test_an_element_that_refers_to_nothing_is_refused(part: str, message: str, lost: bool) -> None:
+    """Catches a drive or a loop that MuJoCo leaves out of a copy without a word, beside a mesh
+    that is missing and in a specification."""
+    model: Any = mjcf(VISUAL if lost else "", part, head=LOST_MESH if lost else "")
+    if not lost:
+        model = mujoco.MjSpec.from_string(model)
+    first, second = refusals(model)
+    assert first == second
+    assert message in first
+    with pytest.raises(ConfigurationError, match=message):
+        make_elastic(model, {"j2": ElasticJoint(stiffness=400.0, damping=2.0, rotor_inertia=0.05)})
+
+
 SLIDES = mjcf(first='name="j1" type="slide"').replace('name="j2"', 'name="j2" type="slide"')
 SLIDES_AND_A_HINGE = SLIDES.replace('name="j2" type="slide"', "")
 FLOATS = mjcf(first='type="free"').replace('axis="0 1 0"', "", 1)
