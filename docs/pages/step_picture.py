@@ -21,15 +21,15 @@ _RIGHT = 408
 _TOP = 34
 _HEIGHT = 124
 _GAP = 56
-_HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}"
+_HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" \
 width="{width}" height="{height}"
 role="img" aria-label="{label}">
 <style>
   text {{ font: 14px sans-serif; fill: #737d88; }}
   .title {{ font-weight: bold; }} .right {{ text-anchor: end; }} .middle {{ text-anchor: middle; }}
   .curve {{ fill: none; stroke-width: 2.5; stroke-linejoin: round; }}
-  .grid {{ stroke: #737d88; stroke-opacity: 0.3; }}
-  .support {{ fill: #737d88; fill-opacity: 0.16; }}
+  .grid {{ stroke: #737d88; stroke-opacity: 0.3; }} \
+.support {{ fill: #737d88; fill-opacity: 0.16; }}
 </style>"""
 
 
