@@ -1,6 +1,4 @@
-"""What makes a robot an environment: its configuration, its task and its picture, registered
-with Gymnasium.
-"""
+"""Robots as environments: configuration, task and picture, registered with Gymnasium."""
 
 import inspect
 import os
@@ -13,6 +11,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
+from elastic_env.core.config import ModelT
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.rendering.picture import Picture
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
@@ -85,18 +84,18 @@ class Robot:
         return self.configure(**arguments)
 
 
-def require_models(**arguments: tuple[Any, type[Any]]) -> None:
-    """Refuse arguments that are neither a model, nor a mapping of its parameters, nor left out.
+def as_model(name: str, given: ModelT | dict[str, Any] | None, default: ModelT) -> ModelT:
+    """An argument that is a model, a mapping of what differs from the default, or left out.
 
     Raises:
-        ConfigurationError: One is none of these.
+        ConfigurationError: It is none of these.
     """
-    for name, (given, model) in arguments.items():
-        if not isinstance(given, dict | model | None):
-            raise ConfigurationError(
-                f"{name} must be a {model.__name__} or a mapping of its parameters, got"
-                f" {quote(given)}"
-            )
+    if not isinstance(given, dict | type(default) | None):
+        raise ConfigurationError(
+            f"{name} must be a {type(default).__name__} or a mapping of its parameters, got"
+            f" {quote(given)}"
+        )
+    return default.replace(**(given or {})) if isinstance(given, dict | None) else given
 
 
 def require_memory(name: str, worlds: int, world_bytes: int) -> None:

@@ -26,16 +26,12 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world import metrics
 from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.world.metrics",
     "elastic_env.world.control_kernels",
     "elastic_env.rigid.tree.kernels",
-    "elastic_env.rigid.leg_kernels",
-    "elastic_env.rigid.tree.end_effector",
     "baselines.compensation.compensators",
     "baselines.compensation.contact_torque",
     "baselines.walking.controller",
@@ -230,9 +226,9 @@ def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPa
     compiler."""
     used: list[Any] = []
     names = ("command", "begin_links", "sense_links", "show_joints")
-    for owner, name in (*((kernels, name) for name in names), (metrics, "_add_in_order")):
-        used.append(compiled(getattr(owner, name).py_func))
-        monkeypatch.setattr(owner, name, used[-1])
+    for name in names:
+        used.append(compiled(getattr(kernels, name).py_func))
+        monkeypatch.setattr(kernels, name, used[-1])
     env = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True)
     assert [len(function.signatures) for function in used] == [1] * len(used)
     env.reset(seed=0)

@@ -26,15 +26,19 @@ CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 class Inner(Model):
     """A nested model."""
 
-    length: float = quantity("m", 1.0, gt=0, le=2, description="a length")
+    length: float = quantity("m", 1.0, gt=0, le=2)
+    """A length [m]."""
 
 
 class Outer(Model):
     """A model with every kind of field."""
 
-    rate: float = quantity("Hz", gt=0, description="a rate")
-    count: int = quantity("1", 3, ge=1, description="a number")
-    offset: float = quantity("rad", 0.0, description="an unbounded angle")
+    rate: float = quantity("Hz", gt=0)
+    """A rate [Hz]."""
+    count: int = quantity("1", 3, ge=1)
+    """A number [1]."""
+    offset: float = quantity("rad", 0.0)
+    """An unbounded angle [rad]."""
     inner: Inner = Inner()
     name: str = "x"
 

@@ -15,7 +15,6 @@ from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import (
     JointAddresses,
-    link_name,
     motor_name,
     servo_name,
     spring_name,
@@ -53,18 +52,53 @@ def hinges(spec: mujoco.MjSpec) -> list[str]:
 # --------------------------------------------------------------------------------------------------
 
 
-def link_motion(joint: ElasticJoint, form: Form, duration_s: float) -> Array:
+def series_model(joint: ElasticJoint) -> mujoco.MjModel:
+    """The testbed with two hinges in series on the link: θ, and the deflection q − θ.
+
+    The link angle q is the length of a tendon, which has the friction.
+    """
+    spec = rigid_spec(PENDULUM)
+    spec.option.timestep = STEP_S
+    (link,) = spec.worldbody.bodies
+    hinge = spec.joint(JOINT)
+    hinge.name = "theta"
+    hinge.armature = joint.rotor_inertia
+    deflection = link.add_joint(name="deflection", axis=hinge.axis)
+    deflection.stiffness = [joint.stiffness, 0.0, 0.0]
+    deflection.damping = [joint.damping, 0.0, 0.0]
+    q = spec.add_tendon(
+        name="q",
+        damping=[joint.viscous_friction, 0.0, 0.0],
+        frictionloss=joint.coulomb_friction,
+        solref_friction=[0.001, 1.0],
+        solimp_friction=[0.9999, 0.9999, 0.001, 0.5, 2.0],
+    )
+    q.wrap_joint("theta", 1.0)
+    q.wrap_joint("deflection", 1.0)
+    servo = joint.servo
+    if servo is not None:
+        actuator = spec.add_actuator(target="theta", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_pid(
+            kp=servo.position_gain,
+            kv=servo.velocity_gain,
+            ki=servo.integral_gain,
+            imax=servo.integral_limit,
+            ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+        )
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = [-servo.torque_limit, servo.torque_limit]
+    return spec.compile()
+
+
+def link_motion(model: mujoco.MjModel, is_series: bool, duration_s: float) -> Array:
     """Link angle of the testbed, released with a deflection, under a moving servo reference."""
-    model = elastic_spec(PENDULUM, joint, form, STEP_S).compile()
     data = mujoco.MjData(model)
-    motor, hinge = (model.joint(name).qposadr[0] for name in (motor_name(JOINT), JOINT))
-    data.qpos[motor] = 0.3
-    data.qpos[hinge] = 0.28 if form == "tendon" else -0.02
+    data.qpos[:] = [0.3, -0.02] if is_series else [0.28, 0.3]
     q = []
     for k in range(round(duration_s / (8 * STEP_S))):
         data.ctrl[:] = 0.3 + 0.5 * np.sin(3.0 * k * 8 * STEP_S)
         mujoco.mj_step(model, data, 8)
-        q.append(data.qpos[hinge] if form == "tendon" else data.qpos[motor] + data.qpos[hinge])
+        q.append(data.qpos.sum() if is_series else data.joint(JOINT).qpos[0])
     return np.array(q)
 
 
@@ -81,21 +115,20 @@ def link_motion(joint: ElasticJoint, form: Form, duration_s: float) -> Array:
 def test_tendon_and_series_form_move_alike(joint: ElasticJoint, bound: float) -> None:
     """Catches a spring, damper, friction or servo that acts on the wrong side in one of the
     forms (5 s of motion)."""
-    tendon = link_motion(joint, "tendon", 5.0)
-    series = link_motion(joint, "series", 5.0)
+    tendon = link_motion(elastic_spec(PENDULUM, joint, "tendon", STEP_S).compile(), False, 5.0)
+    series = link_motion(series_model(joint), True, 5.0)
     assert np.ptp(tendon) > 0.9  # it did move
     assert np.abs(tendon - series).max() < bound
 
 
-@pytest.mark.parametrize("form", ["tendon", "series"])
-def test_free_motion_keeps_its_energy(form: Form) -> None:
+def test_free_motion_keeps_its_energy() -> None:
     """Catches hidden damping or friction, and a spring force that is not the gradient of ½ K δ²
     (10 s of swinging)."""
-    spec = elastic_spec(PENDULUM, CONSERVATIVE, form, STEP_S)
+    spec = elastic_spec(PENDULUM, CONSERVATIVE, "tendon", STEP_S)
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     model = spec.compile()
     data = mujoco.MjData(model)
-    data.qpos[:] = [1.0, 0.95] if form == "tendon" else [0.95, 0.05]
+    data.qpos[:] = [1.0, 0.95]
     energies = []
     for _ in range(6):
         mujoco.mj_forward(model, data)  # the energy of a step belongs to its beginning
@@ -107,18 +140,17 @@ def test_free_motion_keeps_its_energy(form: Form) -> None:
     assert energies[0] > 20.0
 
 
-@pytest.mark.parametrize("form", ["tendon", "series"])
 @pytest.mark.parametrize("stiffness", [300.0, 1001.0, 3000.0])
 @pytest.mark.parametrize(
     "rotor_inertia", [H54_200_S500_R.rotor_inertia, 1e9], ids=["free", "locked"]
 )
 def test_vibration_has_the_frequency_of_the_closed_form(
-    form: Form, stiffness: float, rotor_inertia: float
+    stiffness: float, rotor_inertia: float
 ) -> None:
     """Catches a wrong K, B or I: δ = δ₀ cos ωt, ω = √(K(1/B + 1/I)), and √(K/I) behind a rotor
     that cannot move."""
     joint = CONSERVATIVE.replace(stiffness=stiffness, rotor_inertia=rotor_inertia)
-    spec = elastic_spec(PENDULUM, joint, form, STEP_S, gravity=0.0)
+    spec = elastic_spec(PENDULUM, joint, "tendon", STEP_S, gravity=0.0)
     model = spec.compile()
     data = mujoco.MjData(model)
     motor, hinge = (model.joint(name).qposadr[0] for name in (motor_name(JOINT), JOINT))
@@ -130,9 +162,7 @@ def test_vibration_has_the_frequency_of_the_closed_form(
     deflection = np.empty(len(t))
     for k in range(len(t)):
         mujoco.mj_step(model, data, 10)
-        deflection[k] = (
-            data.qpos[motor] - data.qpos[hinge] if form == "tendon" else -data.qpos[hinge]
-        )
+        deflection[k] = data.qpos[motor] - data.qpos[hinge]
     np.testing.assert_allclose(deflection, 0.01 * np.cos(omega * t), rtol=0.0, atol=1e-7)
 
 
@@ -282,14 +312,11 @@ def load(source: str | Path) -> mujoco.MjSpec:
     )
 
 
-def correspondence(
-    rigid: mujoco.MjModel, elastic: mujoco.MjModel, form: Form
-) -> tuple[Array, Array]:
+def correspondence(rigid: mujoco.MjModel, elastic: mujoco.MjModel) -> tuple[Array, Array]:
     """T_q and T_v with which undeflected states of the elastic model are T_q qpos and T_v qvel of
     the rigid one.
 
-    Every old joint stands for itself, every rotor for the hinge that it drives; in the series form
-    the hinge is the deflection, and that is zero.
+    Every old joint stands for itself, every rotor for the hinge that it drives.
     """
     names = [rigid.joint(i).name for i in range(rigid.njnt)]
     driver = {motor_name(name): i for i, name in enumerate(names) if name}
@@ -299,8 +326,6 @@ def correspondence(
     T_v = np.zeros((elastic.nv, rigid.nv))
     for j, name in enumerate(new):
         i = driver[name] if name in driver else next(old)
-        if form == "series" and name not in driver and motor_name(name) in new:
-            continue
         for T, kind in ((T_q, "qpos"), (T_v, "dof")):
             rows, columns = (
                 _columns(model, index, kind) for model, index in ((elastic, j), (rigid, i))
@@ -325,11 +350,11 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 def random_states(
-    rigid: mujoco.MjModel, elastic: mujoco.MjModel, form: Form, count: int = 4
+    rigid: mujoco.MjModel, elastic: mujoco.MjModel, count: int = 4
 ) -> list[tuple[mujoco.MjData, mujoco.MjData, Array]]:
     """The same random undeflected states in both models, forwarded, and the map T_v of their
     velocities."""
-    T_q, T_v = correspondence(rigid, elastic, form)
+    T_q, T_v = correspondence(rigid, elastic)
     generator = np.random.default_rng(7)
     states = []
     for _ in range(count):
@@ -427,7 +452,7 @@ def test_undeflected_dynamics_are_those_of_the_rigid_model(
     added = np.zeros(rigid.nv)
     for name in chosen:
         added[rigid.joint(name).dofadr[0]] = FOREIGN.rotor_inertia - rigid.joint(name).armature[0]
-    for expected, data, T in random_states(rigid, elastic, form):
+    for expected, data, T in random_states(rigid, elastic):
         M = mass_matrix(rigid, expected) + np.diag(added)
         np.testing.assert_allclose(T.T @ mass_matrix(elastic, data) @ T, M, rtol=1e-10, atol=1e-9)
         for force in ("qfrc_bias", "qfrc_passive", "qfrc_actuator"):
@@ -435,43 +460,6 @@ def test_undeflected_dynamics_are_those_of_the_rigid_model(
             np.testing.assert_allclose(
                 projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force
             )
-
-
-@pytest.mark.parametrize(
-    ("source", "names"),
-    [
-        pytest.param(QUADRUPED, MODELS["quadruped"][1], id="quadruped"),
-        pytest.param(ARM, ["roll", "elbow", "left_finger"], id="arm"),
-        pytest.param(FOUR_BAR, MODELS["four_bar"][1], id="four_bar"),
-        pytest.param(ROVER, ["pan"], id="rover"),
-        pytest.param(
-            ASSETS[[path.stem for path in ASSETS].index("walker2d_v5")], None, id="walker2d_v5"
-        ),
-    ],
-)
-def test_undeflected_dynamics_of_the_series_form(
-    source: str | Path, names: list[str] | None
-) -> None:
-    """Catches springs, damping or actuators of a hinge that the series form loses when it splits
-    the hinge."""
-    spec = load(source)
-    chosen = names if names is not None else [name for name in hinges(spec) if name != "rooty"]
-    rigid, elastic, _ = elastic_from(source, chosen, form="series")
-    added = np.zeros(rigid.nv)
-    for name in chosen:
-        added[rigid.joint(name).dofadr[0]] = FOREIGN.rotor_inertia - rigid.joint(name).armature[0]
-    assert elastic.body_mass.sum() == pytest.approx(rigid.body_mass.sum(), rel=0.0, abs=1e-9)
-    for expected, data, T in random_states(rigid, elastic, "series"):
-        M = mass_matrix(rigid, expected) + np.diag(added)
-        np.testing.assert_allclose(T.T @ mass_matrix(elastic, data) @ T, M, rtol=1e-10, atol=1e-9)
-        for force in ("qfrc_bias", "qfrc_passive", "qfrc_actuator"):
-            projected = T.T @ getattr(data, force)
-            np.testing.assert_allclose(
-                projected, getattr(expected, force), rtol=1e-9, atol=1e-8, err_msg=force
-            )
-        for name in chosen:
-            q = expected.qpos[rigid.joint(name).qposadr[0]]
-            assert data.tendon(link_name(name)).length[0] == pytest.approx(q, abs=1e-12)
 
 
 @pytest.mark.parametrize(("source", "names"), foreign_cases())
@@ -483,7 +471,7 @@ def test_sensors_contacts_and_limits_are_those_of_the_rigid_model(
     of rotors."""
     rigid, elastic, chosen = elastic_from(source, names)
     by_acceleration = mujoco.mjtStage.mjSTAGE_ACC
-    for expected, data, _ in random_states(rigid, elastic, "tendon"):
+    for expected, data, _ in random_states(rigid, elastic):
         assert data.ncon == expected.ncon
         for sensor in range(rigid.nsensor):
             if rigid.sensor_needstage[sensor] != by_acceleration:
@@ -555,21 +543,20 @@ def test_the_elastic_specification_survives_saving(xml: str, names: list[str], f
 
 
 @pytest.mark.parametrize("rule", ["keep", "replace"])
-@pytest.mark.parametrize("form", ["tendon", "series", "rigid"])
+@pytest.mark.parametrize("form", ["tendon", "rigid"])
 @pytest.mark.parametrize("name", ["quadruped", "arm", "four_bar"])
 def test_keyframes_keep_the_links_and_start_without_deflection(
     name: str, form: Form, rule: str
 ) -> None:
     """Catches keyframe vectors that are shifted by the new joints, rotors left at zero, and lost
     controls."""
-    xml, names = MODELS[name]
-    chosen = [n for n in names if form != "series" or n not in ("yaw", "pitch")]
+    xml, chosen = MODELS[name]
     spec = mujoco.MjSpec.from_string(xml)
     rigid = spec.compile()
     joint = FOREIGN.replace(servo=HOLDING)
     model = make_elastic(spec, dict.fromkeys(chosen, joint), form, rule).compile()
     assert model.nkey == rigid.nkey
-    T_q, T_v = correspondence(rigid, model, form)
+    T_q, T_v = correspondence(rigid, model)
     old = [a for a in range(rigid.nactuator) if _survives(rigid, a, chosen, rule)]
     for k in range(rigid.nkey):
         assert model.key(k).name == rigid.key(k).name
@@ -644,8 +631,7 @@ GIVEN = {
     ],
     ids=["gains", "ctrlrange", "inheritrange", "activation"],
 )
-@pytest.mark.parametrize("form", ["tendon", "series"])
-def test_defaults_of_the_model_do_not_leak(form: Form, actuator: str, integral_gain: float) -> None:
+def test_defaults_of_the_model_do_not_leak(actuator: str, integral_gain: float) -> None:
     """Catches any attribute of rotor, spring or servo that is left to the model's default class,
     down to plasticity.
 
@@ -659,12 +645,10 @@ def test_defaults_of_the_model_do_not_leak(form: Form, actuator: str, integral_g
         torque_limit=30.0,
         speed_limit=3.0,
     )
-    joint = FOREIGN.replace(
-        servo=servo, backlash=0.01 if form == "tendon" else 0.0, viscous_friction=0.1
-    )
+    joint = FOREIGN.replace(servo=servo, backlash=0.01, viscous_friction=0.1)
     nasty, plain = (
         make_elastic(
-            mujoco.MjSpec.from_string(xml.format(actuator=actuator, **GIVEN)), {"h": joint}, form
+            mujoco.MjSpec.from_string(xml.format(actuator=actuator, **GIVEN)), {"h": joint}
         ).compile()
         for xml in (NASTY, PLAIN)
     )
@@ -673,17 +657,16 @@ def test_defaults_of_the_model_do_not_leak(form: Form, actuator: str, integral_g
         data.ctrl[:] = 0.7
         mujoco.mj_step(model, data, 300)
     assert worlds[1].qpos.max() > 0.3
-    suspects = "\n".join(_suspects(nasty, plain, form))
+    suspects = "\n".join(_suspects(nasty, plain))
     np.testing.assert_array_equal(worlds[0].qpos, worlds[1].qpos, err_msg=suspects)
 
 
-def _suspects(nasty: mujoco.MjModel, plain: mujoco.MjModel, form: Form) -> list[str]:
+def _suspects(nasty: mujoco.MjModel, plain: mujoco.MjModel) -> list[str]:
     """Fields of the elements we made that differ between two models, appearance and addresses
     aside."""
-    tendon = spring_name("h") if form == "tendon" else link_name("h")
     elements = [
         ("jnt", "joint", motor_name("h")),
-        ("tendon", "tendon", tendon),
+        ("tendon", "tendon", spring_name("h")),
         ("actuator", "actuator", "h_servo"),
     ]
     irrelevant = ("adr", "id", "group", "rgba", "width", "user", "num", "signature")
@@ -906,7 +889,7 @@ def test_an_unknown_form_or_rule_lists_the_choices() -> None:
     """Catches a form that falls through to another one."""
     spec = mujoco.MjSpec.from_string(ROVER)
     with pytest.raises(
-        ConfigurationError, match="unknown form 'tendons'; choose one of: tendon, series, rigid"
+        ConfigurationError, match="unknown form 'tendons'; choose one of: tendon, rigid"
     ):
         make_elastic(spec, {"left": FOREIGN}, "tendons")
     with pytest.raises(
@@ -915,23 +898,9 @@ def test_an_unknown_form_or_rule_lists_the_choices() -> None:
         make_elastic(spec, {"left": FOREIGN}, actuators="drop")
 
 
-def test_the_series_form_refuses_what_it_cannot_represent() -> None:
-    """Catches backlash that is silently dropped, and a hinge in the middle of a body's joints."""
-    spec = mujoco.MjSpec.from_string(ARM)
-    with pytest.raises(
-        ConfigurationError, match=r"backlash of 'elbow' is 0\.01 rad; use the tendon form"
-    ):
-        make_elastic(spec, {"elbow": FOREIGN.replace(backlash=0.01)}, "series")
-    with pytest.raises(
-        ConfigurationError, match=r"'yaw' to be the last joint of its body 'upper_arm'.*'roll'"
-    ):
-        make_elastic(spec, {"yaw": FOREIGN}, "series")
-
-
-@pytest.mark.parametrize("form", ["tendon", "series"])
-def test_an_elastic_hinge_is_not_made_elastic_again(form: Form) -> None:
+def test_an_elastic_hinge_is_not_made_elastic_again() -> None:
     """Catches a second spring in series with the first."""
-    once = make_elastic(mujoco.MjSpec.from_string(QUADRUPED), {"front_hip": FOREIGN}, form)
+    once = make_elastic(mujoco.MjSpec.from_string(QUADRUPED), {"front_hip": FOREIGN})
     with pytest.raises(
         ConfigurationError, match=r"'front_hip_\w+' already exists .* elastic already"
     ):

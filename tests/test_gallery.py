@@ -22,11 +22,11 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.known_torque import hinges_of
-from elastic_env.joint.make_elastic import make_elastic, transformed
+from elastic_env.joint.make_elastic import make_elastic, transform_hinges
 from elastic_env.joint.model_file import keep_shapes, urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots import gallery
 from elastic_env.robots.gallery import (
     GALLERY,
@@ -142,7 +142,7 @@ def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
             )
             for hinge, joint in joints.items()
         }
-        spec = transformed(gallery_robot(name, FOLDER), scaled, form)  # type: ignore[arg-type]
+        spec = transform_hinges(gallery_robot(name, FOLDER), scaled, form)  # type: ignore[arg-type]
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
         model = spec.compile()
@@ -173,7 +173,7 @@ def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
     hinges = hinges_of(model)
     data = mujoco.MjData(model)
     poses = gallery.random_poses(model, np.random.default_rng(3), 10)
-    ours = TreeTorque(model, hinges).gravity_torque(poses)
+    ours = RigidBody(model, hinges).gravity_torque(poses)
     size = np.abs(ours).max()
     for pose, torque in zip(poses, ours, strict=True):
         data.qpos[:] = pose

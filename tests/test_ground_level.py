@@ -61,7 +61,7 @@ def test_tilted_ground_shows_what_level_ground_would(tilt: tuple[float, float]) 
     level = generator.normal(0.0, 5.0, size=(1, 4, 3))
     level[:, [0, 2]] = [[0.0, 0.0, 300.0], [0.0, 0.0, 230.0]]
     theta = generator.normal(0.0, 0.2, size=(1, 12))
-    com, ankles = model.biped.chains_above_feet.com_and_feet(theta.reshape(1, 2, 6))
+    com, ankles = model.biped.chains_above_feet.com_and_feet(theta)
     tilted = level.copy()
     for foot, ankle in enumerate(ankles[0]):
         upright = level[0, 2 * foot]
@@ -166,8 +166,8 @@ def test_acceleration_and_certainty_have_their_closed_forms() -> None:
     rates = np.zeros((2, 6))
     rates[:, 1] = 0.3  # both hips roll: the body goes sideways
     rates[:, 2] = 0.2  # and pitch
-    ahead, behind = (chains.com_and_feet(step * rates) for step in (1e-4, -1e-4))
-    velocity = ((ahead[0] - ahead[1][0]) - (behind[0] - behind[1][0]))[:2] / 2e-4
+    ahead, behind = (chains.com_and_feet(step * rates.reshape(1, 12)) for step in (1e-4, -1e-4))
+    velocity = ((ahead[0] - ahead[1][:, 0]) - (behind[0] - behind[1][:, 0]))[0, :2] / 2e-4
     rows = np.zeros((2, len(table)))
     rows[1, table.group("encoder_rate")] = rates.ravel()
     direction = velocity / (9.81 * PERIOD_S)

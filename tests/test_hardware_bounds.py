@@ -14,6 +14,7 @@ from rich.console import Console
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware import imu
+from elastic_env.hardware.buses.bus import Condition
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
@@ -94,9 +95,9 @@ def test_a_request_with_what_is_no_number_switches_torque_off(what: str, value: 
 @no_number
 def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
     """Catches a servo at an unknown speed that counts as at rest."""
-    bus: Any = SimpleNamespace(name="one", read_velocity=lambda _: value)
+    condition = Condition(velocity=value, temperature=30.0, temperature_limit=80.0, error="")
     with pytest.raises(FaultError, match="torque goes on at rest"):
-        supervisor.require_rest(bus, 1)
+        supervisor.require_ready("servo 1 at one", condition, 80.0)
 
 
 @no_number

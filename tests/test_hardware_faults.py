@@ -25,6 +25,7 @@ from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
+from tests.emulators import wait_until_rest
 from tests.test_hardware_safety import PATIENT, states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import make_hardware
@@ -109,7 +110,7 @@ def running() -> Iterator[RunningEmulator]:
 def emulator(running: RunningEmulator) -> RunningEmulator:
     """The one emulator, at rest and without faults."""
     running.faults(**Faults().model_dump())
-    running.wait_until_rest()
+    wait_until_rest(running)
     return running
 
 

@@ -38,7 +38,7 @@ EXAMPLES = [
         (254, packets.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])),
         "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA",
     ),
-    ((1, packets.REBOOT, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
+    ((1, 0x08, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
 ]
 
 

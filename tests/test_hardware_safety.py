@@ -32,6 +32,7 @@ from elastic_env.hardware.safety.guard import Guard
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
+from tests.emulators import wait_until_rest
 
 PERIOD_S = 0.004
 PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
@@ -161,7 +162,7 @@ def running() -> Iterator[RunningEmulator]:
 def emulator(running: RunningEmulator) -> RunningEmulator:
     """The one emulator, at rest and without the faults that a test before may have left."""
     running.faults(overload=False, silent=False, unheard=0, late=0, latency_s=0)
-    running.wait_until_rest()
+    wait_until_rest(running)
     return running
 
 
@@ -220,8 +221,8 @@ def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
         RunningEmulator(EmulatorConfig(model_number=2020)) as newer,
         DynamixelBus(newer.port) as bus,
     ):
-        found = {one.what: one.cure for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
-    assert set(found.values()) == {""}
+        found = {one.what: one.is_good for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
+    assert set(found.values()) == {True}
 
 
 @pytest.mark.parametrize("fault", ["lost", "corrupted"])

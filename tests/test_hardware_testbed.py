@@ -32,6 +32,7 @@ from elastic_env.hardware.safety.supervised_bus import Cycle
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from tests.busy import once_more
+from tests.emulators import wait_until_rest
 from tests.hardware_trials import trials as hardware_trials
 from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
@@ -55,7 +56,7 @@ def running() -> Iterator[RunningEmulator]:
 def emulator(running: RunningEmulator) -> RunningEmulator:
     """The one emulator, at rest and without the faults that a test before may have left."""
     running.faults(imu_silent=False, imu_corrupted=0)
-    running.wait_until_rest()
+    wait_until_rest(running)
     return running
 
 
@@ -165,7 +166,7 @@ def test_a_testbed_that_is_forgotten_lets_go(emulator: RunningEmulator) -> None:
     gc.collect()
     assert emulator.state()["torque_on"] == [False]
     AttitudeStream(emulator.imu_port, oldest_s=0.5).close()
-    emulator.wait_until_rest()
+    wait_until_rest(emulator)
     again = make_hardware(emulator)
     again.reset()
     again.close()
@@ -239,7 +240,7 @@ def test_a_sample_whose_writer_died_within_is_none() -> None:
     writer._memory[0] = 1  # odd: a write has begun
     _within_seconds(lambda: seen.append(reader.get()))
     writer._memory[0] = 0
-    writer.put(sample)
+    writer.write(sample)
     seen.append(reader.get())
     writer._memory[0] = 3
     _within_seconds(lambda: seen.append(reader.get()))

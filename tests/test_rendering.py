@@ -13,10 +13,16 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signals
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
+from elastic_env.robots.deviations import ENLARGEMENT, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
-from elastic_env.robots.testbed.picture import EXAGGERATION, TestbedPicture, exaggerated
+from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.robots.thormang.config import WalkConfig
-from elastic_env.robots.thormang.picture import LARGEST_FACTOR, Posture, WalkerPicture, enlarged
+from elastic_env.robots.thormang.picture import (
+    LARGEST_FACTOR,
+    Posture,
+    WalkerPicture,
+    enlarge_posture,
+)
 from elastic_env.robots.thormang.task import WalkTask
 
 ID = "elastic_env/Testbed-v0"
@@ -74,14 +80,14 @@ def test_deviations_from_the_reference_are_enlarged(
     angle: float, reference: float, factor: float, drawn: float
 ) -> None:
     """Catches an angle that is enlarged as a whole, and a deviation drawn to the wrong side."""
-    assert exaggerated(angle, reference, factor) == pytest.approx(drawn, abs=1e-15)
+    assert enlarge_deviation(angle, reference, factor) == pytest.approx(drawn, abs=1e-15)
 
 
 def test_default_factor_is_the_one_that_the_caption_shows(picture: TestbedPicture) -> None:
     """Catches a caption that names another factor than the picture has."""
-    assert exaggerated(1.01, 1.0) == pytest.approx(1.0 + 0.01 * EXAGGERATION)
+    assert enlarge_deviation(1.01, 1.0) == pytest.approx(1.0 + 0.01 * ENLARGEMENT)
     picture.rgb(signals(reference=0.2, link_error=0.01))
-    assert picture._data.joint("link").qpos[0] == pytest.approx(0.2 - 0.01 * EXAGGERATION)
+    assert picture._data.joint("link").qpos[0] == pytest.approx(0.2 - 0.01 * ENLARGEMENT)
 
 
 def test_environment_returns_rgb_pictures_that_change_with_the_motion() -> None:
@@ -233,7 +239,7 @@ class Walker:
     def __init__(self, walk: WalkTask) -> None:
         self.walk = walk
         self.robot = walk.truth().model.biped
-        self.planned = Posture.planned(walk.plan, ROW)
+        self.planned = Posture.of_plan(walk.plan, ROW)
         self.fell = False
         task: Any = SimpleNamespace(
             config=walk.config,
@@ -330,7 +336,7 @@ def test_tilt_and_shift_of_the_pelvis_are_enlarged_and_the_feet_stay(walker: Wal
     leave the floor."""
     true = walker.posture(roll=0.02, shift=0.01)
     planned = walker.planned
-    drawn, factor = enlarged(true, planned, 0.0, walker.robot, largest=4.0)
+    drawn, factor = enlarge_posture(true, planned, 0.0, walker.robot, largest=4.0)
     assert factor == 4.0
     np.testing.assert_allclose(drawn.R, rotation_x(np.array(0.08)), atol=1e-12)
     np.testing.assert_allclose(
@@ -343,7 +349,7 @@ def test_robot_that_stands_elsewhere_is_not_tilted(walker: Walker) -> None:
     """Catches a pelvis that is pulled away from feet that slipped as far as it did."""
     true = walker.posture(shift=0.03, feet=0.03)
     for share in (0.0, 0.4, 1.0):
-        drawn, _ = enlarged(true, walker.planned, share, walker.robot)
+        drawn, _ = enlarge_posture(true, walker.planned, share, walker.robot)
         np.testing.assert_allclose(drawn.pelvis, true.pelvis, atol=1e-12)
 
 
@@ -352,7 +358,7 @@ def test_factor_is_as_large_as_the_legs_allow(walker: Walker) -> None:
     truth."""
     tilts = np.linspace(0.0, 0.4, 9)
     postures = [walker.posture(roll=-tilt, shift=0.6 * tilt) for tilt in tilts]
-    factors = [enlarged(true, walker.planned, 0.0, walker.robot)[1] for true in postures]
+    factors = [enlarge_posture(true, walker.planned, 0.0, walker.robot)[1] for true in postures]
     assert factors[0] == LARGEST_FACTOR
     assert all(before >= after >= 1.0 for before, after in pairwise(factors))
     assert factors[-1] < 2.0
@@ -468,7 +474,7 @@ def test_caption_of_the_walker_says_what_is_drawn(walker: Walker) -> None:
     true = walker.stand(fell=True, roll=-0.1, shift=0.05)
     first, _, third = walker.caption()
     assert "fell" in first
-    factor = enlarged(true, walker.planned, walker.walk.plan.share[ROW], walker.robot)[1]
+    factor = enlarge_posture(true, walker.planned, walker.walk.plan.share[ROW], walker.robot)[1]
     assert 1.0 < factor < LARGEST_FACTOR
     assert f"x {factor:.2g} " in third
 

@@ -15,7 +15,7 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environment
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.frozen import frozen
+from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from tests.played import metrics_of
 from tests.trees import TREE
@@ -53,7 +53,7 @@ def test_held_joints_are_where_the_keyframe_has_them() -> None:
     )
     moving = ["pitch", "hip", "twist"]
     model = whole.compile()
-    part = frozen(whole, moving).compile()
+    part = hold_other_joints(whole, moving).compile()
     data = mujoco.MjData(model)
     of_part = mujoco.MjData(part)
     generator = np.random.default_rng(1)

@@ -1,6 +1,7 @@
 """Robots drawn from ranges: the draws themselves, what of them reaches plant and sensors, and
 who may know of it."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotDraw, RobotRanges, draw_robots, latin_hypercube
+from elastic_env.core.robot_ranges import DrawnRobot, RobotRanges, draw_robots, latin_hypercube
+from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import static_deflection
 from elastic_env.robots.thormang import config as walk_config
 from elastic_env.robots.thormang.config import floor_tilt, robot_bank
@@ -53,9 +55,14 @@ def with_ranges(*ranges: RobotRanges, ground: str = "nominal") -> Scenario:
     return make_scenario(ground).replace(ranges=ranges, name="own")
 
 
-def robot_of(env: Any, world: int = 0) -> RobotDraw:
+def robot_of(env: Any, world: int = 0) -> DrawnRobot:
     """The robot that a world has drawn."""
-    return env.unwrapped.task._robot(world)
+    return env.unwrapped.task._robots[world]
+
+
+def place_of(robot: DrawnRobot) -> Array:
+    """Place of a robot's load from the center of mass of the torso, (3,) [m]."""
+    return np.array([robot.load_x_m, robot.load_y_m, robot.load_z_m])
 
 
 def plant_of(env: Any, world: int) -> mujoco.MjModel:
@@ -63,18 +70,21 @@ def plant_of(env: Any, world: int) -> mujoco.MjModel:
     return env.unwrapped.simulation.model_of(world)
 
 
-def is_within(ranges: RobotRanges, robot: RobotDraw) -> bool:
+def is_within(ranges: RobotRanges, robot: DrawnRobot) -> bool:
     """Whether a robot lies in ranges; factors on K are taken together."""
     lowest, highest = np.multiply(ranges.stiffness, ranges.joint_stiffness)
     found: list[tuple[tuple[float, float], Any]] = [
-        ((lowest, highest), robot.stiffness_factor),
-        (ranges.damping, robot.damping_factor),
-        (ranges.friction, robot.friction_factor),
+        ((lowest, highest), robot.stiffness),
+        (ranges.damping, robot.damping),
+        (ranges.friction, robot.friction),
         (ranges.backlash_rad, robot.backlash_rad),
         (ranges.load_kg, robot.load_kg),
-        *zip((ranges.load_x_m, ranges.load_y_m, ranges.load_z_m), robot.load_place_m, strict=True),
-        (ranges.homing_rad, robot.encoder_bias_rad),
-        (ranges.mounting_rad, robot.imu_bias_rad),
+        *(
+            (getattr(ranges, name), getattr(robot, name))
+            for name in ("load_x_m", "load_y_m", "load_z_m")
+        ),
+        (ranges.homing_rad, robot.homing_rad),
+        (ranges.mounting_rad, robot.mounting_rad),
         (ranges.slope_rad, robot.slope_rad),
     ]
     is_unpushed = robot.push_n == 0.0 and (ranges.push_share < 1.0 or ranges.push_n[0] == 0.0)
@@ -110,7 +120,7 @@ def test_robots_lie_in_their_ranges(ranges: RobotRanges, number: int, seed: int)
     assert len(robots) == number
     for robot in robots:
         assert is_within(ranges, robot)
-        assert {len(robot.stiffness_factor), len(robot.encoder_bias_rad)} == {3}
+        assert {len(robot.stiffness), len(robot.homing_rad)} == {3}
         assert 0.0 <= robot.slope_direction_rad <= 2.0 * math.pi
 
 
@@ -133,12 +143,14 @@ def test_the_bank_of_drawn_fills_its_ranges_evenly_and_its_quantities_are_indepe
     columns = np.array(
         [
             [
-                *r.stiffness_factor,
-                *r.encoder_bias_rad,
-                *r.imu_bias_rad,
-                *r.load_place_m,
-                r.damping_factor,
-                r.friction_factor,
+                *r.stiffness,
+                *r.homing_rad,
+                *r.mounting_rad,
+                r.load_x_m,
+                r.load_y_m,
+                r.load_z_m,
+                r.damping,
+                r.friction,
                 r.backlash_rad,
                 r.load_kg,
                 r.slope_rad,
@@ -177,7 +189,7 @@ def test_banks_are_the_same_everywhere_and_have_robots_of_their_own() -> None:
         bank = robot_bank(scenario)
         assert robot_bank(scenario) == bank
         assert not set(robot_bank(scenario, 1)) & set(bank)
-    assert robot_bank(make_scenario("drawn"))[0].damping_factor == pytest.approx(
+    assert robot_bank(make_scenario("drawn"))[0].damping == pytest.approx(
         DAMPING_OF_THE_FIRST, rel=1e-12
     )
 
@@ -205,7 +217,7 @@ def test_a_range_that_changes_leaves_the_other_draws_as_they_are() -> None:
     other robots."""
     one = draw_robots([TRAINING_RANGES], 16, 12, [3])
     other = draw_robots([TRAINING_RANGES.replace(load_kg=(0.0, 0.0))], 16, 12, [3])
-    assert [robot.replace(load_kg=0.0) for robot in one] == other
+    assert [dataclasses.replace(robot, load_kg=0.0) for robot in one] == other
     assert max(robot.load_kg for robot in one) > 7.0
 
 
@@ -269,16 +281,14 @@ def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(world
     joints = {
         name: joint.replace(
             stiffness=joint.stiffness * factor,
-            damping=joint.damping * robot.damping_factor,
-            coulomb_friction=joint.coulomb_friction * robot.friction_factor,
+            damping=joint.damping * robot.damping,
+            coulomb_friction=joint.coulomb_friction * robot.friction,
             backlash=robot.backlash_rad,
         )
-        for (name, joint), factor in zip(
-            config.true_joints.items(), robot.stiffness_factor, strict=True
-        )
+        for (name, joint), factor in zip(config.true_joints.items(), robot.stiffness, strict=True)
     }
     spec = elastic_spec(config.robot, joints, "tendon", config.timestep_s)
-    add_load(spec, DRAWN_LOAD, robot.load_kg, np.array(robot.load_place_m))
+    add_load(spec, DRAWN_LOAD, robot.load_kg, place_of(robot))
     spec.body("floor").quat = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
     compiled = spec.compile()
     generator = np.random.default_rng(0)
@@ -314,7 +324,7 @@ def test_springs_sag_by_torque_over_stiffness() -> None:
     torque = np.array(env.unwrapped.simulation.bind("actuator_force"))
     for world in range(3):
         robot = robot_of(env, world)
-        K = 1001.0 * np.array(robot.stiffness_factor)
+        K = 1001.0 * np.array(robot.stiffness)
         np.testing.assert_allclose(truth.stiffness[world], K, rtol=1e-12)
         loaded = np.abs(torque[world]) > 1.0
         sag = static_deflection(torque[world], K, robot.backlash_rad)
@@ -345,7 +355,7 @@ def test_the_load_moves_the_center_of_mass_by_its_share_of_the_weight() -> None:
     )  # of the principal axes
     frame = np.array(simulation.bind("xmat")[0, body["upper_body"]]).reshape(3, 3)
     assert np.linalg.det(R) == pytest.approx(1.0)
-    load = centers[body["upper_body"]] + frame @ np.array(robot.load_place_m)
+    load = centers[body["upper_body"]] + frame @ place_of(robot)
     without = masses.copy()
     without[body["drawn_load"]] = 0.0
     bare = without @ centers / without.sum()
@@ -385,7 +395,7 @@ def test_a_drawn_robot_that_cannot_stand_is_an_error_with_its_values() -> None:
     )
     with pytest.raises(
         ConfigurationError,
-        match=r"load_kg=90\.0 .*load_place_m=\(0\.9, .* does not stand.*narrow the ran",
+        match=r"load_kg=90\.0, load_x_m=0\.9.* does not stand.*narrow the ran",
     ):
         env.reset(seed=0)
 
@@ -419,7 +429,7 @@ def test_signals_know_the_drawn_joints() -> None:
     delta = truth.theta - truth.q
     rate = truth.theta_dot - truth.q_dot
     spring = np.sign(delta) * np.maximum(np.abs(delta) - robot.backlash_rad / 2.0, 0.0)
-    torque = 1001.0 * np.array(robot.stiffness_factor) * spring + 10.0 * robot.damping_factor * rate
+    torque = 1001.0 * np.array(robot.stiffness) * spring + 10.0 * robot.damping * rate
     assert info["joint_torque"] == pytest.approx(np.abs(torque).max(), rel=1e-12)
     assert robot.backlash_rad > 0.0
 
@@ -456,10 +466,10 @@ def test_encoders_and_imu_are_off_by_what_was_drawn() -> None:
     robots = [robot_of(env, world) for world in range(3)]
     encoder = observation[:, :12] - env.unwrapped.truth().theta
     np.testing.assert_allclose(
-        encoder, [robot.encoder_bias_rad for robot in robots], rtol=0.0, atol=1e-12
+        encoder, [robot.homing_rad for robot in robots], rtol=0.0, atol=1e-12
     )
     imu = observation[:, 24:26] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
-    np.testing.assert_allclose(imu, [robot.imu_bias_rad for robot in robots], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(imu, [robot.mounting_rad for robot in robots], rtol=0.0, atol=1e-12)
 
 
 def test_measurements_are_old_in_the_worlds_of_delayed_robots_alone() -> None:
@@ -628,15 +638,15 @@ def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
             == 0.0
         )
         model = env.simulation.model_of(world)
-        stiffness = known.stiffness * robot.stiffness_factor
+        stiffness = known.stiffness * robot.stiffness
         np.testing.assert_allclose(model.tendon_stiffness[springs], stiffness, rtol=1e-12)
         np.testing.assert_allclose(env.truth().stiffness[world], stiffness, rtol=1e-12)
         np.testing.assert_allclose(
-            model.tendon_damping[springs], known.damping * robot.damping_factor, rtol=1e-12
+            model.tendon_damping[springs], known.damping * robot.damping, rtol=1e-12
         )
         dead_band = np.diff(model.tendon_lengthspring[springs], axis=1)[:, 0]
         np.testing.assert_allclose(dead_band, known.backlash + robot.backlash_rad, atol=1e-12)
-        friction = known.coulomb_friction[0] * robot.friction_factor
+        friction = known.coulomb_friction[0] * robot.friction
         assert model.dof_frictionloss[link] == pytest.approx(friction, rel=1e-12)
 
 
@@ -656,7 +666,7 @@ def test_drawn_robots_on_a_fixed_base_begin_at_rest() -> None:
         observation, info = env.reset(seed=1)
         robots = [robot_of(env, world) for world in range(4)]
         truth: Any = env.unwrapped.truth()  # type: ignore[attr-defined]
-        bias = [robot.encoder_bias_rad[0] for robot in robots]
+        bias = [robot.homing_rad[0] for robot in robots]
         np.testing.assert_allclose(observation[:, 0] - truth.theta[:, 0], bias, atol=1e-12)
         for _ in range(25):
             *_, later = env.step(np.zeros((4, 1), np.float32))

@@ -25,7 +25,7 @@ def balanced(robot: Biped, height: float = 0.66) -> Array:
     pelvis = np.array([0.0, 0.0, height])
     ankles = np.pad(robot.footholds, ((0, 0), (0, 1)), constant_values=robot.ankle_height)
     for _ in range(50):
-        com = robot.chains.center_of_mass(robot.joint_angles(pelvis, ankles).reshape(2, 6))
+        com = robot.chains.center_of_mass(robot.joint_angles(pelvis, ankles)[None])[0]
         pelvis[:2] -= (pelvis + com)[:2]
     return pelvis
 

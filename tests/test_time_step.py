@@ -13,7 +13,7 @@ import pytest
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.make_elastic import make_elastic, transformed
+from elastic_env.joint.make_elastic import make_elastic, transform_hinges
 from elastic_env.joint.time_step import largest_stable_timestep
 
 SPRING = """<mujoco><option timestep="0.01" integrator="{integrator}" gravity="0 0 0"/><worldbody><body>
@@ -121,7 +121,7 @@ def test_the_integrator_is_changed_where_the_springs_need_it(
     closed form."""
     spec = arm(integrator, 3e-3)
     joints = {"shoulder": JOINT.replace(servo=SERVO)}
-    assert is_well(moved(transformed(spec, joints).compile(), 2.0)) == (not becomes)
+    assert is_well(moved(transform_hinges(spec, joints).compile(), 2.0)) == (not becomes)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         model = make_elastic(spec, joints).compile()
@@ -149,7 +149,7 @@ def test_what_no_integrator_follows_is_refused_with_the_largest_step(integrator:
         make_elastic(arm(integrator, 0.01), {"shoulder": JOINT})
     largest_s = float(str(error.value).split("at most ")[1].split()[0])
     for timestep_s, holds in ((largest_s, True), (1.3 * largest_s, False)):
-        elastic = transformed(arm("implicitfast", timestep_s), {"shoulder": JOINT})
+        elastic = transform_hinges(arm("implicitfast", timestep_s), {"shoulder": JOINT})
         assert is_well(moved(elastic.compile(), 10.0)) == holds
     with (
         pytest.warns(UserWarning, match="IMPLICITFAST")
@@ -214,8 +214,8 @@ def test_a_full_arena_is_said_once_and_is_no_divergence() -> None:
     simulation = SingleWorld(mujoco.MjModel.from_xml_string(FULL.format(bodies=bodies)))
     simulation.advance(5)
     with pytest.warns(UserWarning, match="too many .* for its memory"):
-        assert simulation.diverged().tolist() == [False]
+        assert simulation.divergence().tolist() == [False]
     simulation.advance(5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert simulation.diverged().tolist() == [False]
+        assert simulation.divergence().tolist() == [False]

@@ -166,7 +166,7 @@ def test_held_joints_and_a_load_are_those_of_mujoco(seed: int) -> None:
     }
     joints = ["wrist", "first", "second"]
     place = generator.uniform(-0.2, 0.2, 3)
-    body = RigidBody(model, joints, held, gravcomp=True)
+    body = RigidBody(model, joints, held)
     body.set_load(model.body("hand").id, 1.3, place)
     loaded = mujoco.MjSpec.from_string(HELD)
     loaded.body("hand").add_body(
@@ -187,7 +187,7 @@ def test_held_joints_and_a_load_are_those_of_mujoco(seed: int) -> None:
             body.inverse_dynamics(q, q_dot, q_ddot), torque, rtol=0.0, atol=1e-9
         )
     body.set_load(model.body("hand").id, 0.0, place)
-    unloaded = RigidBody(model, joints, held, gravcomp=True)
+    unloaded = RigidBody(model, joints, held)
     np.testing.assert_array_equal(body.gravity_torque(q), unloaded.gravity_torque(q))
 
 

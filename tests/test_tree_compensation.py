@@ -12,7 +12,7 @@ from baselines.compensation.compensators import GravityCompensator, Motion
 from baselines.compensation.gravity_torque import make_gravity
 from elastic_env import ElasticJoint, JointRobot, Servo
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.world.robot_model import RobotModel
 from tests.played import metrics_of
 
@@ -75,7 +75,7 @@ def test_the_torque_is_that_of_mujoco() -> None:
     forces are the judge."""
     model = rigid().compile()
     data = mujoco.MjData(model)
-    torque = TreeTorque(model, NAMES)
+    torque = RigidBody(model, NAMES)
     for q, q_dot, q_ddot in zip(poses(20), poses(20)[::-1], 3.0 * poses(20), strict=True):
         for name, *state in zip(NAMES, q, q_dot, q_ddot, strict=True):
             joint = data.joint(name)

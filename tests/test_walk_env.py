@@ -870,7 +870,7 @@ def test_the_bank_of_spread_fills_its_interval_and_is_the_same_everywhere(
     process."""
     monkeypatch.setattr(walk_config, "BANK_SIZE", BANK_SIZE)
     bank = robot_bank(make_scenario("spread"))
-    factors = np.array([robot.stiffness_factor for robot in bank])
+    factors = np.array([robot.stiffness for robot in bank])
     assert factors.shape == (64, 12)
     assert 0.7 <= factors.min() < 0.71
     assert 1.29 < factors.max() <= 1.3

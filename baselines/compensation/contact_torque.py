@@ -23,14 +23,10 @@ from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.rigid.leg_chains import LegChains
-from elastic_env.rigid.leg_kernels import gradients, loads_type, solutions, torques
+from elastic_env.rigid.tree.kernels import loads_type
 from elastic_env.world.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
-
-_LEGS = 2
-_PER_LEG = 6
-
 
 CONTACT = record_type(
     gravity=(),  # [m/s²]
@@ -38,43 +34,26 @@ CONTACT = record_type(
     footholds=(2, 2),  # middles of the soles [m]
     ankle_height=(),  # [m]
     is_at_zmp=bool,  # or at the ankle axes
-    legs_weigh=bool,
 )
 """How the ground carries the robot."""
 
 
-class LegTorque:
-    """Torques of legs under loads that go with any posture; a `GravityModel` on (num_worlds, 12).
+class LegTorque(NamedTuple):
+    """Torques of legs under loads that go with any posture: a `GravityModel`, (num_worlds, 12)."""
 
-    Args:
-        chains: The legs.
-        loads: Loads on them, rows of `LOADS`, (num_worlds,).
-    """
-
-    def __init__(self, chains: LegChains, loads: Any) -> None:
-        self._chains = chains
-        self._loads = loads
+    chains: LegChains
+    loads: Any
+    """Rows of `LOADS`, (num_worlds,)."""
 
     def gravity_torque(self, q: Array) -> Array:
         """Torque that holds the legs, (num_worlds, 12) [rad] to [N·m]."""
-        torque = np.empty(q.shape)
-        torques(self._chains.legs, self._loads, _by_leg(q), _by_leg(torque))
-        return torque
+        return self.chains.torque(self.loads, q)
 
     def gravity_gradient(self, q: Array) -> Array:
         """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns
         with its foot.
         """
-        return _block_diagonal(self.gradient_by_leg(q))
-
-    def gradient_by_leg(self, q: Array) -> Array:
-        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6)
-        [N·m/rad].
-        """
-        legs = _by_leg(q)
-        gradient = np.empty((*legs.shape, _PER_LEG))
-        gradients(self._chains.legs, self._loads, legs, gradient)
-        return gradient
+        return self.chains.gradient(self.loads, q)
 
     def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
         """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
@@ -90,27 +69,16 @@ class LegTorque:
         Raises:
             ElasticError: The matrix is singular.
         """
-        legs = _by_leg(q)
-        K = stiffness.reshape(_LEGS, _PER_LEG)
-        x = np.empty(q.shape)
-        given = _OWN if torque is None else _by_leg(torque)
-        if not solutions(self._chains.legs, self._loads, legs, K, given, _by_leg(x)):
+        x, is_small = self.chains.solve(self.loads, q, stiffness, torque)
+        if not is_small:
             torque = self.gravity_torque(q) if torque is None else torque
             # says so if it is singular
-            solve_stiffness(
-                np.broadcast_to(K, legs.shape), self.gradient_by_leg(q), _by_leg(torque)
-            )
+            solve_stiffness(np.broadcast_to(stiffness, q.shape), self.gravity_gradient(q), torque)
         return x
 
 
-_OWN: Array = np.empty((0, _LEGS, _PER_LEG))
-LOADS = loads_type(_LEGS)
+LOADS = loads_type(2)
 """Loads on the legs of a world."""
-
-
-def _by_leg(values: Array) -> Array:
-    """(num_worlds, 12) as (num_worlds, 2, 6), in the same memory where it is one piece."""
-    return np.ascontiguousarray(values).reshape(-1, _LEGS, _PER_LEG)
 
 
 class ContactGravity:
@@ -124,14 +92,13 @@ class ContactGravity:
     def __init__(self, model: WalkerModel, method: ContactMethod = "com") -> None:
         biped = model.biped
         self._view = WalkView(model.observation_table)
-        self._chains = biped.chains
+        self._chains = biped.weightless_chains if method == "lumped" else biped.chains
         self._contact: Any = np.zeros(1, CONTACT)
         self._contact["gravity"] = biped.gravity
         self._contact["mass"] = biped.chains.mass
         self._contact["footholds"] = biped.footholds
         self._contact["ankle_height"] = biped.ankle_height
         self._contact["is_at_zmp"] = method == "com"
-        self._contact["legs_weigh"] = method != "lumped"
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
@@ -215,15 +182,6 @@ class BoundPlannedTorque(NamedTuple):
         )
 
 
-def _block_diagonal(blocks: Array) -> Array:
-    """(..., L, J, J) to (..., L J, L J)."""
-    L, J = blocks.shape[-3:-1]
-    full = np.zeros((*blocks.shape[:-3], L * J, L * J))
-    for leg in range(L):
-        full[..., leg * J : (leg + 1) * J, leg * J : (leg + 1) * J] = blocks[..., leg, :, :]
-    return full
-
-
 @compiled
 def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
     """Loads under the planned load share.
@@ -239,7 +197,6 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
         load = level[world]
         plan = observed[world]
         fill_gravity(plan, ground.gravity, True, load)
-        load.legs_weigh = ground.legs_weigh
         share = plan.load_share
         for foot in range(2):
             weight = share if foot == 1 else 1.0 - share
@@ -270,7 +227,6 @@ def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) ->
         load = loads[world]
         shown = observed[world]
         fill_gravity(shown, gravity, is_level, load)
-        load.legs_weigh = True
         for foot in range(2):
             load.mass[foot] = 0.0
             for i in range(3):

@@ -17,8 +17,7 @@ from baselines.compensation.contact_torque import (
 )
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
-from elastic_env.rigid.rigid_body import RigidBody
-from elastic_env.rigid.tree.torque import TreeTorque, needs_more_than_gravity
+from elastic_env.rigid.rigid_body import RigidBody, needs_more_than_gravity
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "tree", "com", "ankle", "lumped"]
@@ -57,7 +56,7 @@ class FixedDynamics:
         body = (
             HingeTorque(model)
             if _is_plain_hinge(model)
-            else TreeTorque(model.rigid, model.joint_names)
+            else RigidBody(model.rigid, model.joint_names)
         )
         self.inverse_dynamics = body.inverse_dynamics
 
@@ -83,7 +82,7 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         return ContactGravity(model, chosen)
     methods: dict[str, Callable[[RobotModel], GravityModel]] = {
         "hinge": HingeTorque,
-        "tree": lambda model: TreeTorque(model.rigid, model.joint_names),
+        "tree": lambda model: RigidBody(model.rigid, model.joint_names),
     }
     chosen = method or ("hinge" if _is_plain_hinge(model) else "tree")
     require_known("gravity method", [chosen], methods)

@@ -51,7 +51,7 @@ from elastic_env.joint.load_path import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.rigid.rigid_body import RigidBody
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 """A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000,
@@ -147,7 +147,7 @@ class PositionCompensator:
         self.joints = tuple(joints)
         require_known_torque(model, self.joints)
         held = _held(model, self.joints)
-        self._links = TreeTorque(model, self.joints, held)
+        self._links = RigidBody(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)

@@ -25,7 +25,6 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.policy import Records, WalkView
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, Signal
-from elastic_env.rigid.leg_kernels import sole_tilts
 from elastic_env.world.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
@@ -132,12 +131,8 @@ class BendingObserver:
         Returns:
             (num_worlds, 2 legs, 2) each, roll and pitch [rad].
         """
-        q = rows[:, self._theta].reshape(len(rows), 2, -1)
-        bent = bending.reshape(len(rows), 2, -1)
-        attitude = np.ascontiguousarray(rows[:, self._attitude])
-        seen, expected = np.empty((2, len(rows), *_SHAPE))
-        sole_tilts(self._model.biped.chains.axis, q, attitude, bent, seen, expected)
-        return seen, expected
+        chains = self._model.biped.chains
+        return chains.sole_tilts(rows[:, self._theta], rows[:, self._attitude], bending)
 
 
 @compiled

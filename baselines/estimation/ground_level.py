@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
-from elastic_env.core.signals import Array, renamed
+from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
 from elastic_env.world.robot_model import WalkerModel
 
@@ -70,8 +70,8 @@ class GroundLevel:
         table = model.observation_table
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
-        own = renamed(table.signals_of("imu_attitude"), "own_tilt")
-        self.signals = (*own, *renamed(table.signals_of("wrench"), "level_wrench"))
+        own = rename_group(table.signals_of("imu_attitude"), "own_tilt")
+        self.signals = (*own, *rename_group(table.signals_of("wrench"), "level_wrench"))
         """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")
@@ -145,9 +145,11 @@ class GroundLevel:
         """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
         one, (n, 2).
         """
-        n = len(rows)
-        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
-        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
-        now, soon = com[:, :, None] - ankles
+        theta = rows[:, self._theta]
+        rate = rows[:, self._rate]
+        com, ankles = self._carried.com_and_feet(
+            np.concatenate([theta, theta + _DIFFERENCE_S * rate])
+        )
+        now, soon = np.split(com[:, None] - ankles, 2)
         velocity = (soon - now)[..., :2] / _DIFFERENCE_S
-        return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]
+        return now[..., 2:], velocity[np.arange(len(rows)), np.argmax(load, axis=1)]

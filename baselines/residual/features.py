@@ -24,7 +24,7 @@ from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, Signal, renamed
+from elastic_env.core.signals import Array, BoolArray, Signal, rename_group
 from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
@@ -88,7 +88,7 @@ class Features:
         )
         self._history = settings.history
         commands = (
-            renamed(model.observation_table.signals_of("last_command"), BASE_ACTION)
+            rename_group(model.observation_table.signals_of("last_command"), BASE_ACTION)
             if self._acts
             else ()
         )
@@ -220,7 +220,7 @@ _ERRORS = {
 def _error(name: str, model: RobotModel) -> _Instant:
     table = model.observation_table
     whole, less = (table.group(group) for group in _ERRORS[name])
-    signals = renamed(table.signals_of("encoder_angle"), name)
+    signals = rename_group(table.signals_of("encoder_angle"), name)
     return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
 
 

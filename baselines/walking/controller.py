@@ -52,7 +52,6 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.rigid.biped import Biped
-from elastic_env.rigid.leg_kernels import local_frames
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -103,7 +102,7 @@ def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2)
     [rad].
     """
-    return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), _sole(biped), attitude))
+    return LocalFrame(*biped.chains.com_and_feet(q, _sole(biped), attitude))
 
 
 def _sole(biped: Biped) -> Array:
@@ -218,7 +217,9 @@ class WalkingController(BatchPolicy):
         much.
         """
         observed = self._walk_view.fields(rows)
-        com, soles = self._local_frame(rows)
+        com, soles = self._biped.chains.com_and_feet(
+            rows[:, self._theta], self._sole, rows[:, self._attitude]
+        )
         action = np.empty((len(rows), 12))
         now = np.empty(len(rows), MEMORY)
         coming = np.empty(len(rows), dtype=np.int64)
@@ -241,17 +242,6 @@ class WalkingController(BatchPolicy):
         if is_moved:
             move_pelvis(*self._stances, steps=coming, shift=pelvis, offset=action)
         return action.astype(np.float32), now
-
-    def _local_frame(self, rows: Array) -> tuple[Array, Array]:
-        """Center of mass, (num_worlds, 3), and soles, (num_worlds, 2, 3), level and relative to
-        the pelvis [m].
-        """
-        q = np.ascontiguousarray(rows[:, self._theta]).reshape(-1, 2, 6)
-        com = np.empty((len(rows), 3))
-        soles = np.empty((len(rows), 2, 3))
-        attitude = np.ascontiguousarray(rows[:, self._attitude])
-        local_frames(self._biped.chains.legs, q, attitude, self._sole, com, soles)
-        return com, soles
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
         """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for

@@ -78,7 +78,7 @@ def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
     axes = np.eye(3)[:2]
     moved = plan.pelvis[0] + _PROBE_M * np.concatenate([axes, -axes])
     q = biped.joint_angles(moved, np.broadcast_to(plan.ankles[0], (4, 2, 3)))
-    com = moved + biped.chains.center_of_mass(q.reshape(4, 2, -1))
+    com = moved + biped.chains.center_of_mass(q)
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 

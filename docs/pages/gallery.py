@@ -25,7 +25,7 @@ from elastic_env.joint.known_torque import hinges_of  # noqa: E402
 from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
-from elastic_env.rigid.tree.torque import TreeTorque  # noqa: E402
+from elastic_env.rigid.rigid_body import RigidBody  # noqa: E402
 from elastic_env.robots.gallery import (  # noqa: E402
     GALLERY,
     gallery_joints,
@@ -88,7 +88,7 @@ class AtRest:
         self.joints = gallery_joints(name, folder)
         self.hinges = hinges_of(self.model)
         self.stiffness = np.array([self.joints[hinge].stiffness for hinge in self.hinges])
-        self._torque = TreeTorque(self.model, self.hinges)
+        self._torque = RigidBody(self.model, self.hinges)
         self._compensator = PositionCompensator(self.model, self.stiffness.tolist())
 
     def commands(self, q_ref: Array) -> Array:
@@ -157,7 +157,7 @@ def picture(name: str) -> Image:
     robot = AtRest(name)
     home = home_pose(name, robot.hinges)
     links = np.array([robot.links(theta) for theta in (home, robot.commands(home))])
-    return SagViews(_display(name), robot.hinges, _PIXELS).drawn(np.array([home, home]), links)
+    return SagViews(_display(name), robot.hinges, _PIXELS).draw(np.array([home, home]), links)
 
 
 def _display(name: str) -> mujoco.MjSpec:

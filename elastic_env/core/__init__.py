@@ -1,3 +1,1 @@
-"""What every room uses: errors, validated models, text formats, tables of signals, rows of
-worlds, compilation.
-"""
+"""Shared basics: errors, validated models, text formats, tables of signals, compilation."""

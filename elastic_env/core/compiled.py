@@ -1,5 +1,6 @@
-"""Functions that Numba compiles: arithmetic row by row, without what NumPy takes for each operation
-on small arrays.
+"""Functions that Numba compiles: arithmetic row by row.
+
+NumPy takes longer, as each of its operations has a fixed cost on small arrays.
 
 Numba compiles them when they are first called with arrays of a kind. It keeps the code beside the
 source file or in the user's cache folder, by the file of the function that was called. So a kernel
@@ -33,7 +34,7 @@ _NOT_KEPT = (
     " written"
 )
 _said_of: dict[Any, str] = {}
-"""What is logged of a function, by its Python code."""
+"""Message to log for a function, by its Python code."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -54,7 +55,8 @@ class _Compilations(events.Listener):
 
     def on_start(self, event: events.Event) -> None:
         """A compilation begins, of whatever function."""
-        said = _said_of.get(getattr((event.data or {}).get("dispatcher"), "py_func", None))
+        dispatcher = (event.data or {}).get("dispatcher")
+        said = _said_of.get(getattr(dispatcher, "py_func", None))
         if said is not None:
             _LOG.info(said)
 
@@ -79,9 +81,7 @@ def record_type(**fields: Any) -> np.dtype[Any]:
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a formula of a kernel that NumPy's arrays need too: Python calls it as it is,
-    kernels compile it.
-    """
+    """Decorate a formula that kernels compile and Python calls as it is, with NumPy's arrays."""
     return register_jitable(error_model="numpy")(function)
 
 
@@ -95,7 +95,8 @@ def compile_now(function: Callable[..., Any], *arguments: Any) -> None:
     def call() -> None:
         try:
             function(*arguments)
-        except OSError:  # compiled, and not kept: a full disk costs the next program time
+        except OSError:
+            # compiled, and not kept: a full disk costs the next program time
             function(*arguments)
 
     with ThreadPoolExecutor(max_workers=1) as beside:

@@ -33,24 +33,19 @@ from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 ModelT = TypeVar("ModelT", bound="Model")
 
 
-def quantity(
-    unit: str, default: Any = ..., *, description: str | None = None, **bounds: Any
-) -> Any:
-    """A physical parameter of a `Model`.
+def quantity(unit: str, default: Any = ..., **bounds: Any) -> Any:
+    """A physical parameter of a `Model`; the docstring below the field is its meaning.
 
     Args:
         unit: SI unit as it appears in error messages and tables, "1" for a pure number.
         default: Default value; without one the parameter is required.
-        description: One line for documentation; None for the docstring below the field.
         **bounds: Any of gt, ge, lt, le.
     """
-    text = None if description is None else f"{description} [{unit}]"
-    return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)
+    return Field(default, json_schema_extra={"unit": unit}, **bounds)
 
 
 def plain_numbers(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's numbers and lists, also within lists, tuples and
-    mappings.
+    """NumPy's numbers and arrays as Python's numbers and lists, also within containers.
 
     A number of less than double precision becomes what it is written as: 1.6 and not
     1.600000023841858.
@@ -73,9 +68,7 @@ def plain_numbers(value: Any) -> Any:
 
 
 def _with_strict_numbers(schema: Any) -> Any:
-    """A schema of Pydantic's whose numbers are strict wherever they stand, and may be NumPy's;
-    lists may be arrays.
-    """
+    """Pydantic's schema with strict numbers, which may be NumPy's; lists may be arrays."""
     if isinstance(schema, list | tuple):
         return type(schema)(_with_strict_numbers(part) for part in schema)
     if not isinstance(schema, dict) or schema.get("strict"):
@@ -120,7 +113,8 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
+            problems = problems_of(type(self), error, values)
+            raise ModelError(type(self).__name__, problems) from None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -128,8 +122,9 @@ class Model(BaseModel):
         super().__pydantic_init_subclass__(**kwargs)
         for field in cls.model_fields.values():
             if field.description is not None:
-                paragraphs = re.split(r"\n\s*\n", field.description)
-                field.description = "\n\n".join(" ".join(part.split()) for part in paragraphs)
+                parts = re.split(r"\n\s*\n", field.description)
+                lines = [" ".join(part.split()) for part in parts]
+                field.description = "\n\n".join(lines)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -138,9 +133,8 @@ class Model(BaseModel):
 
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
-        return type(self)(
-            **{**{name: getattr(self, name) for name in type(self).model_fields}, **changes}
-        )
+        own = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**own, **changes})
 
 
 def _is_text(value: str) -> str:
@@ -181,10 +175,9 @@ def load_yaml(
     content = read_mapping(file, empty=bool(changes))
     try:
         return model(**{**content, **(changes or {})})
-    except ModelError as error:
-        raise ConfigurationError(f"in {shorten(file)}: {error.named()}") from None
     except ConfigurationError as error:
-        raise ConfigurationError(f"in {shorten(file)}: {error}") from None
+        problem = error.describe() if isinstance(error, ModelError) else error
+        raise ConfigurationError(f"in {shorten(file)}: {problem}") from None
 
 
 def load_json(
@@ -208,7 +201,8 @@ def load_json(
             model.
     """
     try:
-        content = parse_json(read_bounded(path, _BYTES * LARGEST_JSON, within).decode("utf-8"))
+        data = read_bounded(path, _BYTES * LARGEST_JSON, within)
+        content = parse_json(data.decode("utf-8"))
     except ConfigurationError:
         raise
     except OSError as error:
@@ -216,11 +210,14 @@ def load_json(
     except ValueError as error:
         raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {type(content).__name__}")
+        kind = type(content).__name__
+        raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(f"{shorten(path)} describes no {what}: {error.named()}") from None
+        raise ConfigurationError(
+            f"{shorten(path)} describes no {what}: {error.describe()}"
+        ) from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
@@ -228,42 +225,37 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
 
     Args:
         file: It.
-        empty: Whether an empty file is taken, as an empty mapping.
+        empty: True to take an empty file, as an empty mapping.
 
     Raises:
         ConfigurationError: The file cannot be read, is no YAML, or holds something else.
     """
     try:
-        content = parse_yaml(_text_of(file))
+        content = parse_yaml(read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8"))
+    except ConfigurationError:
+        raise
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{shorten(file)} is not valid YAML: {error}") from None
-    if content is None and empty:
-        content = {}
-    if not isinstance(content, dict):
-        got = "an empty file" if content is None else type(content).__name__
-        raise ConfigurationError(
-            f"{shorten(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
-        )
-    return content
-
-
-def _text_of(file: Path) -> str:
-    """Text of a file that is one, and no longer than a configuration is.
-
-    Raises:
-        ConfigurationError: It is missing, a folder or too long, or cannot be read.
-    """
-    try:
-        if file.is_dir():
-            raise ConfigurationError(f"{shorten(file)} is a folder, a YAML file is needed")
-        if not file.exists():
-            known = (
-                sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
-            )
-            listing = (
-                f"; found beside it: {list_names(known)}" if known else configurations_are(file)
-            )
-            raise ConfigurationError(f"no configuration file at {shorten(file)}{listing}")
-        return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")
+        problem = f"{shorten(file)} is not valid YAML: {error}"
+    except IsADirectoryError:
+        problem = f"{shorten(file)} is a folder, a YAML file is needed"
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        problem = f"no configuration file at {shorten(file)}{_found_beside(file)}"
     except OSError as error:
-        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None
+        problem = f"{shorten(file)} cannot be read: {error.strerror}"
+    else:
+        if content is None and empty:
+            return {}
+        if isinstance(content, dict):
+            return content
+        got = "an empty file" if content is None else type(content).__name__
+        needed = "must hold a mapping of parameters, such as 'name: value'"
+        problem = f"{shorten(file)} {needed}, got {got}"
+    raise ConfigurationError(problem) from None
+
+
+def _found_beside(file: Path) -> str:
+    """Files beside one that is not there."""
+    known = sorted(map(str, file.parent.glob("*.yaml"))) if file.parent.is_dir() else []
+    if not known:
+        return configurations_are(file)
+    return f"; found beside it: {list_names(known)}"

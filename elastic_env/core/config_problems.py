@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
-"""Where a value stands: the keys and numbers of entries that lead to it."""
+"""Keys and numbers of entries that lead to a value."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class Problem:
         owner = spelt(self.path[:-1]) or of_all
         own = quote(self.path[-1])
         if self.form == "unknown":
-            return f"unknown parameter {f'of {owner} ' if owner else ''}{own}; {self.text}"
+            of_owner = f"of {owner} " if owner else ""
+            return f"unknown parameter {of_owner}{own}; {self.text}"
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
@@ -54,11 +55,11 @@ _LONGEST_SAID = 1900
 """Problems and characters, after which an error says how many more problems there are."""
 
 
-def dotted(path: ParameterPath) -> str:
+def join_path(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
-    return ".".join(
-        part if isinstance(part, str) and len(part) < 100 else quote(part) for part in path
-    )
+    is_short = [isinstance(part, str) and len(part) < 100 for part in path]
+    parts = zip(path, is_short, strict=True)
+    return ".".join(str(part) if short else quote(part) for part, short in parts)
 
 
 class ModelError(ConfigurationError):
@@ -76,20 +77,22 @@ class ModelError(ConfigurationError):
 
     def __str__(self) -> str:
         """All problems, one per line, in the words of who made the model in Python."""
-        return self.named(self.model)
+        return self.describe(self.model)
 
-    def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
-        """All problems, one per line, in the words of who wrote a file or options; arguments as
-        `Problem.sentence`.
+    def describe(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = join_path) -> str:
+        """All problems, one per line, for who wrote a file or options.
+
+        Arguments as in `Problem.sentence`.
         """
-        sentences = list(
-            dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems)
-        )
+        found = [problem.sentence(of_all, spelt) for problem in self.problems]
+        sentences = list(dict.fromkeys(map(readable, found)))
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
         fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
-        said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
-        more = [f"and {len(sentences) - len(said)} more"] if len(said) < len(sentences) else []
-        return "\n".join([*said, *more])
+        fitting = min(fitting, _MOST_SAID)
+        said = [sentence[:_LONGEST_SAID] for sentence in sentences[:fitting]]
+        if fitting < len(sentences):
+            said.append(f"and {len(sentences) - fitting} more")
+        return "\n".join(said)
 
 
 def problems_of(
@@ -121,20 +124,22 @@ def _problems(
 
 def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
     given = quote(problem["input"])
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
         case "extra_forbidden":
-            return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
+            choices = choices_listed(path[-1], model.model_fields)
+            return Problem(path, "unknown", choices)
         case "missing":
-            field = model.model_fields.get(str(path[-1]))
-            meaning = f": {field.description}" if field is not None and field.description else ""
-            return Problem(path, "missing", f"{_unit(model, path)}{meaning}")
+            description = field.description if field is not None else None
+            meaning = f": {description}" if description else ""
+            return Problem(path, "missing", f"{_unit(field)}{meaning}")
         case "value_error":
             return Problem(path, "rule", str(problem["ctx"]["error"]))
         case "string_pattern_mismatch":
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
     context = problem.get("ctx", {})
-    if bounds := _bounds(model, path):
+    if bounds := _bounds(field):
         requirement = f"be {bounds}"
     elif kind := _REQUIREMENTS.get(problem["type"]):
         requirement = kind.format(
@@ -142,12 +147,9 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
         )
     else:
         requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     meaning = meaning_of(field) if field is not None else ""
-    in_brackets = f" ({meaning})" if meaning else ""
-    return Problem(
-        path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}"
-    )
+    text = f"must {requirement}{_unit(field)}, got {given}"
+    return Problem(path, "must", f"{text} ({meaning})" if meaning else text)
 
 
 _REQUIREMENTS = {
@@ -166,9 +168,7 @@ _REQUIREMENTS = {
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
-    """A location without what Pydantic adds to it: the member of a union that it tried, or that
-    a tag chose.
-    """
+    """A location without what Pydantic adds to it: the member of a union."""
     path: list[str | int] = []
     for number, part in enumerate(location):
         inside: Any = None
@@ -176,7 +176,7 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
             if part not in values and not (is_missing and number == len(location) - 1):
                 continue
             inside = values.get(part)
-        elif isinstance(values, Sequence) and not isinstance(values, str) and isinstance(part, int):
+        elif isinstance(values, list | tuple) and isinstance(part, int):
             inside = values[part] if part < len(values) else None
         elif number > 0 and not isinstance(values, Mapping | None):
             continue
@@ -185,24 +185,20 @@ def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> Param
     return tuple(path)
 
 
-def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
-    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one
-    without.
-    """
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+def _bounds(field: FieldInfo | None) -> str:
+    """Requirement of a parameter with bounds, such as "a finite number > 0", else empty."""
+    if field is None:
+        return ""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     constraints = [
         f"{sign} {_number(getattr(constraint, key))}"
-        for constraint in (field.metadata if field is not None else [])
+        for constraint in field.metadata
         for key, sign in signs.items()
         if hasattr(constraint, key)
     ]
-    whole = (
-        field is not None
-        and "int" in str(field.annotation)
-        and "float" not in str(field.annotation)
-    )
-    kind = "a whole number" if whole else "a finite number"
+    annotation = str(field.annotation)
+    is_whole = "int" in annotation and "float" not in annotation
+    kind = "a whole number" if is_whole else "a finite number"
     return f"{kind} {' and '.join(constraints)}" if constraints else ""
 
 
@@ -215,13 +211,14 @@ def meaning_of(field: FieldInfo) -> str:
     """The first sentence of a quantity's description, without its unit; empty for another field."""
     if not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
-    sentence = re.split(r"\.(?: |$)", " ".join(field.description.split()), maxsplit=1)[0]
+    text = " ".join(field.description.split())
+    sentence = re.split(r"\.(?: |$)", text, maxsplit=1)[0]
     if sentence[1:2].islower():  # no symbol and no abbreviation
         sentence = sentence[0].lower() + sentence[1:]
     return sentence.removesuffix(f" [{field.json_schema_extra['unit']}]")
 
 
-def _unit(model: type[BaseModel], path: ParameterPath) -> str:
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+def _unit(field: FieldInfo | None) -> str:
     extra = field.json_schema_extra if field is not None else None
-    return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""
+    unit = extra["unit"] if isinstance(extra, dict) else "1"
+    return f" [{unit}]" if unit != "1" else ""

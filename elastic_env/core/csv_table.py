@@ -1,20 +1,18 @@
-"""Tables of numbers from a user's CSV file: a header, then rows of finite numbers, of bounded
-size.
-"""
+"""Tables of numbers from a user's CSV file of bounded size: a header, then finite numbers."""
 
 import csv
+import io
 import math
-import stat
 from array import array
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, quote, shorten
+from elastic_env.core.files import read_bounded
 from elastic_env.core.signals import Array
 
 LARGEST_BYTES = 20_000_000
@@ -54,47 +52,34 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
         ConfigurationError: The file is missing, too large or no CSV file, or holds something else
             than finite numbers.
     """
-    size = _size(file, what, example)
-    if size > LARGEST_BYTES:
-        raise ConfigurationError(
-            f"{shorten(file)} must have at most {LARGEST_BYTES} bytes, it has {size}"
-        )
     try:
-        with file.open(newline="", encoding="utf-8-sig") as text:
-            return _parsed(file, text, row, most_rows, example)
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            f"{shorten(file)} is no text in UTF-8: {error.reason}; save it as CSV in UTF-8"
-        ) from None
+        text = read_bounded(file, LARGEST_BYTES).decode("utf-8-sig")
+        if max(map(len, io.StringIO(text)), default=0) > _LONGEST_LINE:
+            raise ConfigurationError(
+                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it CSV?"
+            )
+        return _parse(file, text, row, most_rows, example)
+    except ConfigurationError:
+        raise
     except csv.Error as error:
-        raise ConfigurationError(
-            f"{shorten(file)} is no CSV file: {error}; check quotation marks and line ends"
-        ) from None
-    except OSError as error:
-        raise ConfigurationError(f"{shorten(file)} cannot be read: {error.strerror}") from None
-
-
-def _size(file: Path, what: str, example: str) -> int:
-    """Bytes of a plain file."""
-    try:
-        found = file.stat()
+        problem = f"is no CSV file: {error}; check quotation marks and line ends"
+    except UnicodeDecodeError as error:
+        problem = f"is no text in UTF-8: {error.reason}; save it as CSV in UTF-8"
+    except IsADirectoryError:
+        problem = "must be a plain file, it is a folder; give a CSV file"
+    except PermissionError as error:
+        problem = f"cannot be read: {error.strerror}"
     except (OSError, ValueError):
         raise ConfigurationError(
             f"no {what} at {quote(str(file))[1:-1]}; give a CSV file with columns such as {example}"
         ) from None
-    if not stat.S_ISREG(found.st_mode):
-        raise ConfigurationError(
-            f"{shorten(file)} must be a plain file, it is a folder, a pipe or a device; give a"
-            " CSV file"
-        )
-    return found.st_size
+    raise ConfigurationError(f"{shorten(file)} {problem}")
 
 
-def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) -> Table:
-    lines = (
-        cells for cells in csv.reader(_bounded(file, text)) if any(cell.strip() for cell in cells)
-    )
-    header = next(lines, None)
+def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Table:
+    lines = csv.reader(io.StringIO(text, newline=""))
+    filled = (cells for cells in lines if any(cell.strip() for cell in cells))
+    header = next(filled, None)
     if header is None:
         raise ConfigurationError(
             f"{shorten(file)} is empty; its first line must name columns such as {example}"
@@ -102,27 +87,17 @@ def _parsed(file: Path, text: TextIO, row: str, most_rows: int, example: str) ->
     names = _names(file, header)
     values = array("d")
     count = 0
-    for count, cells in enumerate(lines, start=1):
+    for count, cells in enumerate(filled, start=1):
         if count > most_rows:
             break
-        _append(values, file, f"{row} {count}", names, cells)
+        values.extend(_numbers(shorten(file), f"{row} {count}", names, cells))
     if not 0 < count <= most_rows:
         more = f"more than {most_rows}" if count else "0"
         raise ConfigurationError(
             f"{shorten(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
         )
-    return Table(names, np.frombuffer(values, dtype=np.float64).reshape(count, len(names)).copy())
-
-
-def _bounded(file: Path, text: TextIO) -> Iterator[str]:
-    """Lines of the file, each of bounded length."""
-    while line := text.readline(_LONGEST_LINE + 1):
-        if len(line) > _LONGEST_LINE:
-            raise ConfigurationError(
-                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it a"
-                " CSV file?"
-            )
-        yield line
+    rows = np.array(values, dtype=np.float64)
+    return Table(names, rows.reshape(count, len(names)))
 
 
 def _names(file: Path, header: list[str]) -> tuple[str, ...]:
@@ -132,20 +107,17 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
         ConfigurationError: They are not separated by commas, too many, or not each once.
     """
     names = tuple(cell.strip() for cell in header)
-    if len(names) == 1:
-        for separator, called in _SEPARATORS.items():
-            if separator in names[0]:
-                raise ConfigurationError(
-                    f"the columns of {shorten(file)} are separated by {called}; {_CURE}"
-                )
+    if len(names) == 1 and (called := _separators(header)):
+        raise ConfigurationError(
+            f"the columns of {shorten(file)} are separated by {called}; {_CURE}"
+        )
     if len(names) > MOST_COLUMNS:
         raise ConfigurationError(
             f"{shorten(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
         )
     if "" in names:
         raise ConfigurationError(
-            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one, or take"
-            " the column out"
+            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one"
         )
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
@@ -155,45 +127,44 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
     return names
 
 
-def _append(
-    values: "array[float]", file: Path, where: str, names: tuple[str, ...], cells: list[str]
-) -> None:
-    """Add the finite numbers of a row."""
+def _numbers(file: str, where: str, names: tuple[str, ...], cells: list[str]) -> Iterator[float]:
+    """The finite numbers of a row."""
     if len(cells) != len(names):
-        raise ConfigurationError(f"{shorten(file)}, {where}: {_ragged(names, cells)}")
+        problem = f"{len(names)} values are needed, one a column, got {len(cells)}"
+        if called := _separators(cells):
+            problem = f"its values are separated by {called}; {_CURE}"
+        elif len(cells) == 2 * len(names):
+            problem += "; were its numbers written with decimal commas? Write points"
+        raise ConfigurationError(f"{file}, {where}: {problem}")
     for name, cell in zip(names, cells, strict=True):
-        try:
-            value = math.nan if "_" in cell else float(cell)
-        except ValueError:
-            value = math.nan
+        value = math.nan if "_" in cell else _number(cell)
         if not math.isfinite(value):
             raise ConfigurationError(
-                f"{shorten(file)} must hold a header and rows of numbers: {where}, column"
+                f"{file} must hold a header and rows of numbers: {where}, column"
                 f" {quote(name)[1:-1]}: a finite number is needed, got {quote(cell)};"
                 f" {_cure_of(cell)}"
             )
-        values.append(value)
+        yield value
 
 
-def _ragged(names: tuple[str, ...], cells: list[str]) -> str:
-    """What is wrong with a row of another length than the header."""
-    for separator, called in _SEPARATORS.items():
-        if any(separator in cell for cell in cells):
-            return f"its values are separated by {called}; {_CURE}"
-    hint = (
-        "; were its numbers written with decimal commas? Write points"
-        if len(cells) == 2 * len(names)
-        else ""
-    )
-    return f"{len(names)} values are needed, one a column, got {len(cells)}{hint}"
+def _separators(cells: list[str]) -> str:
+    """The name of what separates values in place of commas; empty where nothing does."""
+    text = "".join(cells)
+    return next((name for mark, name in _SEPARATORS.items() if mark in text), "")
+
+
+def _number(cell: str) -> float:
+    """A cell as a number, nan where it is none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _cure_of(cell: str) -> str:
-    """What to do about a cell that is no finite number."""
-    try:
-        float(cell.replace(",", "."))
-    except ValueError:
+    """Cure for a cell that is no finite number."""
+    if math.isnan(_number(cell.replace(",", "."))) and "nan" not in cell.lower():
         return "give a number, or delete the line"
-    return (
-        "write the number with a point" if "," in cell else "measure it again, or delete the line"
-    )
+    if "," in cell:
+        return "write the number with a point"
+    return "measure it again, or delete the line"

@@ -1,5 +1,4 @@
-"""Random generators of an episode: for the robot, which can walk again, and for what happens to it
-then.
+"""Random generators of an episode: one of the robot, which can walk again, and one of the trial.
 
 A robot is what lasts: its joints, the offsets of its sensors, the ground under it, and where a
 motion is drawn, the motion. A trial is what does not: noise, pushes. `reset(options={"robot_seed":

@@ -29,7 +29,8 @@ class ElasticError(ValueError):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, *args: Any) -> None:
-        super().__init__(*(readable(arg) if isinstance(arg, str) else arg for arg in args))
+        parts = [readable(arg) if isinstance(arg, str) else arg for arg in args]
+        super().__init__(*parts)
 
 
 class SystemFailedError(ElasticError):
@@ -88,8 +89,7 @@ def quote(value: Any) -> str:
 
 
 def shorten(text: object, longest: int = _LONGEST_SHOWN) -> str:
-    """Text of a user's as an error shows it without quotes, such as a path: its begin and end,
-    where it is long.
+    """Text of a user as an error shows it without quotes: begin and end of what is long.
 
     Args:
         text: It.
@@ -125,7 +125,8 @@ def unknown_name(kind: str, name: object, choices: Iterable[str]) -> Configurati
         name: The name that was given.
         choices: The names that exist.
     """
-    return ConfigurationError(f"unknown {kind} {quote(name)}; {choices_listed(name, choices)}")
+    listed = choices_listed(name, choices)
+    return ConfigurationError(f"unknown {kind} {quote(name)}; {listed}")
 
 
 def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> None:

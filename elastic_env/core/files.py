@@ -63,8 +63,9 @@ def _short_path(path: Path) -> str:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file beside its place and move it there, when it is on the disk; a failure leaves
-    nothing new.
+    """Write a file beside its place and move it there when it is on the disk.
+
+    A failure leaves nothing new.
 
     A link at its place is replaced; what it leads to stays as it is.
 

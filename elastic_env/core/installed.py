@@ -10,11 +10,8 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 def checkout() -> Path | None:
     """Folder of the checkout that this code runs from; None for an installed package."""
-    return (
-        _ROOT
-        if (_ROOT / "constraints.txt").is_file() and (_ROOT / "pyproject.toml").is_file()
-        else None
-    )
+    files = [_ROOT / name for name in ("constraints.txt", "pyproject.toml")]
+    return _ROOT if all(file.is_file() for file in files) else None
 
 
 def install_command(extra: str) -> str:
@@ -41,8 +38,7 @@ def _packages_of(extra: str) -> list[str]:
 
 
 def configurations_are(file: Path) -> str:
-    """Where the configurations are, for an error about one that does not exist; empty where none of
-    them is meant.
+    """Sentence for an error about a missing file: where the configurations are, or empty.
 
     Args:
         file: The one that was named.

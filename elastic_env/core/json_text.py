@@ -1,6 +1,4 @@
-"""JSON of bounded size, with finite numbers and text that a file can hold: what others may have
-written.
-"""
+"""JSON that others may have written: of bounded size, with finite numbers and plain text."""
 
 import json
 import math
@@ -40,7 +38,8 @@ _TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NEST
 
 def _whole(text: str) -> int:
     if len(text) > LONGEST_NUMBER:
-        raise ValueError(f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
+        bound = f"at most {LONGEST_NUMBER} characters"
+        raise ValueError(f"a number must have {bound}, got {len(text)}")
     return int(text)
 
 

@@ -9,75 +9,63 @@ Values of Input Variables in the Analysis of Output from a Computer Code", Techn
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array
 
 Interval: TypeAlias = tuple[float, float]
 """Lowest and highest value, both included."""
 
 
-def interval(unit: str, nominal: float, *, description: str, bounds: Interval) -> Any:
+def interval(unit: str, nominal: float, bounds: Interval) -> Any:
     """An interval of a `Model`.
 
     Args:
         unit: SI unit as it appears in error messages and tables, "1" for a pure number.
         nominal: Value where nothing is drawn, the default of both ends.
-        description: One line for documentation.
         bounds: What the ends must lie within.
     """
     extra: dict[str, Any] = {"unit": unit, "bounds": bounds}
-    return Field((nominal, nominal), description=f"{description} [{unit}]", json_schema_extra=extra)
+    return Field((nominal, nominal), json_schema_extra=extra)
 
 
 class RobotRanges(Model):
-    """What robots differ in from the assumed one; by default in nothing."""
+    """Intervals of the quantities in which robots differ from the assumed one; by default none.
 
-    stiffness: Interval = interval(
-        "1", 1.0, bounds=(0.05, 20), description="factor on K, of all joints together"
-    )
-    joint_stiffness: Interval = interval(
-        "1", 1.0, bounds=(0.05, 20), description="further factor on K, of every joint its own"
-    )
-    damping: Interval = interval(
-        "1", 1.0, bounds=(0, 100), description="factor on D, of all joints together"
-    )
-    friction: Interval = interval(
-        "1",
-        1.0,
-        bounds=(0, 100),
-        description="factor on dry and viscous friction, of all joints together",
-    )
-    backlash_rad: Interval = interval(
-        "rad", 0.0, bounds=(0, 0.1), description="further dead band, of all joints together"
-    )
-    load_kg: Interval = interval("kg", 0.0, bounds=(0, 100), description="load on the torso")
-    load_x_m: Interval = interval(
-        "m", 0.0, bounds=(-1, 1), description="place of the load before the torso's center of mass"
-    )
-    load_y_m: Interval = interval(
-        "m", 0.0, bounds=(-1, 1), description="the same, to the left of it"
-    )
-    load_z_m: Interval = interval("m", 0.0, bounds=(-1, 1), description="the same, above it")
-    homing_rad: Interval = interval(
-        "rad", 0.0, bounds=(-0.1, 0.1), description="error of the encoders, of every joint its own"
-    )
-    mounting_rad: Interval = interval(
-        "rad",
-        0.0,
-        bounds=(-0.1, 0.1),
-        description="error of the IMU, of roll and pitch each its own",
-    )
-    slope_rad: Interval = interval(
-        "rad", 0.0, bounds=(0, 0.5), description="slope of the floor, in any direction"
-    )
-    push_n: Interval = interval(
-        "N", 0.0, bounds=(0, 1000), description="force of a push on the torso"
-    )
+    The draws depend on the order of these fields, see `draw_robots`.
+    """
+
+    stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
+    """Factor on K, of all joints together [1]."""
+    joint_stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
+    """Further factor on K, of every joint its own [1]."""
+    damping: Interval = interval("1", 1.0, bounds=(0, 100))
+    """Factor on D, of all joints together [1]."""
+    friction: Interval = interval("1", 1.0, bounds=(0, 100))
+    """Factor on dry and viscous friction, of all joints together [1]."""
+    backlash_rad: Interval = interval("rad", 0.0, bounds=(0, 0.1))
+    """Further dead band, of all joints together [rad]."""
+    load_kg: Interval = interval("kg", 0.0, bounds=(0, 100))
+    """Load on the torso [kg]."""
+    load_x_m: Interval = interval("m", 0.0, bounds=(-1, 1))
+    """Place of the load before the torso's center of mass [m]."""
+    load_y_m: Interval = interval("m", 0.0, bounds=(-1, 1))
+    """The same, to the left of it [m]."""
+    load_z_m: Interval = interval("m", 0.0, bounds=(-1, 1))
+    """The same, above it [m]."""
+    homing_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
+    """Error of the encoders, of every joint its own [rad]."""
+    mounting_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
+    """Error of the IMU, of roll and pitch each its own [rad]."""
+    slope_rad: Interval = interval("rad", 0.0, bounds=(0, 0.5))
+    """Slope of the floor, in any direction [rad]."""
+    push_n: Interval = interval("N", 0.0, bounds=(0, 1000))
+    """Force of a push on the torso [N]."""
     push_share: float = quantity("1", 1.0, ge=0, le=1)
     """Share of the robots that are pushed [1]."""
     delay_share: float = quantity("1", 0.0, ge=0, le=1)
@@ -98,20 +86,15 @@ class RobotRanges(Model):
         return self
 
     def on_fixed_base(self) -> Self:
-        """The same for a robot that does not walk, which has no torso to load or to push, and no
-        floor.
-        """
-        nominal = RobotRanges()
-        names = (
-            "load_kg",
-            "load_x_m",
-            "load_y_m",
-            "load_z_m",
-            "slope_rad",
-            "push_n",
-            "inertial_share",
+        """The same without what only a walker has: load and push on the torso, floor, its IMU."""
+        of_walkers = ("load_", "slope_rad", "push_n", "inertial_share")
+        return self.replace(
+            **{
+                name: field.default
+                for name, field in type(self).model_fields.items()
+                if name.startswith(of_walkers)
+            }
         )
-        return self.replace(**{name: getattr(nominal, name) for name in names})
 
     def intervals(self) -> Iterator[tuple[str, Interval]]:
         """Quantities with an interval, by name."""
@@ -121,69 +104,54 @@ class RobotRanges(Model):
                 yield name, value
 
 
-class RobotDraw(Model):
-    """A robot as it was drawn: what of it differs from the plant that its scenario describes,
-    and its conditions.
+@dataclass(frozen=True, kw_only=True)
+class DrawnRobot:
+    """A value for every quantity of `RobotRanges`, under its name, on top of the scenario's plant.
+
+    Attributes:
+        stiffness: Factor on K of every joint [1].
+        homing_rad: Error of the encoder of every joint [rad].
+        mounting_rad: Error of roll and pitch by the IMU [rad].
+        slope_direction_rad: Direction in which the floor rises [rad].
+        is_delayed: True if measurements are one control step old.
+        is_inertial: True if the IMU computes its attitude.
     """
 
-    stiffness_factor: tuple[float, ...]
-    """Of every joint."""
-    encoder_bias_rad: tuple[float, ...]
-    """Of every joint."""
-    damping_factor: float = quantity("1", 1.0, ge=0)
-    """Factor on D of all joints [1]."""
-    friction_factor: float = quantity("1", 1.0, ge=0)
-    """Factor on the friction of all joints [1]."""
-    backlash_rad: float = quantity("rad", 0.0, ge=0)
-    """Further dead band of all joints [rad]."""
-    load_kg: float = quantity("kg", 0.0, ge=0)
-    """Load on the torso [kg]."""
-    load_place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the load, from the torso's center of mass; x forward, y left, z up."""
-    imu_bias_rad: tuple[float, float] = (0.0, 0.0)
-    """Of roll and pitch."""
-    slope_rad: float = quantity("rad", 0.0, ge=0)
-    """Slope of the floor [rad]."""
-    slope_direction_rad: float = quantity("rad", 0.0)
-    """Direction in which the floor rises [rad]."""
-    push_n: float = quantity("N", 0.0, ge=0)
-    """Force of a push on the torso [N]."""
+    stiffness: tuple[float, ...]
+    damping: float = 1.0
+    friction: float = 1.0
+    backlash_rad: float = 0.0
+    load_kg: float = 0.0
+    load_x_m: float = 0.0
+    load_y_m: float = 0.0
+    load_z_m: float = 0.0
+    homing_rad: tuple[float, ...]
+    mounting_rad: tuple[float, float] = (0.0, 0.0)
+    slope_rad: float = 0.0
+    slope_direction_rad: float = 0.0
+    push_n: float = 0.0
     is_delayed: bool = False
-    """Whether measurements are one control step old."""
     is_inertial: bool = False
-    """Whether the IMU computes its attitude."""
 
     def record(self) -> dict[str, float]:
-        """The robot in figures, by name with unit, for the records of episodes; of joints mean
-        and rms.
-        """
-        x, y, z = self.load_place_m
-        roll, pitch = self.imu_bias_rad
+        """The robot in figures, by name with unit, for the records of episodes."""
+        roll, pitch = self.mounting_rad
+        of_several = {
+            "stiffness": {"stiffness": np.mean(self.stiffness)},
+            "homing_rad": {"homing_rms_rad": np.sqrt(np.mean(np.square(self.homing_rad)))},
+            "mounting_rad": {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch},
+        }
         return {
-            "robot_stiffness": float(np.mean(self.stiffness_factor)),
-            "robot_damping": self.damping_factor,
-            "robot_friction": self.friction_factor,
-            "robot_backlash_rad": self.backlash_rad,
-            "robot_load_kg": self.load_kg,
-            "robot_load_x_m": x,
-            "robot_load_y_m": y,
-            "robot_load_z_m": z,
-            "robot_homing_rms_rad": float(np.sqrt(np.mean(np.square(self.encoder_bias_rad)))),
-            "robot_mounting_roll_rad": roll,
-            "robot_mounting_pitch_rad": pitch,
-            "robot_slope_rad": self.slope_rad,
-            "robot_slope_direction_rad": self.slope_direction_rad,
-            "robot_push_n": self.push_n,
-            "robot_is_delayed": float(self.is_delayed),
-            "robot_is_inertial": float(self.is_inertial),
+            f"robot_{name}": float(figure)
+            for quantity_, value in vars(self).items()
+            for name, figure in of_several.get(quantity_, {quantity_: value}).items()
         }
 
 
 def draw_robots(
     ranges: Sequence[RobotRanges], number: int, joints: int, seed: Sequence[int]
-) -> list[RobotDraw]:
-    """Robots of ranges, in equal shares where there are several of these; the same in every
-    process.
+) -> list[DrawnRobot]:
+    """Robots of ranges, the same in every process; equal shares of each of several ranges.
 
     Args:
         ranges: One or several.
@@ -195,71 +163,65 @@ def draw_robots(
     return [
         robot
         for index, own in enumerate(ranges)
-        for robot in _drawn(own, ends[index + 1] - ends[index], joints, (*seed, index))
+        for robot in _draw(own, ends[index + 1] - ends[index], joints, (*seed, index))
     ]
 
 
 def draw_robot(
     ranges: Sequence[RobotRanges], joints: int, generator: np.random.Generator
-) -> RobotDraw:
+) -> DrawnRobot:
     """One robot of ranges, which have equal chances where there are several."""
     own = ranges[int(generator.integers(len(ranges)))]
-    (robot,) = _drawn(own, 1, joints, [int(generator.integers(2**63))])
+    (robot,) = _draw(own, 1, joints, [int(generator.integers(2**63))])
     return robot
 
 
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:
-    """Points in the unit cube, (number, columns): each column has one value in each of `number`
-    equal intervals.
-    """
+    """Points in the unit cube, (number, columns), one of each column in each of equal intervals."""
     strata = generator.permuted(np.tile(np.arange(number), (columns, 1)), axis=1)
     points: Array = (strata + generator.random((columns, number))).T / number
     return points
 
 
-def _drawn(
+_OF_ONE = (
+    "damping",
+    "friction",
+    "backlash_rad",
+    "load_kg",
+    "load_x_m",
+    "load_y_m",
+    "load_z_m",
+    "slope_rad",
+)
+"""Quantities of which a robot has one value, under the name of their range."""
+
+
+def _draw(
     ranges: RobotRanges, number: int, joints: int, seed: Sequence[int]
-) -> Iterator[RobotDraw]:
+) -> Iterator[DrawnRobot]:
     """Robots of one set of ranges."""
-    names = type(ranges).model_fields
-
-    def unit(name: str, columns: int = 1) -> Array:
-        own = np.random.default_rng([*seed, [*names, "slope_direction"].index(name)])
-        return latin_hypercube(number, columns, own)
-
-    def within(name: str, columns: int = 1) -> Array:
-        low, high = getattr(ranges, name)
-        # not low + u (high - low), which may end beyond high by rounding
-        return np.clip(low + unit(name, columns) * (high - low), low, high)
-
-    def has(name: str) -> BoolArray:
-        return unit(name)[:, 0] < getattr(ranges, name)
-
-    stiffness = within("stiffness") * within("joint_stiffness", joints)
-    homing = within("homing_rad", joints)
-    mounting = within("mounting_rad", 2)
-    place = np.hstack([within("load_x_m"), within("load_y_m"), within("load_z_m")])
-    push = within("push_n")[:, 0] * has("push_share")
-    direction = 2.0 * np.pi * unit("slope_direction")[:, 0]
-    delayed = has("delay_share")
-    inertial = has("inertial_share")
-    one_each = {
-        "damping_factor": "damping",
-        "friction_factor": "friction",
-        "backlash_rad": "backlash_rad",
-        "load_kg": "load_kg",
-        "slope_rad": "slope_rad",
+    width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2}
+    names = [*RobotRanges.model_fields, "slope_direction"]
+    unit = {
+        name: latin_hypercube(number, width.get(name, 1), np.random.default_rng([*seed, index]))
+        for index, name in enumerate(names)
     }
-    columns = {field: within(name)[:, 0] for field, name in one_each.items()}
+    # not low + u (high - low), which may end beyond high by rounding
+    drawn = {
+        name: np.clip(low + unit[name] * (high - low), low, high)
+        for name, (low, high) in ranges.intervals()
+    }
+    stiffness = drawn["stiffness"] * drawn["joint_stiffness"]
     for i in range(number):
-        yield RobotDraw(
-            stiffness_factor=tuple(stiffness[i].tolist()),
-            encoder_bias_rad=tuple(homing[i].tolist()),
-            imu_bias_rad=mounting[i],
-            load_place_m=place[i],
-            push_n=push[i],
-            slope_direction_rad=direction[i],
-            is_delayed=bool(delayed[i]),
-            is_inertial=bool(inertial[i]),
-            **{name: values[i] for name, values in columns.items()},
+        is_pushed = unit["push_share"][i, 0] < ranges.push_share
+        roll, pitch = drawn["mounting_rad"][i].tolist()
+        yield DrawnRobot(
+            stiffness=tuple(stiffness[i].tolist()),
+            homing_rad=tuple(drawn["homing_rad"][i].tolist()),
+            mounting_rad=(roll, pitch),
+            slope_direction_rad=float(2.0 * np.pi * unit["slope_direction"][i, 0]),
+            push_n=float(drawn["push_n"][i, 0]) if is_pushed else 0.0,
+            is_delayed=bool(unit["delay_share"][i, 0] < ranges.delay_share),
+            is_inertial=bool(unit["inertial_share"][i, 0] < ranges.inertial_share),
+            **{name: float(drawn[name][i, 0]) for name in _OF_ONE},
         )

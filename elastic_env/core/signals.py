@@ -1,6 +1,4 @@
-"""Named arrays that know their units: the one description of what an observation or an action
-holds.
-"""
+"""Named arrays that know their units: the columns of observations and actions."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +20,7 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 Kind: TypeAlias = Literal["measured", "reference", "command"]
 Mirrored: TypeAlias = Literal["same", "opposite", "complement"]
-"""What a value p is where left and right change places: p, −p, or 1 − p as of a share."""
+"""A value p where left and right change places: p, −p, or 1 − p as of a share."""
 
 
 @dataclass(frozen=True)
@@ -118,33 +116,28 @@ class SignalTable:
         """The columns of groups, one group after the other."""
         return cls(tuple(signal for group in groups for signal in group.signals))
 
-    def extended(self, signals: Sequence[Signal]) -> "SignalTable":
-        """This table with further columns behind its own."""
-        return SignalTable((*self.signals, *signals))
-
     def signals_of(self, name: str) -> tuple[Signal, ...]:
         """The signals of a group, see `group`."""
         return self.signals[self.group(name)]
 
     def columns(self, *names: str) -> slice | list[int]:
-        """Where the named columns stand, a slice if they are neighbours."""
+        """Indices of the named columns, a slice if they are neighbours."""
         indices = [self.names.index(name) for name in names]
         if indices == list(range(indices[0], indices[0] + len(indices))):
             return slice(indices[0], indices[0] + len(indices))
         return indices
 
     def group(self, name: str) -> slice:
-        """Where the signal of that name stands, or the signals whose names begin with it and a dot,
-        in order.
+        """Columns of the signal of that name, or of those whose names begin with it and a dot.
 
         Raises:
             ConfigurationError: There is none, or they are not neighbours.
         """
-        found = [i for i, own in enumerate(self.names) if own == name or own.startswith(f"{name}.")]
+        start = f"{name}."
+        found = [i for i, own in enumerate(self.names) if f"{own}.".startswith(start)]
         if not found:
-            raise unknown_name(
-                "signal", name, dict.fromkeys(own.split(".")[0] for own in self.names)
-            )
+            groups = dict.fromkeys(own.split(".")[0] for own in self.names)
+            raise unknown_name("signal", name, groups)
         if found != list(range(found[0], found[-1] + 1)):
             raise ConfigurationError(
                 f"the columns of {name!r} must be neighbours, they are {found}"
@@ -158,7 +151,7 @@ class SignalTable:
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
 
-def renamed(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
+def rename_group(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
     """The same quantities by another way, under the name of another group."""
     return tuple(
         replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None)

@@ -1,6 +1,4 @@
-"""Files of arrays that others may have written: safetensors, of bounded size, with real numbers
-alone.
-"""
+"""Safetensors that others may have written: of bounded size, with real numbers alone."""
 
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,4 @@
-"""YAML as configurations need it: plain data of bounded size, and nothing that YAML 1.1 makes of
-text.
+"""YAML for configurations: plain data of bounded size, without YAML 1.1's guesses.
 
 What `yaml_of` and `yaml_line` write, `parse_yaml` reads.
 
@@ -29,8 +28,7 @@ NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one
-    too.
+    """PyYAML's loader with limits and the numbers of YAML 1.2 (1e3), without dates and tags.
 
     PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast
     as PyYAML's.
@@ -38,7 +36,7 @@ class _Loader(Composer, yaml.CSafeLoader):
 
     # dates stay text: a list of the resolvers of its own
     yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag != f"{_TAG}timestamp"]
+        first: [pair for pair in resolvers if pair[0] != f"{_TAG}timestamp"]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
@@ -54,24 +52,24 @@ class _Loader(Composer, yaml.CSafeLoader):
         if isinstance(event, yaml.AliasEvent):
             node = super().compose_node(parent, index)
             if id(node) not in self._sizes:
-                raise _refusal(event, f"the alias *{event.anchor} stands within what it names")
+                problem = f"the alias *{event.anchor} stands within what it names"
+                raise _refusal(event, problem)
             return node
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            raise _refusal(
-                event, f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
-            )
+            problem = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
+            raise _refusal(event, problem)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
             _require_names(self, node)
-        self._sizes[id(node)] = size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
+        size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
+        self._sizes[id(node)] = size
         if size > MOST_VALUES:
             raise _refusal(
                 event,
-                f"it must hold at most {MOST_VALUES} values, aliases counted as what they"
-                " stand for",
+                f"it must hold at most {MOST_VALUES} values, aliases counted in full",
             )
         return node
 
@@ -79,15 +77,12 @@ class _Loader(Composer, yaml.CSafeLoader):
         """A number of bounded length."""
         text = self.construct_scalar(node)
         if len(text) > LONGEST_NUMBER:
-            raise _refusal(
-                node, f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}"
-            )
+            bound = f"at most {LONGEST_NUMBER} characters"
+            raise _refusal(node, f"a number must have {bound}, got {len(text)}")
         try:
-            return (
-                self.construct_yaml_int(node)
-                if node.tag == f"{_TAG}int"
-                else self.construct_yaml_float(node)
-            )
+            if node.tag == f"{_TAG}int":
+                return self.construct_yaml_int(node)
+            return self.construct_yaml_float(node)
         except ValueError:
             raise _refusal(
                 node, f"{text!r} is no number; put text that looks like one in quotes"
@@ -100,15 +95,15 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values,
-    and None.
+    """Content of a text in YAML: plain mappings with text as keys, lists and scalars.
 
     Raises:
         yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as
             objects, zero bytes, or a key twice.
     """
     if len(text) > LARGEST_TEXT:
-        raise yaml.YAMLError(f"it must have at most {LARGEST_TEXT} characters, got {len(text)}")
+        bound = f"at most {LARGEST_TEXT} characters"
+        raise yaml.YAMLError(f"it must have {bound}, got {len(text)}")
     loader = _Loader(text)
     try:
         return loader.get_single_data()
@@ -126,12 +121,9 @@ _PATTERN = re.compile(
 
 
 def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
-    """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an
-    alias.
-    """
-    lines = (
-        [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
-    )
+    """The error with its cure, where a pattern's star is taken for YAML's sign of an alias."""
+    is_clear = error.problem is None or error.problem.startswith("the alias")
+    lines = [] if is_clear else text.splitlines()
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
@@ -143,18 +135,17 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
             key = found["key"][:40]
             key = key if "[" in key and "]" in key else key.strip("[]")
             value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
-            return _refusal_at(mark, f'put the pattern in quotes: "{key}"{value}')
+            return _refusal(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3,
-    or would fold.
-    """
+    """PyYAML's dumper with quotes around text that `parse_yaml` would read as a number or fold."""
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Text; with escapes where it holds line ends or other characters that do not print."""
-        return self.represent_scalar(f"{_TAG}str", text, style=None if text.isprintable() else '"')
+        style = None if text.isprintable() else '"'
+        return self.represent_scalar(f"{_TAG}str", text, style)
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
@@ -162,24 +153,20 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
 
 
 def yaml_of(content: Any) -> str:
-    """Plain data as YAML that `parse_yaml` reads: mappings with text as keys, lists, text,
-    numbers and the like.
-    """
+    """Plain data as YAML that `parse_yaml` reads."""
     return yaml.dump(content, Dumper=_Dumper, allow_unicode=True, sort_keys=False)
 
 
 def yaml_line(name: str, value: Any, comment: str) -> str:
-    """An entry of a mapping with a comment behind it, on a line of its own; a long name takes two
-    lines.
+    """An entry of a mapping with a comment, on its own line; a long name takes two lines.
 
     Args:
         name: Key of the entry, any text that a file can hold.
         value: Plain data without a mapping or list in it that holds another one.
         comment: Its characters that do not print become spaces.
     """
-    flow = (
-        None if isinstance(value, dict | list) else False
-    )  # None: only what holds no mapping or list
+    # None: flow style for what holds no mapping or list
+    flow = None if isinstance(value, dict | list) else False
     text = yaml.dump(
         {name: value},
         Dumper=_Dumper,
@@ -209,20 +196,16 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
         if key.tag == f"{_TAG}merge":
             continue
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
-            what = (
-                repr(loader.construct_object(key))
-                if isinstance(key, yaml.ScalarNode)
-                else f"a {key.id}"
-            )
+            is_scalar = isinstance(key, yaml.ScalarNode)
+            what = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
             raise _refusal(
                 key,
                 f"the name of a parameter must be text, got {what}; put it in quotes if it is"
                 " meant",
             )
         if key.value in seen:
-            raise _refusal(
-                key, f"the key {key.value[:100]!r} stands twice in one mapping; keep one of them"
-            )
+            twice = f"the key {key.value[:100]!r} stands twice in one mapping"
+            raise _refusal(key, f"{twice}; keep one of them")
         seen.add(key.value)
 
 
@@ -234,9 +217,6 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
-    """An error that names the place."""
-    return _refusal_at(at.start_mark, problem)
-
-
-def _refusal_at(mark: Any, problem: str) -> yaml.MarkedYAMLError:
+    """An error that names the place, which is a node, an event or a mark."""
+    mark = getattr(at, "start_mark", at)
     return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)

@@ -24,7 +24,7 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 
 Axis = Literal["roll", "pitch", "yaw"]
 
-_RANGE_RAD: dict[Axis, float] = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
+_RANGE_RAD = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
 _ROUNDING_RAD = 1e-4  # the IMU sends 32 bits
 _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
@@ -116,7 +116,7 @@ class SharedSample:
         os.ftruncate(descriptor, _SIZE)
         return descriptor
 
-    def put(self, sample: Attitude) -> None:
+    def write(self, sample: Attitude) -> None:
         """Replace the sample."""
         counter = self._counter()
         _COUNTER.pack_into(self._memory, 0, counter + 1)
@@ -204,7 +204,8 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
                 measured it.
         """
         sample = self._shared.get()
-        if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
+        age_s = math.inf if sample is None else time.monotonic() - sample.time_s
+        if sample is None or is_outside(age_s, 0.0, self._oldest_s):
             raise self._silence(sample)
         problem = self._plausible.check(sample)
         if problem:

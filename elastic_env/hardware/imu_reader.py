@@ -25,7 +25,8 @@ def read(shared: SharedSample, port: str, baudrate: int) -> None:
         import mscl
     except ModuleNotFoundError:
         raise missing_extra("pymscl", "hardware", "reading the IMU") from None
-    prefer_realtime(Priority.IMU_READER, with_threads=True)  # the library reads in one of its own
+    # the library reads in a thread of its own
+    prefer_realtime(Priority.IMU_READER, with_threads=True)
     connection = mscl.Connection.Serial(port, baudrate)
     node = mscl.InertialNode(connection)
     begin = time.monotonic()
@@ -33,7 +34,7 @@ def read(shared: SharedSample, port: str, baudrate: int) -> None:
         for packet in node.getDataPackets(_WAIT_MS):
             sample = _attitude(packet)
             if sample is not None and sample.time_s > begin + _STALE_AT_FIRST_S:
-                shared.put(sample)
+                shared.write(sample)
     connection.disconnect()
 
 

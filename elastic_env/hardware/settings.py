@@ -2,7 +2,7 @@
 
 import math
 import os
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import model_validator
 
@@ -10,14 +10,8 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses.packets import HIGHEST_RATE, LARGEST_ID, LOWEST_RATE
 from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
 
-_PI = math.pi
 _TURN = 2.0 * math.pi
 _LEAST_RANGE_RAD = 0.01
-
-
-def _within(unit: str, default: float, least: float, most: float, description: str) -> Any:
-    """A quantity between two bounds; the calls below are a table."""
-    return quantity(unit, default, ge=least, le=most, description=description)
 
 
 class SafetyLimits(Model):
@@ -26,20 +20,26 @@ class SafetyLimits(Model):
     Angles as the servo has them.
     """
 
-    lowest_rad: float = _within("rad", -1.6, -_TURN, _TURN, "lowest goal")
-    highest_rad: float = _within("rad", 1.6, -_TURN, _TURN, "highest goal")
-    margin_rad: float = _within("rad", 0.05, 0, 0.5, "how far beyond that range a position may lie")
-    slew_rad_s: float = _within("rad/s", 3.0, 0.01, 10, "fastest change of the goal")
-    speed_rad_s: float = _within("rad/s", 4.5, 0.01, 10, "measured speed that stops the motion")
-    following_error_rad: float = _within(
-        "rad", 0.35, 1e-3, 1.5, "distance from the goal that stops it"
-    )
-    temperature_c: float = _within("°C", 80.0, 1, 80, "temperature above which the motion stops")
-    torque_nm: float = _within(
-        "N·m", LARGEST_TORQUE_NM, 0.1, LARGEST_TORQUE_NM, "torque, by the current, that stops it"
-    )
-    patience_cycles: int = _within("1", 3, 1, 10, "cycles without a reply, or too much torque")
-    hang_s: float = _within("s", 0.05, 0.005, 0.09, "time without a command that stops the motion")
+    lowest_rad: float = quantity("rad", -1.6, ge=-_TURN, le=_TURN)
+    """Lowest goal [rad]."""
+    highest_rad: float = quantity("rad", 1.6, ge=-_TURN, le=_TURN)
+    """Highest goal [rad]."""
+    margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5)
+    """How far beyond that range a position may lie [rad]."""
+    slew_rad_s: float = quantity("rad/s", 3.0, ge=0.01, le=10)
+    """Fastest change of the goal [rad/s]."""
+    speed_rad_s: float = quantity("rad/s", 4.5, ge=0.01, le=10)
+    """Measured speed that stops the motion [rad/s]."""
+    following_error_rad: float = quantity("rad", 0.35, ge=1e-3, le=1.5)
+    """Distance from the goal that stops it [rad]."""
+    temperature_c: float = quantity("°C", 80.0, ge=1, le=80)
+    """Temperature above which the motion stops [°C]."""
+    torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, ge=0.1, le=LARGEST_TORQUE_NM)
+    """Torque, by the current, that stops it [N·m]."""
+    patience_cycles: int = quantity("1", 3, ge=1, le=10)
+    """Cycles without a reply, or too much torque [1]."""
+    hang_s: float = quantity("s", 0.05, ge=0.005, le=0.09)
+    """Time without a command that stops the motion [s]."""
 
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
@@ -59,39 +59,39 @@ class HardwareSettings(Model):
 
     port: str
     """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
-    servo_id: int = _within("1", 1, 0, LARGEST_ID, "id of the servo")
-    baudrate: int = _within(
-        "bit/s", 3_000_000, LOWEST_RATE, HIGHEST_RATE, "rate of the servo's bus"
-    )
+    servo_id: int = quantity("1", 1, ge=0, le=LARGEST_ID)
+    """Id of the servo [1]."""
+    baudrate: int = quantity("bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    """Rate of the servo's bus [bit/s]."""
     direction: Literal[1, -1] = 1
     """Sign of the joint angle against the servo's."""
-    zero_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI)
+    zero_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
     """Servo angle where the pendulum hangs [rad]."""
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
-    imu_baudrate: int = _within(
-        "bit/s", 115_200, LOWEST_RATE, HIGHEST_RATE, "rate of the IMU's port"
-    )
-    imu_oldest_s: float = _within("s", 0.05, 0.01, 1, "age at which an attitude counts as missing")
+    imu_baudrate: int = quantity("bit/s", 115_200, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    """Rate of the IMU's port [bit/s]."""
+    imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1)
+    """Age at which an attitude counts as missing [s]."""
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
-    imu_offset_rad: float = quantity("rad", 0.0, gt=-_PI, lt=_PI)
-    """What it shows where q is 0 [rad]."""
-    largest_deflection_rad: float = _within("rad", 0.2, 1e-3, 1, "bend that stops it, by the IMU")
-    approach_rad_s: float = _within(
-        "rad/s", 0.2, 0.01, 2, "peak speed to the start and back to rest"
-    )
+    imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
+    """Euler angle that it shows at q = 0 [rad]."""
+    largest_deflection_rad: float = quantity("rad", 0.2, ge=1e-3, le=1)
+    """Bend that stops it, by the IMU [rad]."""
+    approach_rad_s: float = quantity("rad/s", 0.2, ge=0.01, le=2)
+    """Peak speed to the start and back to rest [rad/s]."""
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()
 
     @model_validator(mode="after")
     def _ports_differ(self) -> Self:
-        if self.imu_port is not None and os.path.realpath(self.imu_port) == os.path.realpath(
-            self.port
-        ):
+        named = (self.port, self.imu_port)
+        ports = [os.path.realpath(port) for port in named if port is not None]
+        if len(set(ports)) < len(ports):
             raise ValueError(
                 f"servo and IMU each have a port of their own, got {self.port} for both"
             )
@@ -123,4 +123,5 @@ class HardwareSettings(Model):
         return self.limits.replace(lowest_rad=low, highest_rad=high)
 
     def _servo_range(self) -> list[float]:
-        return sorted(map(self.servo_angle, (self.limits.lowest_rad, self.limits.highest_rad)))
+        ends = (self.limits.lowest_rad, self.limits.highest_rad)
+        return sorted(map(self.servo_angle, ends))

@@ -1,3 +1,1 @@
-"""The elastic joint: its formulas, its servo, and the transform that makes the hinges of a rigid
-model elastic.
-"""
+"""The elastic joint: its formulas, its servo, and the transform of rigid hinges."""

@@ -1,5 +1,4 @@
-"""The actuator of the paper, Dynamixel PRO H54-200-S500-R, as an elastic joint, with the source of
-every number.
+"""The paper's actuator, Dynamixel PRO H54-200-S500-R, with the source of every number.
 
 | parameter | value | source |
 |---|---|---|

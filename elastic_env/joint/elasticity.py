@@ -54,12 +54,11 @@ class Servo(Model):
 
     @property
     def integral_limit(self) -> float:
-        """Largest magnitude of the integral of the position error [rad·s]; 0 without an
-        integrator.
-        """
+        """Largest magnitude of the position error's integral [rad·s]; 0 without one."""
         if self.integral_gain == 0.0:
             return 0.0
-        return (self.torque_limit + self.velocity_gain * self.speed_limit) / self.integral_gain
+        most = self.torque_limit + self.velocity_gain * self.speed_limit
+        return most / self.integral_gain
 
 
 class ElasticJoint(Model):
@@ -117,15 +116,13 @@ def joint_torque(
         τ_J, (..., n) [N·m]; positive drives the link forward.
     """
     if np.any(backlash):
-        deflection = np.sign(deflection) * np.maximum(
-            np.abs(deflection) - np.asarray(backlash) / 2.0, 0.0
-        )
+        wound = np.maximum(np.abs(deflection) - np.asarray(backlash) / 2.0, 0.0)
+        deflection = np.sign(deflection) * wound
     return stiffness * deflection + damping * deflection_rate
 
 
 def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter = 0.0) -> Array:
-    r"""Deflection at rest under a joint torque, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band
-    towards the load.
+    r"""Deflection at rest, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band towards the load.
 
     Args:
         torque: τ_J, (..., n) [N·m]; at rest the gravity torque.
@@ -136,11 +133,9 @@ def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter =
         δ = θ − q, (..., n) [rad]; positive where the motor side leads.
     """
     wound = torque / stiffness
-    return (
-        wound
-        if isinstance(backlash, float) and backlash == 0.0
-        else wound + np.sign(torque) * backlash / 2.0
-    )
+    if isinstance(backlash, float) and backlash == 0.0:
+        return wound
+    return wound + np.sign(torque) * backlash / 2.0
 
 
 def static_link_angle(
@@ -152,8 +147,7 @@ def static_link_angle(
     max_iterations: int = 50,
     unique: bool = True,
 ) -> Array:
-    r"""Link angle at rest for a motor angle: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q =
-    θ.
+    r"""Link angle at rest: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q = θ.
 
     Where the load bends a spring far, Newton's steps may fail or end at another equilibrium. There
     the load grows from zero, see `follow_load`.
@@ -182,19 +176,21 @@ def static_link_angle(
     residual = np.full_like(q, np.inf)
     for iteration in range(max_iterations):
         residual = K * (q - theta) + torque(q)
-        open_rows = open_rows & np.any(np.abs(residual) > tolerance * K, axis=-1, keepdims=True)
+        is_off = np.abs(residual) > tolerance * K
+        open_rows = open_rows & is_off.any(axis=-1, keepdims=True)
         if iteration and not open_rows.any():
             break
         # rows that are done stay, so that a row does not depend on the rest of its batch
         gradient = torque_gradient(q) / K[..., None]
         step, is_singular = _solved(gradient, residual / K)
-        is_lost = is_singular | ~(np.abs(step) < _LARGEST_STEP_RAD).all(axis=-1, keepdims=True)
-        is_soft = (
-            is_soft | ((open_rows | (iteration == 0)) & _may_fold(gradient)) | (open_rows & is_lost)
-        )
+        is_short = np.abs(step) < _LARGEST_STEP_RAD
+        is_lost = is_singular | ~is_short.all(axis=-1, keepdims=True)
+        may_fold = (open_rows | (iteration == 0)) & _may_fold(gradient)
+        is_soft = is_soft | may_fold | (open_rows & is_lost)
         open_rows = open_rows & ~is_lost
         q = np.where(open_rows, q - step, q)
-    is_soft = is_soft | open_rows | (np.abs(q - theta).max(axis=-1, keepdims=True) > _FAR_RAD)
+    is_far = np.abs(q - theta).max(axis=-1, keepdims=True) > _FAR_RAD
+    is_soft = is_soft | open_rows | is_far
     if not is_soft.any():
         return q
     found = follow_load(
@@ -226,7 +222,8 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
             stable.
     """
     # every row by its own stiffness: the size of K says nothing about singularity
-    solution, is_singular = _solved(torque_gradient / stiffness[..., None], torque / stiffness)
+    relative_gradient = torque_gradient / stiffness[..., None]
+    solution, is_singular = _solved(relative_gradient, torque / stiffness)
     if is_singular.any():
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness (smallest K"
@@ -254,18 +251,18 @@ def _solved(relative_gradient: Array, right: Array) -> tuple[Array, BoolArray]:
         solution = np.linalg.solve(matrix, right[..., None])[..., 0]
     except np.linalg.LinAlgError:
         is_zero = np.linalg.det(matrix)[..., None] == 0.0
-        solution = np.linalg.solve(
-            np.where(is_zero[..., None], np.eye(n), matrix), right[..., None]
-        )[..., 0]
+        regular = np.where(is_zero[..., None], np.eye(n), matrix)
+        solution = np.linalg.solve(regular, right[..., None])[..., 0]
         solution = np.where(is_zero, np.inf, solution)
     is_large: BoolArray = ~np.all(np.abs(solution) < np.pi, axis=-1, keepdims=True)
     if not is_large.any():
         return solution, is_large
     # no deflection: worth a closer look
-    is_singular: BoolArray = is_large & (np.abs(np.linalg.det(matrix))[..., None] < _SINGULAR)
-    return solution, is_singular
+    determinant = np.abs(np.linalg.det(matrix))[..., None]
+    return solution, is_large & (determinant < _SINGULAR)
 
 
 def _may_fold(relative_gradient: Array) -> BoolArray:
     """Rows whose load may overcome a spring: K⁻¹ ∂τ_g/∂q is not smaller than 1, (..., 1)."""
-    return np.asarray(np.abs(relative_gradient).sum(axis=-1).max(axis=-1, keepdims=True) >= 1.0)
+    row_sums = np.abs(relative_gradient).sum(axis=-1)
+    return np.asarray(row_sums.max(axis=-1, keepdims=True) >= 1.0)

@@ -1,6 +1,4 @@
-"""Names that an elastic joint gives to its parts, and where its angles stand in a compiled
-model.
-"""
+"""Names that an elastic joint gives to its parts, and addresses of its angles in a model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,14 +24,9 @@ def servo_name(joint: str) -> str:
     return f"{joint}_servo"
 
 
-def link_name(joint: str) -> str:
-    """Name of the tendon whose length is q in the series form."""
-    return f"{joint}_link"
-
-
 @dataclass(frozen=True)
 class JointAddresses:
-    """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""
+    """Indices of motor and link angles of the elastic joints in `qpos` and `qvel`, each (n,)."""
 
     theta: IntArray
     q: IntArray
@@ -45,9 +38,8 @@ class JointAddresses:
         """Look the joints up by name, in a model of the tendon or the rigid form."""
         link = [model.joint(name) for name in joints]
         known = {model.joint(i).name for i in range(model.njnt)}
-        motor = [
-            model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints
-        ]
+        rotors = [motor_name(n) if motor_name(n) in known else n for n in joints]
+        motor = [model.joint(name) for name in rotors]
         return cls(
             theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
             q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),

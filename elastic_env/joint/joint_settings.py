@@ -1,5 +1,4 @@
-"""What people say of elastic joints, in a file of YAML or in a mapping: K, servo, friction, `held`,
-by name or pattern.
+"""Settings of elastic joints by name or pattern, in YAML or a mapping: K, servo, friction.
 
 This is the only reader of such files. `elastic_env/Robot-v0` and `baselines.PositionCompensator`
 take what it returns, so that a file means the same to both.
@@ -33,11 +32,11 @@ CURE = (
     " poses and writes a file for `joints`; `elastic identify --robot MODEL --plan 20` proposes"
     " poses"
 )
-"""Where a stiffness comes from, for errors."""
+"""Source of a stiffness, for errors."""
 
 
 class ServoSettings(Model):
-    """What is known of a servo; the rest comes from the model's actuator, or from defaults.
+    """Known values of a servo; the rest comes from the model's actuator, or from defaults.
 
     A position gain without an integral gain is a servo that gives way under a load. A servo of
     which neither is said, and that the model has not either, holds its angle.
@@ -84,8 +83,7 @@ class ServoSettings(Model):
         return found.replace(**said)
 
     def sagging_gain(self, joint: str) -> float:
-        """k_p of a servo that gives way under a load, infinite for one that holds its angle
-        [N·m/rad].
+        """k_p of a servo that gives way under a load; infinite for one that holds [N·m/rad].
 
         Args:
             joint: Whose servo it is, for the error.
@@ -106,7 +104,7 @@ class ServoSettings(Model):
 
 
 class JointSettings(Model):
-    """What is known of a joint; all but K has a default."""
+    """Known values of a joint; all but K has a default."""
 
     stiffness: float = quantity("N·m/rad", gt=0, allow_inf_nan=True)
     """K, stiffness of the transmission, without a default; infinite for a rigid joint [N·m/rad]."""
@@ -136,7 +134,7 @@ class JointSettings(Model):
 
     @property
     def is_rigid(self) -> bool:
-        """Whether it has no spring."""
+        """True if it has no spring."""
         return bool(np.isinf(self.stiffness))
 
 
@@ -171,9 +169,7 @@ def read_joints(
 
 
 def key_of(mapping: Iterable[str], name: str) -> str | None:
-    """The key that stands for a joint: its name, else the last pattern that fits it; None where
-    none does.
-    """
+    """The key for a joint: its name, else the last pattern that fits, or None."""
     fitting = [key for key in mapping if isinstance(key, str) and _fits(name, key)]
     return name if name in fitting else next(reversed(fitting), None)
 

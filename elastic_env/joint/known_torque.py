@@ -1,5 +1,4 @@
-"""The one judgement of what a compensator can know of a model: which joints move, and what else
-acts on them.
+"""Judgement of a model for compensators: which joints move, and what else acts on them.
 
 Everything that a model has is either part of the torque at rest, held, or refused with its name.
 """
@@ -21,15 +20,14 @@ cube.
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
-_WRAP_JOINT, _WRAP_SITE, _WRAP_SPHERE, _WRAP_CYLINDER = (
-    int(getattr(mujoco.mjtWrap, f"mjWRAP_{kind}"))
-    for kind in ("JOINT", "SITE", "SPHERE", "CYLINDER")
-)
+_WRAP_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
+_WRAP_SITE = int(mujoco.mjtWrap.mjWRAP_SITE)
+_WRAP_GEOMS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
 _EQ_JOINT = int(mujoco.mjtEq.mjEQ_JOINT)
 _EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
-_TENDON, _SITE, _SLIDERCRANK = (
-    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("TENDON", "SITE", "SLIDERCRANK")
-)
+_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
+_SITE = int(mujoco.mjtTrn.mjTRN_SITE)
+_SLIDERCRANK = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
 _FLAGS = {
     int(mujoco.mjtDisableBit.mjDSBL_GRAVITY): "gravity",
     int(mujoco.mjtDisableBit.mjDSBL_SPRING): "spring",
@@ -47,7 +45,7 @@ def hinges_of(model: mujoco.MjModel) -> list[str]:
 
 
 def has_nameless_hinge(model: mujoco.MjModel) -> bool:
-    """Whether a hinge has no name, by which its stiffness could be given."""
+    """True if a hinge has no name, by which its stiffness could be given."""
     return any(not model.joint(j).name for j in _hinges(model))
 
 
@@ -81,23 +79,23 @@ def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list
 def without_fingers(
     model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]
 ) -> list[str]:
-    """The joints without the fingers that the model couples and that nobody names; arguments as
-    `commanded_hinges`.
+    """The joints without the fingers that the model couples and that nobody names.
+
+    Arguments as in `commanded_hinges`.
     """
     joints = list(joints)
-    fingers = [name for name in coupled_fingers(model) if name in joints and name not in named]
+    coupled = [name for name in coupled_fingers(model) if name not in named]
+    fingers = [name for name in coupled if name in joints]
     if fingers:
         warnings.warn(
-            f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints"
-            " are elastic",
+            f"{_listed(fingers)} are coupled in the model (mimic), and are held, unlike all others",
             stacklevel=5,
         )
     return [name for name in joints if name not in fingers]
 
 
 def coupled_fingers(model: mujoco.MjModel) -> list[str]:
-    """Hinges of grippers whose fingers follow one another: joints that equalities couple, side by
-    side at the end.
+    """Hinges of fingers that follow one another: coupled by equalities, side by side at the end.
 
     Two fingers are on different branches, and carry no other joint. Coupled joints within the arm
     are none.
@@ -107,9 +105,11 @@ def coupled_fingers(model: mujoco.MjModel) -> list[str]:
         if model.eq_type[e] == _EQ_JOINT and model.eq_obj2id[e] >= 0:
             pair = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}
             joined = [group for group in groups if group & pair]
-            groups = [group for group in groups if not group & pair] + [pair.union(*joined)]
+            apart = [group for group in groups if not group & pair]
+            groups = [*apart, pair.union(*joined)]
     fingers = [j for group in groups if _is_gripper(model, group) for j in group]
-    return [model.joint(j).name for j in _hinges(model) if j in fingers and model.joint(j).name]
+    names = [model.joint(j).name for j in _hinges(model) if j in fingers]
+    return [name for name in names if name]
 
 
 def home_of(model: mujoco.MjModel) -> Array:
@@ -169,11 +169,11 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     ids = _ids_of(model, joints)
     _require_flags(model)
     for e in _active(model):
-        acts = _acted_on(model, e)
+        acts, ends = _equality(model, e)
         if acts & ids:
             raise ConfigurationError(
-                f"the model has an equality constraint of {_ends_of(model, e)}, whose torque is not"
-                f" known in advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
+                f"the model has an equality constraint of {ends}, whose torque is not known in"
+                f" advance; take it out of the model{_or_hold(model, acts & ids, ids)}"
             )
     for t in range(model.ntendon):
         if _pulls(model, t) and (acts := _joints_of_tendon(model, t) & ids):
@@ -225,25 +225,26 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
 def _require_flags(model: mujoco.MjModel) -> None:
     for bit, flag in _FLAGS.items():
         if int(model.opt.disableflags) & bit:
+            cure = "take the flag out"
+            if flag == "gravity":
+                cure += "; for no gravity write gravity='0 0 0'"
             raise ConfigurationError(
-                f'the model has <flag {flag}="disable"/> in <option>, with which its joints do not'
-                " bend as they do on a robot; take the flag out"
-                + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
+                f'the model has <flag {flag}="disable"/> in <option>, with which its'
+                f" joints do not bend as they do on a robot; {cure}"
             )
+    unknown = "are not known in advance; take it out"
     if model.nflex:
         raise ConfigurationError(
-            "the model has a deformable body (flex), whose forces on the links are not known in"
-            " advance; take it out"
+            f"the model has a deformable body (flex), whose forces on the links {unknown}"
         )
     if (model.body_plugin >= 0).any() or (model.actuator_plugin >= 0).any():
         raise ConfigurationError(
-            "the model has a plugin of a body or an actuator, whose forces are not known in"
-            " advance; take it out"
+            f"the model has a plugin of a body or an actuator, whose forces {unknown}"
         )
-    if model.opt.wind.any() and (model.opt.density > 0.0 or model.opt.viscosity > 0.0):
+    is_fluid = model.opt.density > 0.0 or model.opt.viscosity > 0.0
+    if model.opt.wind.any() and is_fluid:
         raise ConfigurationError(
-            "the model has wind, whose force on the links is not compensated; take `wind` out of"
-            " <option>"
+            "the model has wind, whose force on the links is not compensated; take `wind` out"
         )
 
 
@@ -253,31 +254,27 @@ def _active(model: mujoco.MjModel) -> Iterator[int]:
         yield from (e for e in range(model.neq) if model.eq_active0[e])
 
 
-def _acted_on(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Joints that feel an equality constraint."""
+def _equality(model: mujoco.MjModel, equality: int) -> tuple[set[int], str]:
+    """Joints that feel an equality constraint, and the names of what it couples."""
     kind = int(model.eq_type[equality])
-    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
+    both = (model.eq_obj1id[equality], model.eq_obj2id[equality])
+    ends = [int(i) for i in both if i >= 0]
     if kind == _EQ_JOINT:
-        return set(ends)
-    if kind == _EQ_TENDON:
-        return set().union(*(_joints_of_tendon(model, t) for t in ends))
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-        return _between(model, [int(model.site_bodyid[site]) for site in ends])
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
-        return _between(model, [*ends, 0][:2])
-    return set(range(model.njnt))
-
-
-def _ends_of(model: mujoco.MjModel, equality: int) -> str:
-    kind = int(model.eq_type[equality])
-    of = model.eq_objtype[equality]
-    read = model.joint if kind == _EQ_JOINT else model.tendon if kind == _EQ_TENDON else model.body
-    if of == mujoco.mjtObj.mjOBJ_SITE:
-        read = model.site
-    elif kind not in (_EQ_JOINT, _EQ_TENDON) and of != mujoco.mjtObj.mjOBJ_BODY:
-        return "a deformable body"
-    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
-    return " and ".join(quote(read(i).name)[1:-1] or f"number {i}" for i in ends)
+        acts = set(ends)
+        element = model.joint
+    elif kind == _EQ_TENDON:
+        acts = set().union(*(_joints_of_tendon(model, t) for t in ends))
+        element = model.tendon
+    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        acts = _between(model, [int(model.site_bodyid[site]) for site in ends])
+        element = model.site
+    elif model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
+        acts = _between(model, [*ends, 0][:2])
+        element = model.body
+    else:
+        return set(range(model.njnt)), "a deformable body"
+    names = [quote(element(i).name)[1:-1] or f"number {i}" for i in ends]
+    return acts, " and ".join(names)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> set[int]:
@@ -300,20 +297,16 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     """Joints with which the length of a tendon changes."""
     joints: set[int] = set()
     bodies: list[int] = []
-    of_body = {
-        _WRAP_SITE: model.site_bodyid,
-        _WRAP_SPHERE: model.geom_bodyid,
-        _WRAP_CYLINDER: model.geom_bodyid,
-    }
-    for at in range(
-        int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon])
-    ):
+    first = int(model.tendon_adr[tendon])
+    for at in range(first, first + int(model.tendon_num[tendon])):
         kind = int(model.wrap_type[at])
         one = int(model.wrap_objid[at])
         if kind == _WRAP_JOINT:
             joints.add(one)
-        elif kind in of_body:
-            bodies.append(int(of_body[kind][one]))
+        elif kind == _WRAP_SITE:
+            bodies.append(int(model.site_bodyid[one]))
+        elif kind in _WRAP_GEOMS:
+            bodies.append(int(model.geom_bodyid[one]))
     return joints | _between(model, bodies)
 
 
@@ -335,9 +328,9 @@ def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
     if kind == _TENDON:
         return _joints_of_tendon(model, first)
     if kind in (_SITE, _SLIDERCRANK):
-        return _between(
-            model, [int(model.site_bodyid[site]) if site >= 0 else 0 for site in (first, second)]
-        )
+        sites = [site for site in (first, second) if site >= 0]
+        bodies = [int(model.site_bodyid[site]) for site in sites]
+        return _between(model, [*bodies, 0][:2])
     return set()
 
 
@@ -364,12 +357,12 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
-    """Whether coupled joints are fingers: on two branches at least, and with no other joint
-    beyond them.
-    """
-    bodies = {int(model.jnt_bodyid[j]) for j in group}
-    carried = {j for j in range(model.njnt) if _chain(model, int(model.jnt_bodyid[j])) & group}
-    first = [body for body in bodies if not _chain(model, int(model.body_parentid[body])) & group]
+    """True if coupled joints are fingers: on two branches or more, with no joint beyond them."""
+    body_of = model.jnt_bodyid.tolist()
+    parent_of = model.body_parentid.tolist()
+    bodies = {body_of[j] for j in group}
+    carried = {j for j in range(model.njnt) if _chain(model, body_of[j]) & group}
+    first = [body for body in bodies if not _chain(model, parent_of[body]) & group]
     return carried <= group and len(first) > 1 and len(group) < model.njnt
 
 
@@ -392,8 +385,7 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         scaled = links / np.outer(scale, scale)
         if not np.isfinite(scaled).all():
             raise ConfigurationError(
-                "the masses and inertias of the model are too large to compute with; see their"
-                " units"
+                "the masses and inertias of the model are too large; see their units"
             )
         values, vectors = np.linalg.eigh(scaled)
         smallest.append((values[0], vectors[:, 0]))
@@ -402,6 +394,5 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         names = " and ".join(joints[int(i)] for i in np.argsort(-np.abs(vector))[:2])
         raise ConfigurationError(
             f"the links that {names} move have no inertia of their own, or two joints have one"
-            " axis; give each link between two joints its mass and inertia, and each joint its own"
-            " axis"
+            " axis; give each link its mass and inertia, and each joint its own axis"
         )

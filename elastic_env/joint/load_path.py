@@ -57,7 +57,9 @@ class LoadPath:
         row = tuple(np.argwhere(self.lost[..., 0])[0])
         joint = int(self.joint[row])
         K = 1.0 / float(np.broadcast_to(compliance, self.q.shape)[(*row, joint)])
-        name = f"joint {joint + 1} of {self.q.shape[-1]}" if names is None else names[joint]
+        name = f"joint {joint + 1} of {self.q.shape[-1]}"
+        if names is not None:
+            name = names[joint]
         question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
         if self.load[row] < 1.0:
             return (
@@ -98,9 +100,8 @@ def follow_load(
         unique: Whether to look for other equilibria.
         finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
     """
-    springs = _Springs(
-        theta, np.broadcast_to(compliance, theta.shape), torque, torque_gradient, tolerance
-    )
+    C = np.broadcast_to(compliance, theta.shape)
+    springs = _Springs(theta, C, torque, torque_gradient, tolerance)
     is_open = np.ones((*theta.shape[:-1], 1), dtype=np.bool_) if rows is None else rows
     q = theta
     load = np.where(is_open, 0.0, 1.0)
@@ -124,7 +125,8 @@ def follow_load(
     if lost.any():
         joint = springs.softest(q, load)
     elif unique:
-        joint, other = springs.others(q, np.ones_like(lost) if rows is None else rows, within)
+        rows = np.ones_like(lost) if rows is None else rows
+        joint, other = springs.others(q, rows, within)
         lost = ~np.isnan(other)[..., None]
     return LoadPath(q, load, joint, other, lost)
 
@@ -140,9 +142,7 @@ class _Springs:
     tolerance: float
 
     def settle(self, start: Array, load: Array, rows: BoolArray) -> tuple[Array, BoolArray]:
-        """Equilibria under shares of the load by Newton's steps, and which rows have a stable
-        one near the start.
-        """
+        """Equilibria under shares of the load by Newton's steps; rows with a stable one near."""
         C = load * self.compliance
         q = start
         is_good = rows
@@ -150,16 +150,16 @@ class _Springs:
         for _ in range(_MOST_NEWTON_STEPS):
             residual = q - self.theta + C * self.torque(q)
             matrix = self._matrix(q, C, is_good)
-            is_good = is_good & (
-                np.real(np.linalg.eigvals(matrix)).min(axis=-1, keepdims=True) > 0.0
-            )
+            eigenvalues = np.real(np.linalg.eigvals(matrix))
+            is_good = is_good & (eigenvalues.min(axis=-1, keepdims=True) > 0.0)
             size = self.tolerance * (1.0 + np.abs(q).max(axis=-1, keepdims=True))
             is_done = is_done | (np.abs(residual).max(axis=-1, keepdims=True) <= size)
             moves = is_good & ~is_done
             if not moves.any():
                 break
             matrix = np.where(moves[..., None], matrix, np.eye(q.shape[-1]))
-            q = np.where(moves, q - np.linalg.solve(matrix, residual[..., None])[..., 0], q)
+            step = np.linalg.solve(matrix, residual[..., None])[..., 0]
+            q = np.where(moves, q - step, q)
             is_near = np.abs(q - start).max(axis=-1, keepdims=True) <= _FARTHEST_RAD
             q = np.where(is_near, q, start)
             is_good = is_good & is_near
@@ -167,19 +167,22 @@ class _Springs:
 
     def softest(self, q: Array, load: Array) -> IntArray:
         """Joint that moves most in the direction that gives way most easily, (...)."""
-        matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
+        rows = np.ones_like(load, dtype=np.bool_)
+        matrix = self._matrix(q, load * self.compliance, rows)
         values, vectors = np.linalg.eig(matrix)
         least = np.real(values).argmin(axis=-1)[..., None, None]
-        return np.abs(np.take_along_axis(vectors, least, axis=-1)[..., 0]).argmax(axis=-1)
+        softest = np.take_along_axis(vectors, least, axis=-1)[..., 0]
+        return np.abs(softest).argmax(axis=-1)
 
     def others(
         self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None
     ) -> tuple[IntArray, Array]:
-        """Joints that can rest elsewhere, and where, nan for none: found along each joint alone,
-        then of all joints.
+        """Joints that can rest elsewhere, and where, nan for none.
+
+        They are found along each joint alone, then of all joints.
         """
         n = q.shape[-1]
-        lowest, highest = (np.full(n, -np.inf), np.full(n, np.inf)) if within is None else within
+        lowest, highest = within or (np.full(n, -np.inf), np.full(n, np.inf))
         other = np.full(q.shape[:-1], np.nan)
         joint = np.zeros(q.shape[:-1], dtype=np.int64)
         whole = np.ones_like(rows, dtype=np.float64)
@@ -191,46 +194,37 @@ class _Springs:
                 begin = q.copy()
                 begin[..., i] = np.where(is_new[..., 0], start, q[..., i])
                 found, is_stable = self.settle(begin, whole, is_new)
-                is_other = (
-                    is_new
-                    & is_stable
-                    & (np.abs(found - q).max(axis=-1, keepdims=True) > _OTHER_RAD)
-                )
-                is_other = is_other & (np.abs(found - self.theta) <= _WOUND_RAD).all(
-                    axis=-1, keepdims=True
-                )
-                is_other = is_other & ((found >= lowest) & (found <= highest)).all(
-                    axis=-1, keepdims=True
-                )
+                is_apart = (np.abs(found - q) > _OTHER_RAD).any(axis=-1, keepdims=True)
+                is_allowed = np.abs(found - self.theta) <= _WOUND_RAD
+                is_allowed = is_allowed & (found >= lowest) & (found <= highest)
+                is_allowed = is_allowed.all(axis=-1, keepdims=True)
+                is_other = is_new & is_stable & is_apart & is_allowed
                 other = np.where(is_other[..., 0], found[..., i], other)
                 joint = np.where(is_other[..., 0], i, joint)
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:
-        """Angles of joint i at which its spring and its load balance stably while the others
-        stay, nan for none.
-        """
+        """Angles of joint i at which spring and load balance while the others stay, or nan."""
         moved = q.copy()
         values = []
-        angles = self.theta[..., i] + np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS).reshape(
-            -1, *[1] * (q.ndim - 1)
-        )
+        scan = np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS)
+        angles = self.theta[..., i] + scan.reshape(-1, *[1] * (q.ndim - 1))
         for angle in angles:
             moved[..., i] = angle
-            values.append((moved - self.theta + self.compliance * self.torque(moved))[..., i])
+            balance = moved - self.theta + self.compliance * self.torque(moved)
+            values.append(balance[..., i])
         starts = []
         for (left, low), (right, high) in pairwise(zip(angles, values, strict=True)):
             is_crossed = (low < 0.0) & (high >= 0.0)
             if is_crossed.any():
-                share = np.where(is_crossed, low / np.where(is_crossed, low - high, 1.0), 0.0)
-                starts.append(np.where(is_crossed, left + share * (right - left), np.nan))
+                change = np.where(is_crossed, low - high, 1.0)
+                share = np.where(is_crossed, low / change, 0.0)
+                start = left + share * (right - left)
+                starts.append(np.where(is_crossed, start, np.nan))
         return starts
 
     def _matrix(self, q: Array, C: Array, rows: BoolArray) -> Array:
         """1 + C ∂τ/∂q of some rows, (..., n, n), and 1 of the others."""
         own = np.eye(q.shape[-1]) + C[..., None] * self.torque_gradient(q)
-        return np.where(
-            rows[..., None] & np.isfinite(own).all(axis=(-2, -1), keepdims=True),
-            own,
-            np.eye(q.shape[-1]),
-        )
+        is_finite = np.isfinite(own).all(axis=(-2, -1), keepdims=True)
+        return np.where(rows[..., None] & is_finite, own, np.eye(q.shape[-1]))

@@ -1,13 +1,11 @@
 """Turn rigid hinges of any MuJoCo specification into elastic joints.
 
-Three forms of the same joint:
+Two forms of the same joint:
 
 * `tendon` (default): the rotor is a hinge `<joint>_motor` of its own with armature B, and a fixed
   tendon `<joint>_spring` of length θ − q couples it to the link's hinge: K, D, and backlash as the
   spring's dead band. The link's hinge keeps its name, axis, limits and everything that refers to
   it.
-* `series`: two collinear hinges on the link's body, θ = `<joint>_motor` and q − θ = `<joint>`; the
-  link angle is the length of the tendon `<joint>_link`. Slower; kept for checking the tendon form.
 * `rigid`: no spring; the rotor's inertia is the hinge's armature.
 
 Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
@@ -24,21 +22,21 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
 from elastic_env.joint.known_torque import require_few
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 
-Form = Literal["tendon", "series", "rigid"]
+Form = Literal["tendon", "rigid"]
 ActuatorRule = Literal["keep", "replace"]
 
+_HINGE = mujoco.mjtJoint.mjJNT_HINGE
 _JOINT = mujoco.mjtTrn.mjTRN_JOINT
 _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-_ROTOR_MASS = (
-    1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
-)
+# MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+_ROTOR_MASS = 1e-12
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -75,7 +73,7 @@ def make_elastic(
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
             `read_model`. It is not changed. Set its physics step before.
         joints: Parameters by hinge name.
-        form: "tendon", "series" or "rigid", see the module.
+        form: "tendon" or "rigid", see the module.
         actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where
             there is none; "replace" deletes them and adds the servo.
 
@@ -84,29 +82,28 @@ def make_elastic(
 
     Raises:
         ConfigurationError: The model cannot be read or compiled; unknown form or hinge, a joint
-            that is no hinge, a name that is already taken, or parameters that the series form
-            cannot represent. Or `implicitfast` does not follow the joints either at the physics
-            step of the model; the message names the largest step at which it does.
+            that is no hinge, or a name that is already taken. Or `implicitfast` does not follow the
+            joints either at the physics step of the model; the message names the largest step at
+            which it does.
 
     Warns:
         UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its
             actuators.
     """
     require_few(joints)
-    elastic = transformed(read_model(spec).spec, joints, form, actuators)
+    elastic = transform_hinges(read_model(spec).spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
     return elastic
 
 
-def transformed(
+def transform_hinges(
     spec: mujoco.MjSpec,
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
 ) -> mujoco.MjSpec:
-    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at
-    their stability then.
+    """`make_elastic` without a look at stability, for a caller that sets the physics step later.
 
     The integrator and the automatic reset are those of the given specification.
     """
@@ -122,16 +119,15 @@ def transformed(
 
 
 def _choose_integrator(spec: mujoco.MjSpec) -> None:
-    """Let the integrator be `implicitfast` where the model's own does not follow the joints;
-    refuse if neither does.
+    """Take `implicitfast` where the model's own integrator does not follow the joints.
+
+    Refuse the model if neither does.
     """
     model = compiled_spec(spec, "the elastic model")
     if is_stable(model):
         return
-    tried = [mujoco.mjtIntegrator(model.opt.integrator), _IMPLICITFAST]
-    names = " and ".join(
-        dict.fromkeys(integrator.name.removeprefix("mjINT_") for integrator in tried)
-    )
+    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    names = " and ".join(dict.fromkeys((own, "IMPLICITFAST")))
     step = f"at a physics step of {model.opt.timestep:g} s"
     model.opt.integrator = _IMPLICITFAST
     if not is_stable(model):
@@ -142,16 +138,14 @@ def _choose_integrator(spec: mujoco.MjSpec) -> None:
         )
     spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with {tried[0].name.removeprefix('mjINT_')} {step}; the"
-        " elastic model has the integrator IMPLICITFAST, which follows them",
+        f"the elastic joints explode with {own} {step}; the elastic model has the integrator"
+        " IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 
 
 def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
-    """Write out springs that are given as time constants: they follow from inertias that the
-    transform changes.
-    """
+    """Write out springs that are given as time constants, which depend on the inertias."""
     given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
     if given:
         model = compiled_spec(spec, "the specification")
@@ -163,15 +157,11 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
 
 
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
-    hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
+    hinges = [joint.name for joint in spec.joints if joint.type == _HINGE and joint.name]
     require_known("hinge", [name], hinges)
-    taken = (
-        {j.name for j in spec.joints}
-        | {t.name for t in spec.tendons}
-        | {a.name for a in spec.actuators}
-    )
-    taken |= {motor_name(name)} & {b.name for b in spec.bodies}
-    for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):
+    taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
+    taken |= {motor_name(name)} & {body.name for body in spec.bodies}
+    for derived in (motor_name(name), spring_name(name), servo_name(name)):
         if derived in taken:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"
@@ -183,17 +173,14 @@ def _transform(
     spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint, form: Form, rule: ActuatorRule
 ) -> None:
     name = hinge.name
-    driven = name if form == "rigid" else motor_name(name)
+    driven = name
+    hinge.armature = joint.rotor_inertia
     if form == "tendon":
-        _add_rotor(hinge, joint, _rotor_body(spec, hinge))
-        _add_spring(spec, name, joint)
-        _add_friction(hinge, joint)
+        driven = motor_name(name)
         hinge.armature = 0.0
-    elif form == "series":
-        _split_hinge(spec, hinge, joint)
-    else:
-        _add_friction(hinge, joint)
-        hinge.armature = joint.rotor_inertia
+        _add_rotor(spec, hinge, joint)
+        _add_spring(spec, name, joint)
+    _add_friction(hinge, joint)
     _drive(spec, name, driven, joint.servo, rule)
     _follow_actuators(spec, name, driven)
 
@@ -232,24 +219,23 @@ def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
     return parent.add_frame().attach_body(rotor, hinge.name, "")
 
 
-def _add_rotor(
-    hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody
-) -> mujoco.MjsJoint:
+def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
     """The rotor's hinge.
 
     Every attribute is set: the model's default class must not leak into the rotor.
     """
+    # not enforced, so not converted; for actuators that inherit their range
     limits = _in_radians(hinge, hinge.range)
-    rotor = body.add_joint(
+    rotor = _rotor_body(spec, hinge).add_joint(
         name=motor_name(hinge.name),
-        type=mujoco.mjtJoint.mjJNT_HINGE,
+        type=_HINGE,
         pos=hinge.pos,
         axis=hinge.axis,
         ref=hinge.ref,
         springref=hinge.ref,
         armature=joint.rotor_inertia,
         limited=mujoco.mjtLimited.mjLIMITED_FALSE,
-        range=limits,  # not enforced, so not converted; for actuators that inherit their range
+        range=limits,
         actfrclimited=hinge.actfrclimited,
         actfrcrange=hinge.actfrcrange,
         frictionloss=0.0,
@@ -258,37 +244,29 @@ def _add_rotor(
     rotor.stiffness = rotor.damping = np.zeros(3)
     rotor.springyield = 0.0
     rotor.actgravcomp = False
-    ref = float(
-        _in_radians(hinge, hinge.ref)
-    )  # of an attached model the unit may differ from the rotor's
+    # of an attached model the unit may differ from the rotor's
+    ref = float(_in_radians(hinge, hinge.ref))
     rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
     rotor.springdamper = np.zeros(2)
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     hinge.actfrcrange = np.zeros(2)
-    return rotor
 
 
 def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
-    """An angle of the specification, which may be written in degrees, as the compiled model has
-    it.
-    """
+    """An angle of the specification, which may be written in degrees, in radians."""
     return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
 
 
-def _blank_tendon(spec: mujoco.MjSpec, name: str) -> mujoco.MjsTendon:
-    """A tendon without any spring, damper, friction or limit that a default class may hold."""
-    tendon = spec.add_tendon(
-        name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0
-    )
-    tendon.stiffness = tendon.damping = np.zeros(3)
-    tendon.springlength = np.zeros(2)
-    tendon.springyield = 0.0
-    tendon.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    return tendon
-
-
 def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
-    spring = _blank_tendon(spec, spring_name(name))
+    """The spring as a tendon of length θ − q, without what a default class may hold."""
+    spring = spec.add_tendon(
+        name=spring_name(name),
+        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+        frictionloss=0.0,
+        armature=0.0,
+    )
+    spring.springyield = 0.0
+    spring.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     spring.wrap_joint(motor_name(name), 1.0)
     spring.wrap_joint(name, -1.0)
     spring.stiffness = np.array([joint.stiffness, 0.0, 0.0])
@@ -296,54 +274,21 @@ def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
     spring.springlength = np.array([-joint.backlash / 2, joint.backlash / 2])
 
 
-def _add_friction(element: mujoco.MjsJoint | mujoco.MjsTendon, joint: ElasticJoint) -> None:
-    """Friction on the link angle, on top of what the element has."""
-    element.damping = element.damping + np.array([joint.viscous_friction, 0.0, 0.0])
+def _add_friction(hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+    """Friction on the link angle, on top of what the hinge has."""
+    hinge.damping = hinge.damping + np.array([joint.viscous_friction, 0.0, 0.0])
     if joint.coulomb_friction > 0.0:
-        element.frictionloss += joint.coulomb_friction
-        element.solref_friction[:] = _FRICTION_SOLREF
-        element.solimp_friction[:] = _FRICTION_SOLIMP
-
-
-def _split_hinge(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
-    """Series form: a collinear hinge for θ; the old hinge becomes q − θ and carries the spring."""
-    body = hinge.parent
-    if body.joints[-1].name != hinge.name:
-        raise ConfigurationError(
-            f"the series form needs {hinge.name!r} to be the last joint of its body {body.name!r},"
-            f" which ends with {body.joints[-1].name!r}; use the tendon form"
-        )
-    if joint.backlash > 0.0:
-        raise ConfigurationError(
-            f"the series form has a linear spring, but backlash of {hinge.name!r} is"
-            f" {joint.backlash} rad; use the tendon form"
-        )
-    _add_rotor(hinge, joint, body)
-    link = _blank_tendon(spec, link_name(hinge.name))
-    link.wrap_joint(motor_name(hinge.name), 1.0)
-    link.wrap_joint(hinge.name, 1.0)
-    link.limited = hinge.limited
-    link.range = _in_radians(hinge, hinge.range)
-    link.stiffness = np.array(hinge.stiffness)
-    link.damping = np.array(hinge.damping)
-    link.springlength = _in_radians(hinge, np.full(2, hinge.springref))
-    link.frictionloss = hinge.frictionloss
-    _add_friction(link, joint)
-    hinge.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-    hinge.range = np.zeros(2)
-    hinge.frictionloss = 0.0
-    hinge.armature = 0.0
-    hinge.ref = 0.0
-    hinge.springref = 0.0
-    hinge.stiffness = np.array([joint.stiffness, 0.0, 0.0])
-    hinge.damping = np.array([joint.damping, 0.0, 0.0])
+        hinge.frictionloss += joint.coulomb_friction
+        hinge.solref_friction[:] = _FRICTION_SOLREF
+        hinge.solimp_friction[:] = _FRICTION_SOLIMP
 
 
 def _drive(
     spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule
 ) -> None:
     """Put the hinge's actuators, or the servo, on the driven joint."""
-    existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
+    on_joints = [a for a in spec.actuators if a.trntype in _ON_JOINT]
+    existing = [actuator for actuator in on_joints if actuator.target == name]
     for actuator in existing:
         if rule == "replace":
             _redirect_sensors(spec, actuator.name, name, servo)
@@ -363,18 +308,17 @@ def _drive(
 
 def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
     """Sensors of the actuator torque on a hinge go where its actuators go."""
+    kind = mujoco.mjtSensor.mjSENS_JOINTACTFRC
     for sensor in spec.sensors:
-        if sensor.type == mujoco.mjtSensor.mjSENS_JOINTACTFRC and sensor.objname == name:
+        if sensor.type == kind and sensor.objname == name:
             sensor.objname = driven
 
 
 def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
-    sensors = [
-        s
-        for s in spec.sensors
-        if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator
-    ]
+    kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+    of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
+    sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
     if sensors and servo is None:
         raise ConfigurationError(
             f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"

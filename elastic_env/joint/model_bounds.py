@@ -1,5 +1,6 @@
-"""Bounds of a model, counted on its XML before MuJoCo builds it: a small file must not ask for
-much time or memory.
+"""Bounds of a model, counted on its XML before MuJoCo builds it.
+
+A small file must not ask for much time or memory.
 """
 
 import math
@@ -13,7 +14,7 @@ from elastic_env.joint.model_text import (
     DEEPEST,
     LARGEST_BYTES,
     ModelText,
-    decoded,
+    decode_xml,
     name_of,
     parse_xml,
     read_bytes,
@@ -28,6 +29,8 @@ MOST_PIXELS = 2**28
 MOST_ASSET_BYTES = 500_000_000
 """Of all meshes and pictures of a model together."""
 
+FOLDERS = ("meshdir", "texturedir", "assetdir")
+"""Attributes of <compiler> that name a folder of files."""
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
@@ -82,7 +85,7 @@ def require_bounds(model: ModelText) -> None:
 
 @dataclass
 class _Counts:
-    """What a model has, so far."""
+    """Counts of a model, so far."""
 
     model: ModelText
     elements: float = 0.0
@@ -98,11 +101,9 @@ class _Counts:
         """Count a URDF, whose links nest in MuJoCo as they are joined."""
         self._bound("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
         self._bound("bodies", len(robot.findall("link")), MOST_BODIES)
-        self._bound(
-            "joints",
-            sum(joint.get("type") != "fixed" for joint in robot.findall("joint")),
-            MOST_JOINTS,
-        )
+        joints = robot.findall("joint")
+        moving = [joint for joint in joints if joint.get("type") != "fixed"]
+        self._bound("joints", len(moving), MOST_JOINTS)
         for element in robot.iter():
             self._require_numbers(element)
         for mesh in robot.iter("mesh"):
@@ -110,11 +111,12 @@ class _Counts:
 
     def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
         """Count a document of MJCF; `files` are those in which it is included."""
-        for compiler in root.iter("compiler"):
-            self._folders += [
-                compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
-            ]
+        self._add_folders(root)
         self._walk(root, files, 1.0, in_world=False, depth=len(files))
+
+    def _add_folders(self, root: ET.Element) -> None:
+        for compiler in root.iter("compiler"):
+            self._folders += [compiler.get(key, "") for key in FOLDERS]
 
     def _walk(
         self,
@@ -153,9 +155,10 @@ class _Counts:
         elif tag == "attach":
             self._attach(element, files, copies, depth)
         else:
-            for key in element.keys() if tag in ("mesh", "texture", "hfield", "skin") else ():
-                if key.startswith("file"):
-                    self._add_asset(element.get(key, ""))
+            is_asset = tag in ("mesh", "texture", "hfield", "skin")
+            for key, value in element.items():
+                if is_asset and key.startswith("file"):
+                    self._add_asset(value)
         for part in element:
             self._walk(part, files, copies, in_world, depth + 1)
 
@@ -164,10 +167,7 @@ class _Counts:
     ) -> None:
         root, path = self._document(name, files)
         if root is not None:
-            for compiler in root.iter("compiler"):
-                self._folders += [
-                    compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")
-                ]
+            self._add_folders(root)
             for part in root:
                 self._walk(part, (*files, path), copies, in_world, depth + 1)
 
@@ -183,27 +183,29 @@ class _Counts:
     ) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
-            bodies = [body for body in root.iter("body") if body.get("name") == element.get("body")]
+            name = element.get("body")
+            bodies = [body for body in root.iter("body") if body.get("name") == name]
             for body in bodies or root.findall("worldbody"):
                 self._walk(body, files, copies, in_world=True, depth=depth + 1)
 
     def _document(self, name: str, files: tuple[Path, ...]) -> tuple[ET.Element | None, Path]:
         """A further file of the model; None where MuJoCo will say that it is missing."""
         folders = [self.model.folder, *(file.parent for file in files[-1:])]
-        path = next((folder / name for folder in folders if _exists(folder / name)), None)
-        if path is None or not name:
+        paths = [folder / name for folder in folders if _exists(folder / name)]
+        if not paths or not name:
             return None, self.model.folder
-        path = path.resolve()
+        path = paths[0].resolve()
         if path in files:
             raise ConfigurationError(
                 f"{self.model.name} includes {name_of(path)} within itself; take the circle out"
             )
-        text, _ = decoded(read_bytes(path, "included model"), name_of(path))
+        text, _ = decode_xml(read_bytes(path, "included model"), name_of(path))
         return parse_xml(text, name_of(path)), path
 
     def _add_asset(self, name: str) -> None:
-        """A mesh or picture, which has to be a regular file of bounded size; one that is missing
-        is judged later.
+        """Count a mesh or picture, which must be a regular file of bounded size.
+
+        One that is missing is judged later.
         """
         for folder in self._folders:
             path = self.model.folder / folder / name
@@ -219,7 +221,8 @@ class _Counts:
                 )
             self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
             self.asset_bytes += facts.st_size
-            self._bound("bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES)
+            what = "bytes of meshes and pictures"
+            self._bound(what, self.asset_bytes, MOST_ASSET_BYTES)
             self.pixels += _pixels(path)
             self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
 
@@ -228,24 +231,27 @@ class _Counts:
         values = element.attrib
         for tags, names, most in _LARGEST:
             if (tags is None or tag in tags) and any(name in values for name in names):
-                numbers = [number for name in names for number in _numbers(values.get(name, ""))]
-                self._bound(f"{' times '.join(names)} of <{tag}>", _product(numbers), most)
+                numbers = [n for name in names for n in _numbers(values.get(name, ""))]
+                what = f"{' times '.join(names)} of <{tag}>"
+                self._bound(what, _product(numbers), most)
         for name, value in values.items():
             if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
-                self._bound(f"{name} of <{tag}>", _product(_numbers(value)), _MOST_OF_OTHERS)
+                product = _product(_numbers(value))
+                self._bound(f"{name} of <{tag}>", product, _MOST_OF_OTHERS)
             if name != "name" and _has_nan(value):
                 raise ConfigurationError(
                     f"{name} of <{tag}> in {self.model.name} must be numbers, got {quote(value)}"
                 )
         if tag == "texture" and {"width", "height"} <= set(values):
-            self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
+            sizes = [*_numbers(values["width"]), *_numbers(values["height"])]
+            self.pixels += _product(sizes)
             self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
         if tag == "mesh" and "params" in values:
-            self._bound(
-                "as params of a mesh", max(_numbers(values["params"]), default=0.0), _FINEST
-            )
+            finest = max(_numbers(values["params"]), default=0.0)
+            self._bound("as params of a mesh", finest, _FINEST)
         if tag == "size" and "memory" in values:
-            self._bound("memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY)
+            memory = _bytes(values["memory"])
+            self._bound("memory of <size> [bytes]", memory, _MOST_MEMORY)
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
@@ -307,5 +313,6 @@ def _pixels(path: Path) -> int:
     """Pixels that a PNG declares; 0 for other files."""
     with path.open("rb") as file:
         head = file.read(24)
-    is_png = head.startswith(_PNG) and len(head) == 24
-    return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big") if is_png else 0
+    if not head.startswith(_PNG) or len(head) < 24:
+        return 0
+    return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big")

@@ -1,5 +1,4 @@
-"""The one reader of rigid models that others wrote: MJCF and URDF, files and texts, specifications,
-compiled models.
+"""Reader of rigid models: MJCF and URDF, files and texts, specifications, compiled models.
 
 Whoever reads a model reads it here, so that all accept and refuse the same ones, in the same words.
 """
@@ -17,7 +16,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, quote
-from elastic_env.joint.model_bounds import require_bounds
+from elastic_env.joint.model_bounds import FOLDERS, require_bounds
 from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
 GivenModel = str | Path | mujoco.MjSpec | mujoco.MjModel
@@ -27,18 +26,12 @@ compiled.
 
 Result = TypeVar("Result")
 
-_SPECIFICATION = "the specification"
 _CURES = {
     "mass and inertia of moving bodies": (
         "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero"
     ),
-    "inertia must": (
-        "the inertia must be that of a body: positive, and no main value above the sum of the"
-        " other two"
-    ),
-    "inertia matrix": (
-        "the inertia must be that of a body: positive, and no main value above the sum of the"
-        " other two"
+    "inertia m": (
+        "the inertia must be that of a body: positive, no main value above the sum of the others"
     ),
     "Error opening file": (
         "put the mesh where the model names it, or take its shape out and give the link's inertia"
@@ -50,7 +43,7 @@ _CURES = {
     "range[0] should be smaller": "the lower limit must be below the upper one",
     "Could not allocate memory": "make the sizes in <size> smaller",
 }
-"""What to do about errors of MuJoCo, by a part of their text."""
+"""Cures of MuJoCo's errors, by a part of their text."""
 _LONGEST_ERROR = 400
 _SHAPES = ("visual", "collision")
 _READABLE = (".stl", ".obj")
@@ -59,7 +52,6 @@ _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
 _REFERRING = ("actuators", "equalities", "sensors", "tendons", "excludes", "pairs", "tuples")
 """Elements of a specification that refer to others by name."""
-_OF_FILES = ("meshdir", "texturedir", "assetdir")
 
 
 @dataclass(frozen=True)
@@ -113,11 +105,11 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     """
     if isinstance(model, mujoco.MjSpec):
         given: Any = model
-        return _without_lost_meshes(lambda: _whole_copy(given, _SPECIFICATION), _SPECIFICATION)
+        name = "the specification"
+        return _without_lost_meshes(lambda: _whole_copy(given, name), name)
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
-            "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf),"
-            " or its mujoco.MjSpec"
+            "a compiled model cannot be made elastic; give its file (.xml, .urdf) or its MjSpec"
         )
     if not isinstance(model, str | Path):
         raise ConfigurationError(
@@ -126,11 +118,9 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         )
     text = read_model_text(model)
     require_bounds(text)
-    return (
-        _of_urdf(text, shapes)
-        if text.is_urdf
-        else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
-    )
+    if text.is_urdf:
+        return _of_urdf(text, shapes)
+    return _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
 
 
 def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
@@ -221,15 +211,14 @@ def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
     own = ET.SubElement(robot, "mujoco") if own is None else own
     compilers = own.findall("compiler") or [ET.SubElement(own, "compiler")]
     for compiler in compilers:
-        for key in _OF_FILES:
+        for key in FOLDERS:
             compiler.attrib.pop(key, None)
         compiler.attrib.update(_URDF_OPTIONS)
     text = ET.tostring(robot, encoding="unicode")
     spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text), name, "read")
     for mesh in spec.meshes:
-        mesh.inertia = (
-            mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        )  # a mesh that is not closed has no volume
+        # a mesh that is not closed has no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     for geom in spec.geoms:
         geom.mass = geom.contype = geom.conaffinity = 0
     return spec
@@ -272,10 +261,8 @@ def _require_tree(text: ModelText) -> None:
     parents: dict[str, str] = {}
     for joint in text.root.findall("joint"):
         name = quote(joint.get("name", ""))
-        ends = [
-            element.get("link", "") if (element := joint.find(end)) is not None else ""
-            for end in _ENDS
-        ]
+        found = [joint.find(end) for end in _ENDS]
+        ends = ["" if element is None else element.get("link", "") for element in found]
         for end, link in zip(_ENDS, ends, strict=True):
             if link not in links:
                 raise ConfigurationError(
@@ -284,8 +271,7 @@ def _require_tree(text: ModelText) -> None:
                 )
         if ends[1] in parents:
             raise ConfigurationError(
-                f"link {quote(ends[1])} of {text.name} is the child of two joints; a URDF is a"
-                " tree, cut the loop"
+                f"link {quote(ends[1])} of {text.name} is the child of two joints; cut the loop"
             )
         parents[ends[1]] = ends[0]
     for link in parents:
@@ -314,8 +300,7 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
 
 
 def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
-    """A specification that compiles: without its meshes and pictures, where these are why it does
-    not.
+    """A specification that compiles, without its meshes and pictures where these prevent it.
 
     What is compiled is read for that alone: to compile a specification changes it.
     """
@@ -361,17 +346,17 @@ def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
 
 def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     """Bodies that have their mass from a mesh."""
-    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    rule = spec.compiler.inertiafromgeom
+    from_geoms = rule == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     return [
         body
         for body in spec.bodies[1:]
-        if any(_is_of_mesh(geom) for geom in body.geoms)
-        and (from_geoms or not body.explicitinertial)
+        if (from_geoms or not body.explicitinertial) and any(map(_is_of_mesh, body.geoms))
     ]
 
 
 def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
-    """Whether a geom is a mesh, or a primitive that is fitted to one."""
+    """True if a geom is a mesh, or a primitive that is fitted to one."""
     return geom.type == _MESH or bool(geom.meshname)
 
 
@@ -385,8 +370,9 @@ def _take_meshes(spec: mujoco.MjSpec) -> None:
 
 
 def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
-    """What MuJoCo makes, in a thread of its own so that Ctrl-C reaches this one; its errors in
-    words that teach.
+    """The result of an action of MuJoCo; its errors teach.
+
+    It runs in a thread of its own, so that Ctrl-C reaches this one.
     """
     results: list[Result] = []
     errors: list[Exception] = []
@@ -394,7 +380,8 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
     def work() -> None:
         try:
             results.append(action())
-        except Exception as error:  # MuJoCo raises nearly every kind, and "unknown exception"
+        except Exception as error:
+            # MuJoCo raises nearly every kind, and "unknown exception"
             errors.append(error)
 
     thread = threading.Thread(target=work, daemon=True)
@@ -408,39 +395,35 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
     finally:
         before.set()
     if errors:
-        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {_with_cure(errors[0])}") from None
+        problem = _with_cure(errors[0])
+        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {problem}") from None
     return results[0]
 
 
 def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
-    """Visual or collision shapes of a link, whichever MuJoCo reads all of; else the meshes that
-    it does not read.
-    """
+    """Visual or collision shapes of a link that MuJoCo reads, else the meshes that it does not."""
     missing: list[str] = []
     for tag in _SHAPES:
         shapes = link.findall(tag)
-        named = [
-            (mesh, mesh.get("filename", "")) for shape in shapes for mesh in shape.iter("mesh")
-        ]
-        found = [(mesh, _mesh_file(name, folder)) for mesh, name in named]
-        if shapes and all(path is not None for _, path in found):
-            for mesh, path in found:
+        meshes = [mesh for shape in shapes for mesh in shape.iter("mesh")]
+        files = {mesh: _mesh_file(mesh.get("filename", ""), folder) for mesh in meshes}
+        lost = [mesh.get("filename", "") for mesh in meshes if files[mesh] is None]
+        if shapes and not lost:
+            for mesh, path in files.items():
                 mesh.set("filename", str(path))
             return shapes, []
-        missing = missing or [
-            name for (_, name), (_, path) in zip(named, found, strict=True) if path is None
-        ]
+        missing = missing or lost
     return [], missing
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that MuJoCo reads, in the folder of the URDF, or of a package in a folder above;
-    None without one.
-    """
+    """A mesh that MuJoCo reads, in the URDF's folder or a package above it, or None."""
     if Path(name).suffix.lower() not in _READABLE:
         return None
     relative = name.removeprefix(_PACKAGE).removeprefix("file://")
-    bases = [folder, *folder.resolve().parents] if name.startswith(_PACKAGE) else [folder]
+    bases = [folder]
+    if name.startswith(_PACKAGE):
+        bases += folder.resolve().parents
     return next((base / relative for base in bases if _is_mesh(base / relative)), None)
 
 
@@ -453,10 +436,8 @@ def _is_mesh(path: Path) -> bool:
 
 def _with_cure(error: Exception) -> str:
     """MuJoCo's error in one line, and what to do about it where that is known."""
-    text = (
-        ", ".join(line.strip() for line in str(error).splitlines() if line.strip())
-        or type(error).__name__
-    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    text = ", ".join(filter(None, lines)) or type(error).__name__
     cures = [cure for part, cure in _CURES.items() if part in text]
     if len(text) > _LONGEST_ERROR:
         text = f"{text[:_LONGEST_ERROR]}..."

@@ -1,4 +1,4 @@
-"""What a model's actuators say of the drive of a joint: gains, rotor inertia, limits."""
+"""The drive of a joint by a model's actuators: gains, rotor inertia, limits."""
 
 from dataclasses import dataclass
 
@@ -35,11 +35,12 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
     Raises:
         ConfigurationError: There are several, or it has a law that a `Servo` has not.
     """
-    position = [i for i in _actuators(model, joint) if model.actuator_biasprm[i, 1] != 0.0]
+    actuators = _actuators(model, joint)
+    position = [i for i in actuators if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
         return None  # a motor or a velocity servo: a position servo takes its place
     i = position[0]
-    gear = float(model.actuator_gear[position[0], 0])
+    gear = float(model.actuator_gear[i, 0])
     gain = model.actuator_gainprm[i]
     bias = model.actuator_biasprm[i]
     is_pid = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID
@@ -47,18 +48,10 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
     kv = -float(bias[2])
     ki = float(gain[0]) if is_pid else 0.0
     is_filtered = not is_pid and model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
-    is_plain = is_pid or (
-        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and np.isclose(gain[0], kp)
-    )
-    if (
-        len(position) > 1
-        or is_filtered
-        or not is_plain
-        or bias[0] != 0.0
-        or kp <= 0.0
-        or kv < 0.0
-        or gear == 0.0
-    ):
+    is_fixed = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+    is_plain = is_pid or (is_fixed and np.isclose(gain[0], kp))
+    is_one = len(position) == 1 and not is_filtered and is_plain
+    if not is_one or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0 or gear == 0.0:
         raise ConfigurationError(
             f"the actuators of joint {joint!r} are no single position servo of the form kp (u - q)"
             " - kv q_dot; say its position_gain, velocity_gain and integral_gain under `servo` of"
@@ -77,60 +70,48 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
 
 def rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
     """Armature of a joint and of the actuators on it, 0 where there is none [kg·m²]."""
-    of_actuators = [
-        model.actuator_gear[i, 0] ** 2 * model.actuator_armature[i]
-        for i in _actuators(model, joint)
-    ]
-    return float(model.dof_armature[model.joint(joint).dofadr[0]] + sum(of_actuators))
+    actuators = _actuators(model, joint)
+    gears = model.actuator_gear[actuators, 0]
+    of_actuators = (gears**2 * model.actuator_armature[actuators]).tolist()
+    return float(model.joint(joint).armature[0] + sum(of_actuators))
 
 
 def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
-    """What a joint and its actuators can deliver [N·m]; None where the model does not say it.
+    """Torque limit of a joint and its actuators [N·m]; None where the model has none.
 
     Raises:
         ConfigurationError: A range leaves no torque in one direction.
     """
     number = model.joint(joint).id
-    found = [_bound(joint, 1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
+    limits = [(1.0, model.jnt_actfrclimited[number], model.jnt_actfrcrange[number])]
     for i in _actuators(model, joint):
         gear = abs(float(model.actuator_gear[i, 0]))
-        found.append(
-            _bound(joint, gear, model.actuator_forcelimited[i], model.actuator_forcerange[i])
-        )
-        if (
-            model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-            and model.actuator_dyntype[i] == 0
-        ):
-            gain = abs(float(model.actuator_gainprm[i, 0]))
-            found.append(
-                _bound(
-                    joint, gear * gain, model.actuator_ctrllimited[i], model.actuator_ctrlrange[i]
-                )
-            )
+        force = (model.actuator_forcelimited[i], model.actuator_forcerange[i])
+        limits.append((gear, *force))
+        is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        if is_unbiased and model.actuator_dyntype[i] == 0:
+            gain = gear * abs(float(model.actuator_gainprm[i, 0]))
+            command = (model.actuator_ctrllimited[i], model.actuator_ctrlrange[i])
+            limits.append((gain, *command))
+    found = [_bound(joint, *limit) for limit in limits]
     return min((value for value in found if value is not None), default=None)
 
 
 def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
     """Actuators that act on a joint."""
     number = model.joint(joint).id
-    return [
-        i
-        for i in range(model.nu)
-        if model.actuator_trntype[i] in _ON_JOINT and model.actuator_trnid[i, 0] == number
-    ]
+    is_on_joint = np.isin(model.actuator_trntype, _ON_JOINT)
+    is_on_it = is_on_joint & (model.actuator_trnid[:, 0] == number)
+    return np.flatnonzero(is_on_it).tolist()
 
 
 def _braking(model: mujoco.MjModel, joint: str) -> float:
-    """Damping by the actuators of a joint but the gain of its position servo, at zero command
-    [N·m·s/rad].
-    """
+    """Damping by a joint's actuators at zero command, without its position servo [N·m·s/rad]."""
     braking = 0.0
     for i in _actuators(model, joint):
         own = float(model.actuator_damping[i])
-        if (
-            model.actuator_biasprm[i, 1] == 0.0
-            and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
-        ):
+        has_state = model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
+        if model.actuator_biasprm[i, 1] == 0.0 and not has_state:
             own += max(-float(model.actuator_biasprm[i, 2]), 0.0)
         braking += float(model.actuator_gear[i, 0]) ** 2 * own
     return braking

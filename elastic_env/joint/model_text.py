@@ -1,5 +1,4 @@
-"""The XML of a model, read within bounds before MuJoCo sees it: a file of MJCF or URDF, or the text
-of one.
+"""The XML of a model in MJCF or URDF, read within bounds before MuJoCo sees it.
 
 Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded
 first (xacro, entities) is refused.
@@ -7,7 +6,6 @@ first (xacro, entities) is refused.
 
 import codecs
 import re
-import stat
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from typing import Any
 from xml.parsers import expat
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.files import read_bounded
 
 LARGEST_BYTES = 50_000_000
 """Of a model's file, and of its text."""
@@ -49,24 +48,6 @@ _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
 """Children of a robot that old files of xacro have without prefix."""
-_URDF_PARTS = {
-    "robot",
-    "link",
-    "joint",
-    "origin",
-    "mass",
-    "inertia",
-    "axis",
-    "limit",
-    "dynamics",
-    "parent",
-    "child",
-    "mimic",
-    "box",
-    "cylinder",
-    "sphere",
-    "mesh",
-}
 _PLACEHOLDER = re.compile(r"\$[{(]")
 
 
@@ -92,7 +73,7 @@ class ModelText:
 
     @property
     def is_urdf(self) -> bool:
-        """Whether it is a URDF rather than MJCF."""
+        """True for a URDF, False for MJCF."""
         return self.root.tag == "robot"
 
 
@@ -110,7 +91,8 @@ def read_model_text(model: str | Path) -> ModelText:
             raise ConfigurationError(
                 f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}"
             )
-        found = ModelText(parse_xml(text, name), name, Path.cwd(), None, text, is_utf8=True)
+        root = parse_xml(text, name)
+        found = ModelText(root, name, Path.cwd(), None, text, is_utf8=True)
     else:
         found = _of_file(Path(model))
     _require_model(found)
@@ -118,19 +100,17 @@ def read_model_text(model: str | Path) -> ModelText:
 
 
 def is_text(model: object) -> bool:
-    """Whether a model is given as its text rather than as a file."""
+    """True if a model is given as its text rather than as a file."""
     return isinstance(model, str) and model.lstrip(_BLANK).startswith("<")
 
 
 def without_declaration(text: str) -> str:
-    """The text of a model for a file in UTF-8: without mark, and without the encoding that it
-    had once.
-    """
+    """The text of a model for a file in UTF-8: without mark and declared encoding."""
     return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
 
 
 def is_file(path: str | Path) -> bool:
-    """Whether there is a regular file, for any path: one that no file can have is none."""
+    """True if there is a regular file, for any path: one that no file can have is none."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -150,21 +130,18 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
         ConfigurationError: It is no regular file, is too large, or cannot be read.
     """
     try:
-        facts = path.stat()
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(
+                f"no {what} at {name_of(path)}: it is no regular file; {_FILE}"
+            )
+        return read_bounded(path, LARGEST_BYTES)
+    except ConfigurationError:
+        raise
+    except PermissionError as error:
+        problem = f"{name_of(path)} cannot be read: {error.strerror}"
     except (OSError, ValueError):
-        raise ConfigurationError(f"no {what} at {name_of(path)}; {_FILE}") from None
-    if not stat.S_ISREG(facts.st_mode):
-        raise ConfigurationError(f"no {what} at {name_of(path)}: it is no regular file; {_FILE}")
-    if facts.st_size > LARGEST_BYTES:
-        raise ConfigurationError(
-            f"{name_of(path)} must have at most {LARGEST_BYTES} bytes, it has {facts.st_size}"
-        )
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(
-            f"{name_of(path)} cannot be read: {error.strerror}; {_FILE}"
-        ) from None
+        problem = f"no {what} at {name_of(path)}"
+    raise ConfigurationError(f"{problem}; {_FILE}")
 
 
 def parse_xml(text: str, name: str) -> ET.Element:
@@ -194,7 +171,6 @@ def parse_xml(text: str, name: str) -> ET.Element:
     def refuse_entity(entity: str, *_: Any) -> None:
         raise ConfigurationError(
             f"{name} declares the entity {quote(entity)}, which is not read; write its text out"
-            " where it is used"
         )
 
     parser = expat.ParserCreate()
@@ -213,14 +189,13 @@ def parse_xml(text: str, name: str) -> ET.Element:
 def _of_file(path: Path) -> ModelText:
     name = name_of(path)
     content = read_bytes(path)
-    text, is_utf8 = decoded(content, name)
-    return ModelText(parse_xml(text, name), name, path.resolve().parent, path, text, is_utf8)
+    text, is_utf8 = decode_xml(content, name)
+    root = parse_xml(text, name)
+    return ModelText(root, name, path.resolve().parent, path, text, is_utf8)
 
 
-def decoded(content: bytes, name: str) -> tuple[str, bool]:
-    """The text of a file by its mark, or by the encoding that it declares; and whether that is
-    UTF-8.
-    """
+def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
+    """The text of a file by its mark or declared encoding, and whether that is UTF-8."""
     encoding = next((own for mark, own in _MARKS if content.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(content)
@@ -254,11 +229,11 @@ def _require_model(found: ModelText) -> None:
     }
     for element in root.iter():
         prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
-        of_xacro = next(
-            (key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None
-        )
+        prefixed = [key for key in element.attrib if ":" in key]
+        of_xacro = next((key for key in prefixed if key.partition(":")[0] in aliases), None)
         if prefix in aliases or of_xacro is not None:
-            what = f"<{element.tag}>" if prefix in aliases else f"the attribute {of_xacro}"
+            is_tag = prefix in aliases
+            what = f"<{element.tag}>" if is_tag else f"the attribute {of_xacro}"
             raise ConfigurationError(
                 f"{name} is a file of xacro, it has {quote(what)[1:-1]}; {_EXPAND}"
             )
@@ -268,12 +243,11 @@ def _require_model(found: ModelText) -> None:
         )
     if found.is_urdf:
         for element in _parts(root):
-            unread = next(
-                (value for value in element.attrib.values() if _PLACEHOLDER.search(value)), None
-            )
-            if unread is not None:
+            values = element.attrib.values()
+            unread = [value for value in values if _PLACEHOLDER.search(value)]
+            if unread:
                 raise ConfigurationError(
-                    f"{name} has {quote(unread)} in <{element.tag}>, of xacro; {_EXPAND}"
+                    f"{name} has {quote(unread[0])} in <{element.tag}>, of xacro; {_EXPAND}"
                 )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:
@@ -281,8 +255,8 @@ def _require_model(found: ModelText) -> None:
 
 
 def _parts(robot: ET.Element) -> Iterator[ET.Element]:
-    """What describes the robot, not a simulator of it."""
+    """Elements that describe the robot, not a simulator of it."""
     yield robot
     for part in robot:
         if part.tag in ("link", "joint"):
-            yield from (element for element in part.iter() if element.tag in _URDF_PARTS)
+            yield from part.iter()

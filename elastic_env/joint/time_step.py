@@ -1,5 +1,4 @@
-r"""Whether MuJoCo's integrator follows the springs, dampers and servos of a model, or lets them
-explode.
+r"""Stability of MuJoCo's integrator with the springs, dampers and servos of a model.
 
 Near rest a step of the physics is linear, :math:`x_{k+1} = A x_k`, and stable if no eigenvalue of A
 lies outside the unit circle. Of a semi-implicit step (Euler, implicitfast) that means ωh < 2 for a
@@ -32,14 +31,11 @@ _LEFT_OUT = [
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}"))
     for what in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
 ]
-"""What holds a joint back, and the reset that would put numbers in the place of a step that
-gives none.
-"""
+"""Flags of what holds a joint back, and of the reset that would hide a step without numbers."""
 
 
 def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> float:
-    """Largest magnitude of the eigenvalues of a physics step about the model's reference posture
-    [1].
+    """Largest eigenvalue of a physics step about the reference posture, by magnitude [1].
 
     Args:
         model: It is not changed.
@@ -53,16 +49,15 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> f
         linear.opt.timestep = timestep_s
     with _without_messages():
         A = _transition(linear)
-    return (
-        float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-        if np.isfinite(A).all()
-        else float("inf")
-    )
+    if not np.isfinite(A).all():
+        return float("inf")
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
 
 
 def largest_stable_timestep(model: mujoco.MjModel) -> float:
-    """The largest physics step, from a little above the model's own downwards, that is stable, to a
-    thousandth [s].
+    """The largest stable physics step, at most a little above the model's own [s].
+
+    It is found to a thousandth.
 
     Raises:
         ConfigurationError: None is, down to a millionth of it.
@@ -86,7 +81,7 @@ def largest_stable_timestep(model: mujoco.MjModel) -> float:
 
 
 def is_stable(model: mujoco.MjModel) -> bool:
-    """Whether the model's physics step is stable, with a tenth of room."""
+    """True if the model's physics step is stable, with a tenth of room."""
     return spectral_radius(model, _ROOM * model.opt.timestep) <= _LARGEST_RADIUS
 
 
@@ -116,24 +111,20 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
 
 
 def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
-    """The model's physics step; where the joints explode with it, the largest stable one that
-    divides a period [s].
+    """The model's physics step, or the largest stable one that divides a period [s].
 
     Raises:
         ConfigurationError: None is stable, down to a millionth of it.
     """
     if is_stable(model):
         return float(model.opt.timestep)
-    return control_period_s / int(
-        np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9)
-    )
+    steps = control_period_s * _ROOM / largest_stable_timestep(model)
+    return control_period_s / int(np.ceil(steps - 1e-9))
 
 
 @contextmanager
 def _without_messages() -> Iterator[None]:
-    """No warnings of MuJoCo on the terminal or in MUJOCO_LOG.TXT: here a step that explodes is
-    an answer.
-    """
+    """Silence MuJoCo's warnings: here a step that explodes is an answer."""
     before = mujoco.MjLogConfig.get()
     silent = mujoco.MjLogConfig.get()
     silent.logto_console = silent.logto_file = False
@@ -150,7 +141,8 @@ def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
-    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    middle = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    linear.tendon_lengthspring[:] = middle
     return linear
 
 
@@ -161,7 +153,7 @@ def _transition(model: mujoco.MjModel) -> Array:
     A = np.empty((size, size))
     rest = data.qpos.copy()
 
-    def stepped(change: Array) -> Array:
+    def step(change: Array) -> Array:
         mujoco.mj_resetData(model, data)
         dq, data.qvel[:], data.act[:] = np.split(change, [model.nv, 2 * model.nv])
         mujoco.mj_integratePos(model, data.qpos, dq, 1.0)
@@ -171,5 +163,5 @@ def _transition(model: mujoco.MjModel) -> Array:
         return np.concatenate([moved, data.qvel, data.act])
 
     for column, change in enumerate(_DIFFERENCE * np.eye(size)):
-        A[:, column] = (stepped(change) - stepped(-change)) / (2.0 * _DIFFERENCE)
+        A[:, column] = (step(change) - step(-change)) / (2.0 * _DIFFERENCE)
     return A

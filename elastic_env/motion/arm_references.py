@@ -1,21 +1,21 @@
-"""References of robots of several joints: static poses, moves from pose to pose, a line and a
-circle, a user's file.
+"""References of robots of several joints: poses, moves, a line, a circle, a user's file.
 
 Those of `elastic_env.motion.references` move every joint alike. These know the robot: its joint
 ranges, its home, and where its end effector is. All begin with a second of standing.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
 from scipy.interpolate import CubicSpline
 
-from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
+from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
-from elastic_env.core.errors import ConfigurationError, quote, require_known, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import (
@@ -23,8 +23,10 @@ from elastic_env.motion.references import (
     AboutHome,
     Hold,
     Multisine,
+    RepeatableReference,
     Sine,
     Steps,
+    by_kind,
     make_reference,
 )
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
@@ -42,7 +44,7 @@ _MARGIN = 0.1
 
 @dataclass(frozen=True)
 class Workspace:
-    """What a reference has to know of a robot.
+    """A robot as its references know it.
 
     Attributes:
         joints: Names of the joints, in order.
@@ -82,21 +84,9 @@ class Workspace:
             "the servos hold hardly any pose of the workspace; give them a larger torque_limit"
         )
 
-    def require_tool(self, kind: str) -> EndEffector:
-        """The end effector that a reference moves.
 
-        Raises:
-            ConfigurationError: There is none.
-        """
-        if self.end_effector is None:
-            raise ConfigurationError(
-                f"the reference {kind!r} moves an end effector; name one, end_effector=SITE"
-            )
-        return self.end_effector
-
-
-class _Drawn(Model):
-    """What references with drawn poses share."""
+class _Drawn(RepeatableReference):
+    """References with drawn poses."""
 
     positions: int = quantity("1", 8, ge=1, le=1000)
     """Number of poses [1]."""
@@ -105,15 +95,10 @@ class _Drawn(Model):
     seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    @property
-    def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
-        return self.seed is None
-
-    def _visits(self, workspace: Workspace, generator: np.random.Generator) -> Array:
+    def visits(self, workspace: Workspace, generator: np.random.Generator) -> Array:
         """Home and the poses, (positions + 1, n) [rad]."""
-        own = generator if self.seed is None else np.random.default_rng(self.seed)
-        return np.concatenate([workspace.home[None], workspace.poses(own, self.positions)])
+        poses = workspace.poses(self.own(generator), self.positions)
+        return np.concatenate([workspace.home[None], poses])
 
 
 class Poses(_Drawn):
@@ -131,11 +116,8 @@ class Poses(_Drawn):
     measure_s: float = quantity("s", 0.25, gt=0, le=600)
     """Time of the measurement [s]."""
 
-    def joint_plan(
-        self, workspace: Workspace, generator: np.random.Generator, control_period_s: float
-    ) -> Plan:
-        """A plan of all joints, (T, n)."""
-        visits = self._visits(workspace, generator)
+    def through(self, visits: Array, control_period_s: float) -> Plan:
+        """A plan of all joints, (T, n), from the first pose through the others."""
         period = self.move_s + self.settle_s + self.measure_s
         t = control_times(STAND_S + self.positions * period, control_period_s)
         since = t[:, None] - STAND_S - period * np.arange(self.positions)
@@ -152,20 +134,16 @@ class Moves(_Drawn):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    def joint_plan(
-        self, workspace: Workspace, generator: np.random.Generator, control_period_s: float
-    ) -> Plan:
-        """A plan of all joints, (T, n)."""
-        visits = self._visits(workspace, generator)
+    def through(self, visits: Array, control_period_s: float) -> Plan:
+        """A plan of all joints, (T, n), from the first pose through the others."""
         t = control_times(STAND_S + self.positions * self.move_s, control_period_s)
         since = t[:, None] - STAND_S - self.move_s * np.arange(self.positions)
         return _scored(t, *_moved(visits, since / self.move_s, self.move_s))
 
 
-class _Path(Model):
-    """What paths of the end effector share: there is one plan for all episodes."""
+class _Path(RepeatableReference):
+    """Paths of the end effector."""
 
-    is_random: ClassVar[bool] = False
     duration_s: float = quantity("s", 4.0, gt=0, le=600)
     """Time of one way, or of one turn [s]."""
     repeats: int = quantity("1", 1, ge=1, le=100)
@@ -174,11 +152,14 @@ class _Path(Model):
     def _along(
         self, workspace: Workspace, place: Any, phase: tuple[Array, ...], control_period_s: float
     ) -> Plan:
-        """The plan of joints whose tool is at `place(s)`, an offset from where it starts, for a
-        phase over time.
-        """
+        """Plan of joints whose tool moves by `place(s)` from its start, for a phase over time."""
         s, s_dot, s_ddot = phase
-        tool = workspace.require_tool(str(getattr(self, "kind", "")))
+        tool = workspace.end_effector
+        if tool is None:
+            raise ConfigurationError(
+                f"the reference {getattr(self, 'kind', '')!r} moves an end effector; name one,"
+                " end_effector=SITE"
+            )
         path = joint_path(tool, workspace.home, place, float(s.max()))
         q = path(s)
         slope = path(s, 1)
@@ -199,14 +180,9 @@ class Line(_Path):
 
     kind: Literal["line"] = "line"
     by: tuple[float, float, float] = (0.0, 0.0, -0.1)
-    """Where it leads, from home, in the axes of the base [m]."""
+    """Way from home, in the axes of the base [m]."""
 
-    def joint_plan(
-        self,
-        workspace: Workspace,
-        generator: np.random.Generator,  # noqa: ARG002
-        control_period_s: float,
-    ) -> Plan:
+    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
         t = control_times(STAND_S + 2 * self.repeats * self.duration_s, control_period_s)
         since = (t[:, None] - STAND_S) / self.duration_s - np.arange(2 * self.repeats)
@@ -230,12 +206,7 @@ class Circle(_Path):
     normal: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Axis of the circle in the axes of the base; its length does not matter."""
 
-    def joint_plan(
-        self,
-        workspace: Workspace,
-        generator: np.random.Generator,  # noqa: ARG002
-        control_period_s: float,
-    ) -> Plan:
+    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
         axis = np.array(self.normal)
         if not np.linalg.norm(axis) > 0.0:
@@ -261,7 +232,7 @@ class Circle(_Path):
         )
 
 
-class Csv(Model):
+class Csv(RepeatableReference):
     """Angles over time from a user's file. Scored throughout.
 
     The file has a column `time_s` and one for each joint that moves, by its name [rad]. The other
@@ -269,16 +240,10 @@ class Csv(Model):
     """
 
     kind: Literal["csv"] = "csv"
-    is_random: ClassVar[bool] = False
     file: Locator
     """Path of the file."""
 
-    def joint_plan(
-        self,
-        workspace: Workspace,
-        generator: np.random.Generator,  # noqa: ARG002
-        control_period_s: float,
-    ) -> Plan:
+    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
         names, rows = _table(Path(self.file), workspace.joints)
         times = rows[:, 0] - rows[0, 0]
@@ -300,29 +265,11 @@ OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
 ArmReference = Annotated[Hold | Sine | Multisine | Steps | OfArm, Field(discriminator="kind")]
 AnyArmReference: TypeAlias = Hold | Sine | Multisine | Steps | OfArm
 
-ARM_REFERENCES: dict[str, type[OfArm]] = {
-    "poses": Poses,
-    "moves": Moves,
-    "line": Line,
-    "circle": Circle,
-    "csv": Csv,
-}
+ARM_REFERENCES = {**REFERENCES, **by_kind(OfArm)}
 
 
-def make_arm_reference(reference: "str | dict[str, Any] | AnyArmReference") -> AnyArmReference:
-    """A reference from its name, from a mapping with `kind` and parameters, or as it is.
-
-    Raises:
-        ConfigurationError: The kind does not exist, or a parameter does not fit it.
-    """
-    if isinstance(reference, OfArm):
-        return reference
-    kind = reference.get("kind") if isinstance(reference, dict) else reference
-    if isinstance(kind, str) and kind in ARM_REFERENCES:
-        return ARM_REFERENCES[kind](**(reference if isinstance(reference, dict) else {}))
-    if isinstance(kind, str) and kind not in REFERENCES:
-        raise unknown_name("reference", kind, [*REFERENCES, *ARM_REFERENCES])
-    return make_reference(reference)
+make_arm_reference = partial(make_reference, kinds=ARM_REFERENCES)
+"""A reference of a robot of several joints; arguments as of `make_reference`."""
 
 
 @dataclass(frozen=True)
@@ -339,16 +286,18 @@ class ArmMotion:
 
     @property
     def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
+        """True where every episode has a plan of its own."""
         return self.reference.is_random
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """Angles, rates and accelerations of all joints, (T, n); of a random one each joint has
-        a plan of its own.
-        """
-        if isinstance(self.reference, OfArm):
-            return self.reference.joint_plan(self.workspace, generator, control_period_s)
-        return AboutHome(self.reference, self.workspace.home).plan(generator, control_period_s)
+        """A plan of all joints, (T, n); of a random reference each joint has a plan of its own."""
+        reference = self.reference
+        if isinstance(reference, Poses | Moves):
+            visits = reference.visits(self.workspace, generator)
+            return reference.through(visits, control_period_s)
+        if isinstance(reference, OfArm):
+            return reference.joint_plan(self.workspace, control_period_s)
+        return AboutHome(reference, self.workspace.home).plan(generator, control_period_s)
 
 
 def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
@@ -384,9 +333,7 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
 
 
 def _moved(visits: Array, share: Array, move_s: float) -> tuple[Array, Array, Array]:
-    """Angle, rate and acceleration of moves between poses, each (T, n), from the shares of the
-    moves, (T, moves).
-    """
+    """Motion between poses, (T, n) each, from the shares of the moves, (T, moves)."""
     blend, blend_dot, blend_ddot = quintic(share)
     steps = np.diff(visits, axis=0)
     return visits[0] + blend @ steps, blend_dot @ steps / move_s, blend_ddot @ steps / move_s**2

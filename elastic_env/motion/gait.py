@@ -142,34 +142,31 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
         _whole_steps(name, getattr(gait, name), control_period_s) for name in _DURATIONS
     )
     period = first + single + last
-    _require_short(gait)
+    if gait.duration_s > LONGEST_WALK_S:
+        raise ConfigurationError(
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
+            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
+            " ones"
+        )
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
     since = np.arange(len(time)) - begin  # control steps since the walk began
     of_walk = np.clip((since - 1) // period, 0, gait.num_steps - 1)
     within = since - of_walk * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
-    lift_offs = np.arange(gait.num_steps) * period + first
-    events = np.concatenate([lift_offs, lift_offs + single])
-    nearest = _distance(since, np.sort(events))
+    around = int((TRANSITION_S + 1e-9) / control_period_s)
+    transition = np.zeros(len(time), dtype=np.bool_)
+    for lift_off in begin + np.arange(gait.num_steps) * period + first:
+        for event in (lift_off, lift_off + single):
+            transition[event - around : event + around + 1] = True
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
         support=of_walk % 2,
         single=(within > 0) & (within < single),
         swing=swing,
-        transition=walking & (nearest * control_period_s <= TRANSITION_S + 1e-9),
+        transition=walking & transition,
         walking=walking,
-    )
-
-
-def _distance(steps: IntArray, events: IntArray) -> IntArray:
-    """Control steps from each step to the nearest of some events in order, (T,)."""
-    after = np.searchsorted(events, steps)
-    last = len(events) - 1
-    return np.minimum(
-        np.abs(steps - events[np.minimum(after, last)]),
-        np.abs(steps - events[np.maximum(after - 1, 0)]),
     )
 
 
@@ -196,9 +193,7 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
 
 
 def support_points(gait: Gait, feet: Array) -> Array:
-    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2,
-    2) [m].
-    """
+    """Place of the ZMP on one foot, under or inward of its ankle, (2, 2) [m]."""
     inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
     towards = feet.mean(axis=0) - feet
     return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -227,15 +222,6 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
         last = support
         begin = end
     return shifts
-
-
-def _require_short(gait: Gait) -> None:
-    if gait.duration_s > LONGEST_WALK_S:
-        raise ConfigurationError(
-            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps"
-            f" of {gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter"
-            " ones"
-        )
 
 
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:

@@ -1,6 +1,4 @@
-"""Joint angles whose end effector follows a path, by Newton's method from point to point when a
-motion is planned.
-"""
+"""Joint angles whose end effector follows a path, by Newton's method from point to point."""
 
 from collections.abc import Callable
 
@@ -53,9 +51,7 @@ def joint_path(
 
 
 def _solved(tool: EndEffector, q: Array, wanted: Array, R_wanted: Array) -> Array | None:
-    """Angles near q with the end effector in a place, and of six joints or more in an
-    orientation; None for none.
-    """
+    """Angles near q that reach a place; six joints or more keep the orientation. None for none."""
     keeps = len(q) >= _FOR_ORIENTATION
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)

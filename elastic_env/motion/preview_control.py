@@ -38,9 +38,7 @@ class PreviewConfig(Model):
 
 @dataclass(frozen=True)
 class PreviewGains:
-    """Gains of the servo: on the integrated ZMP error, the state (x, ẋ, ẍ), and the previewed
-    references.
-    """
+    """Gains on the integrated ZMP error, the state (x, ẋ, ẍ), and the previewed references."""
 
     integral: float
     state: Array
@@ -49,9 +47,7 @@ class PreviewGains:
 
 @dataclass(frozen=True)
 class ComMotion:
-    """Motion of the center of mass, time first, and the ZMP that it has on the cart-table [m],
-    [m/s], [m/s²].
-    """
+    """Motion of the center of mass and its ZMP on the cart-table, time first [m], [m/s], [m/s²]."""
 
     com: Array
     com_dot: Array

@@ -5,11 +5,13 @@ acceleration in closed form. Every plan begins with a second of standing, in whi
 and moves by quintic (minimum-jerk) polynomials, which start and end without acceleration.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
@@ -42,18 +44,36 @@ def _require_short(duration_s: float) -> None:
         )
 
 
-class _Motion(Model):
-    """What all references share: one that is drawn has a seed, None for a new plan per episode."""
+class RepeatableReference(Model):
+    """A reference, whose plans repeat unless it has a seed that is None: then each is new."""
 
     @property
     def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
+        """True where every episode has a plan of its own."""
         return getattr(self, "seed", 0) is None
 
+    def own(self, generator: np.random.Generator) -> np.random.Generator:
+        """Its own generator where it has a seed, or the one that is given."""
+        seed: int | None = getattr(self, "seed", None)
+        return generator if seed is None else np.random.default_rng(seed)
 
-class Hold(_Motion):
-    """The paper's static positions, evenly spaced in gravity torque, approached from below and then
-    from above.
+
+class _JointReference(RepeatableReference):
+    """A motion of one joint."""
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan by the draws of a generator, or of the reference's own seed."""
+        raise NotImplementedError
+
+    def extent(self) -> Extent:
+        """Bounds over all its plans."""
+        raise NotImplementedError
+
+
+class Hold(_JointReference):
+    """The paper's static positions, evenly spaced in gravity torque.
+
+    They are approached from below and then from above.
 
     Without compensation the link sags below its reference; the references lie so far beyond the
     positions that the uncompensated link rests at evenly spaced torques.
@@ -109,15 +129,13 @@ class Hold(_Motion):
 
     @property
     def visits(self) -> tuple[Array, IntArray]:
-        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at
-        rest.
-        """
+        """Angle [rad] of each window at rest, and +1 if approached from below, else −1."""
         angles = self.angles
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
 
+    @override
     def extent(self) -> Extent:
-        """See `Extent`."""
         angles = self.angles
         distances = np.append(np.diff(angles), self.overrun)
         durations = np.array([self._move_s(distance) for distance in distances])
@@ -132,29 +150,21 @@ class Hold(_Motion):
         """Duration of a move over a distance [rad]."""
         return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
-        """The plan, the same for every generator."""
-        angles, directions = self.visits
+    @override
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        angles, _ = self.visits
         start = angles[0] - self.overrun
-        turn = self.angles[-1] + self.overrun
+        targets = np.insert(angles, self.positions, self.angles[-1] + self.overrun)
         moves = []
         windows = []
         now = STAND_S
-        position = start
-
-        def move(target: float) -> None:
-            nonlocal now, position
-            duration = self._move_s(abs(target - position))
-            moves.append((now, duration, target))
+        for number, distance in enumerate(np.abs(np.diff(targets, prepend=start))):
+            duration = self._move_s(distance)
+            moves.append((now, duration, targets[number]))
             now = now + duration
-            position = target
-
-        for visit, (angle, direction) in enumerate(zip(angles, directions, strict=True)):
-            if visit > 0 and direction != directions[visit - 1]:
-                move(turn)
-            move(angle)
-            windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
-            now = windows[-1][1]
+            if number != self.positions:  # there it turns round
+                windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
+                now = windows[-1][1]
         t = control_times(now, control_period_s)
         q, q_dot, q_ddot = quintic_moves(t, start, moves)
         rest = np.full(len(t), -1)
@@ -163,8 +173,8 @@ class Hold(_Motion):
         return Plan(q, q_dot, q_ddot, rest >= 0, rest)
 
 
-class _Oscillation(_Motion):
-    """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
+class _Oscillation(_JointReference):
+    """Amplitude, an envelope that starts smoothly, and a duration."""
 
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi)
     """Largest angle from the middle [rad]."""
@@ -210,13 +220,13 @@ class Sine(_Oscillation):
     frequency_hz: float = quantity("Hz", 0.25, gt=0)
     """Frequency [Hz]."""
 
+    @override
     def extent(self) -> Extent:
-        """See `Extent`."""
         omega = 2.0 * np.pi * self.frequency_hz
         return self._extent(self.amplitude * omega, self.amplitude * omega**2)
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
-        """The plan, the same for every generator."""
+    @override
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
         t = self._time_base(control_period_s)
         omega = 2.0 * np.pi * self.frequency_hz
         phase = omega * (t - STAND_S)
@@ -225,8 +235,9 @@ class Sine(_Oscillation):
 
 
 class Multisine(_Oscillation):
-    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode;
-    their sum stays inside.
+    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode.
+
+    Their sum stays inside the amplitude.
     """
 
     kind: Literal["multisine"] = "multisine"
@@ -262,14 +273,14 @@ class Multisine(_Oscillation):
     def _omega(self) -> Array:
         return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
 
+    @override
     def extent(self) -> Extent:
-        """See `Extent`."""
         share = self.amplitude / self.components
         return self._extent(share * float(self._omega.sum()), share * float((self._omega**2).sum()))
 
+    @override
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """A plan with phases of the generator, or of the reference's own seed."""
-        phases = _own(generator, self.seed).uniform(0.0, 2.0 * np.pi, self.components)
+        phases = self.own(generator).uniform(0.0, 2.0 * np.pi, self.components)
         t = self._time_base(control_period_s)
         omega = self._omega
         share = self.amplitude / self.components
@@ -280,7 +291,7 @@ class Multisine(_Oscillation):
         return self._enveloped(t, x, x_dot, x_ddot)
 
 
-class Steps(_Motion):
+class Steps(_JointReference):
     """Quick moves between random levels, each followed by a rest."""
 
     kind: Literal["steps"] = "steps"
@@ -302,8 +313,8 @@ class Steps(_Motion):
         _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
         return self
 
+    @override
     def extent(self) -> Extent:
-        """See `Extent`."""
         span = 2.0 * self.amplitude
         return Extent(
             self.middle - self.amplitude,
@@ -312,9 +323,9 @@ class Steps(_Motion):
             q_ddot=QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
         )
 
+    @override
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """A plan with levels of the generator, or of the reference's own seed."""
-        offsets = _own(generator, self.seed).uniform(-self.amplitude, self.amplitude, self.moves)
+        offsets = self.own(generator).uniform(-self.amplitude, self.amplitude, self.moves)
         period = self.move_s + self.rest_s
         moves = [
             (STAND_S + i * period, self.move_s, float(self.middle + x))
@@ -328,18 +339,20 @@ class Steps(_Motion):
 AnyReference: TypeAlias = Hold | Sine | Multisine | Steps
 Reference = Annotated[AnyReference, Field(discriminator="kind")]
 
-REFERENCES: dict[str, type[AnyReference]] = {
-    "hold": Hold,
-    "sine": Sine,
-    "multisine": Multisine,
-    "steps": Steps,
-}
+
+def by_kind(union: Any) -> dict[str, Any]:
+    """Classes of a union of references by the names of their kinds."""
+    return {one.model_fields["kind"].default: one for one in get_args(union)}
+
+
+REFERENCES = by_kind(AnyReference)
 
 
 @dataclass(frozen=True)
 class AboutHome:
-    """A reference that every joint follows about its home; of a random one each joint has a plan of
-    its own.
+    """A reference that every joint follows about its home.
+
+    Of a random one each joint has a plan of its own.
 
     Attributes:
         reference: It.
@@ -351,7 +364,7 @@ class AboutHome:
 
     @property
     def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
+        """True where every episode has a plan of its own."""
         return self.reference.is_random
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
@@ -366,15 +379,17 @@ class AboutHome:
         return Plan(q + self.home, q_dot, q_ddot, first.scored, first.rest)
 
 
-def make_reference(
-    reference: "str | dict[str, Any] | AnyReference",
-) -> AnyReference:
+def make_reference(reference: Any, kinds: Mapping[str, Any] = REFERENCES) -> Any:
     """A reference from its name, from a mapping with `kind` and parameters, or as it is.
+
+    Args:
+        reference: Such.
+        kinds: Classes of references by their names; default those that move every joint alike.
 
     Raises:
         ConfigurationError: The kind does not exist, or a parameter does not fit it.
     """
-    if isinstance(reference, AnyReference):
+    if isinstance(reference, tuple(kinds.values())):
         return reference
     if isinstance(reference, str):
         reference = {"kind": reference}
@@ -383,10 +398,6 @@ def make_reference(
             f"a reference is a name, a mapping or a model, got {type(reference).__name__}"
         )
     kind = reference.get("kind")
-    if not isinstance(kind, str) or kind not in REFERENCES:
-        raise unknown_name("reference", kind, REFERENCES)
-    return REFERENCES[str(kind)](**reference)
-
-
-def _own(generator: np.random.Generator, seed: int | None) -> np.random.Generator:
-    return generator if seed is None else np.random.default_rng(seed)
+    if not isinstance(kind, str) or kind not in kinds:
+        raise unknown_name("reference", kind, kinds)
+    return kinds[kind](**reference)

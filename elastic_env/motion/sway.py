@@ -1,5 +1,4 @@
-r"""How a robot sways on its springs: natural frequencies of standing on both feet with the motors
-held.
+r"""Natural frequencies of a robot that stands on both feet, on its springs, its motors held.
 
 With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint
 angles q(x). About the equilibrium, with the motors at θ = q + K⁻¹τ,
@@ -13,7 +12,6 @@ from scipy import linalg
 from elastic_env.core.signals import Array
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_chains import LegLoads
 from elastic_env.rigid.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
@@ -33,18 +31,13 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
         unstable.
     """
     q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
-    legs = biped.chains.posture(q.reshape(2, -1))
-    carried = np.full(2, biped.chains.mass / 2.0)
-    torque = (
-        LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3)))
-        .torque()
-        .ravel()
-    )
-    theta = q + torque / stiffness
+    gravity = np.array([0.0, 0.0, -biped.gravity])
+    loads = biped.chains.loads(1, gravity, mass=-biped.chains.mass / 2.0)
+    theta = q + biped.chains.torque(loads, q[None])[0] / stiffness
 
     def potential(x: Array) -> Array:
         angles = _angles(biped, pelvis, x)
-        com = biped.chains.center_of_mass(angles.reshape(len(x), 2, -1))
+        com = biped.chains.center_of_mass(angles)
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
         return 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1) + biped.weight * height
 
@@ -66,9 +59,7 @@ def _rotations(x: Array) -> Array:
 
 
 def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
-    """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n,
-    12).
-    """
+    """Joint angles that keep both soles on the ground, small pelvis motions (n, 6) to (n, 12)."""
     R = _rotations(x)
     ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips

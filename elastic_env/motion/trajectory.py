@@ -1,6 +1,4 @@
-"""Plans: sampled trajectories of a reference, their building blocks, and tables of them for many
-worlds.
-"""
+"""Plans: sampled trajectories, their building blocks, and tables of them for many worlds."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,8 +17,9 @@ QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples of a reference at the control rate; row k is the target at the end of control period
-    k, row 0 the start.
+    """Samples of a reference at the control rate.
+
+    Row k is the target at the end of control period k, row 0 the start.
 
     Attributes:
         q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,), or of all links, (T, n)
@@ -43,9 +42,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Extent:
-    """Bounds of a reference over all its plans: range of q [rad], largest |q̇| [rad/s], |q̈|
-    [rad/s²].
-    """
+    """Bounds over all plans: range of q [rad], largest |q̇| [rad/s], largest |q̈| [rad/s²]."""
 
     lowest: float
     highest: float
@@ -78,9 +75,7 @@ def quintic(s: Array) -> tuple[Array, Array, Array]:
 def quintic_moves(
     t: Array, start: float, moves: list[tuple[float, float, float]]
 ) -> tuple[Array, Array, Array]:
-    """Angle, rate, acceleration at times t of moves (begin [s], duration [s], target [rad]) one
-    after the other.
-    """
+    """Angle, rate, acceleration of moves in a row: begin [s], duration [s], target [rad]."""
     q = np.full_like(t, start)
     q_dot = np.zeros_like(t)
     q_ddot = np.zeros_like(t)
@@ -109,7 +104,7 @@ class Planned(Protocol):
 
     @property
     def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
+        """True where every episode has a plan of its own."""
         ...
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
@@ -118,8 +113,7 @@ class Planned(Protocol):
 
 
 class PlanTable:
-    """The plans of all worlds as tables, one row per control step; a plan without randomness is
-    held once.
+    """Plans of all worlds as tables, one row per control step; one that repeats is held once.
 
     Args:
         reference: Makes plans of all joints, (T, n).

@@ -1,5 +1,4 @@
-"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles at every control
-step.
+"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles.
 
 The pelvis stays level at one height and moves so that the center of mass of the whole robot, not
 the pelvis, follows the preview control.
@@ -18,7 +17,6 @@ from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_chains import LegLoads
 
 _COM_TOLERANCE_M = 1e-10
 _MAX_ITERATIONS = 50
@@ -26,8 +24,9 @@ _MAX_ITERATIONS = 50
 
 @dataclass(frozen=True, eq=False)
 class WalkPlan:
-    """A walk in place, one row per control step, row k at the end of control period k, row 0 the
-    start.
+    """A walk in place, one row per control step.
+
+    Row k is the end of control period k, row 0 the start.
 
     Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway
     between the feet.
@@ -103,28 +102,26 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     share = load_share(zmp, support_points(gait, biped.footholds))
     torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
-        gait,
-        timing,
-        q,
-        q_dot,
-        q_ddot,
-        zmp,
-        dynamics.zmp,
-        motion.com,
-        motion.com_dot,
-        com_height,
-        biped.gravity,
-        pelvis,
-        ankles,
-        share,
-        torque,
+        gait=gait,
+        timing=timing,
+        q=q,
+        q_dot=q_dot,
+        q_ddot=q_ddot,
+        zmp=zmp,
+        zmp_of_motion=dynamics.zmp,
+        com=motion.com,
+        com_dot=motion.com_dot,
+        com_height=com_height,
+        gravity=biped.gravity,
+        pelvis=pelvis,
+        ankles=ankles,
+        share=share,
+        torque=torque,
     )
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
-    """The same motion with the torques, and the ZMP, that it has on another robot of the same
-    size.
-    """
+    """The same motion with the torques and the ZMP that it has on another robot of that size."""
     dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
     torque = _joint_torque(biped, plan.ankles, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
@@ -139,30 +136,27 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
     """
     joints = [biped.rigid.joint(name) for name in biped.joint_names]
     low, high = np.array([joint.range for joint in joints]).T
-    _require(plan, biped, -plan.q, -low, "an angle of at least", "rad", sign=-1.0)
-    _require(plan, biped, plan.q, high, "an angle of at most", "rad")
-    _require(
-        plan,
-        biped,
-        np.abs(plan.q_dot),
-        np.array([s.speed_limit for s in servos]),
-        "a speed of at most",
-        "rad/s",
-    )
-    _require(
-        plan,
-        biped,
-        np.abs(plan.torque),
-        np.array([s.torque_limit for s in servos]),
-        "at most",
-        "N·m",
-    )
+    speed = np.array([servo.speed_limit for servo in servos])
+    torque = np.array([servo.torque_limit for servo in servos])
+    for needed, allowed, sign, what, unit in (
+        (-plan.q, -low, -1.0, "an angle of at least", "rad"),
+        (plan.q, high, 1.0, "an angle of at most", "rad"),
+        (np.abs(plan.q_dot), speed, 1.0, "a speed of at most", "rad/s"),
+        (np.abs(plan.torque), torque, 1.0, "at most", "N·m"),
+    ):
+        excess = needed - allowed
+        row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[row, joint] > 0.0:
+            raise ConfigurationError(
+                f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
+                f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * allowed[joint]:.3f}"
+                f" {unit}, the plan needs {sign * needed[row, joint]:.3f} {unit}; use longer"
+                " durations, a lower lift or another hip height"
+            )
 
 
 def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
-    """First and second derivative of samples, time first, by central differences; zero at the
-    ends, where it stands.
-    """
+    """First and second derivative by central differences, time first; zero at the ends."""
     first = np.zeros_like(samples)
     second = np.zeros_like(samples)
     first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
@@ -171,9 +165,7 @@ def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
 
 
 def swing_height(progress: Array) -> Array:
-    """Height of the swing foot over its lift, 64 s³ (1 − s)³: no speed and no acceleration at
-    both ends.
-    """
+    """Height of the swing foot over its lift, 64 s³ (1 − s)³: it starts and ends at rest."""
     return 64.0 * (progress * (1.0 - progress)) ** 3
 
 
@@ -190,21 +182,17 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Arra
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
-    com = pelvis + biped.chains.center_of_mass(
-        _angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1)
-    )
+    com = pelvis + biped.chains.center_of_mass(_angles(biped, pelvis, ankles[None], np.zeros(1)))
     return pelvis[0], float(com[0, 2])
 
 
 def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: Array) -> Array:
-    """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag
-    behind a little.
-    """
+    """Pelvis of one height that puts the center of mass where it belongs."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
         q = _angles(biped, pelvis, ankles, time)
-        error = pelvis[:, :2] + biped.chains.center_of_mass(q.reshape(len(q), 2, -1))[:, :2] - com
+        error = pelvis[:, :2] + biped.chains.center_of_mass(q)[:, :2] - com
         pelvis[:, :2] -= error
         if np.abs(error).max() < _COM_TOLERANCE_M:
             return pelvis
@@ -241,9 +229,7 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Dynamics:
-    """What a motion needs of the ground, (T, ...): force, its ZMP, its moment about the
-    vertical; and of the joints.
-    """
+    """Force of the ground, its ZMP and vertical moment; torque of the joints, (T, ...) each."""
 
     force: Array
     zmp: Array
@@ -278,27 +264,6 @@ def _joint_torque(
     moments = np.zeros_like(forces)
     moments[..., 2] = weights * dynamics.moment[:, None]
     arms = points - ankles
-    legs = biped.chains.posture(q.reshape(len(q), 2, -1))
     # soles and pelvis are level: the feet's frames are parallel to the world's
-    contact = LegLoads(legs, wrench=(forces, np.cross(arms, forces) + moments))
-    return dynamics.torque + contact.torque().reshape(len(q), -1)
-
-
-def _require(
-    plan: WalkPlan,
-    biped: Biped,
-    values: Array,
-    bound: Array,
-    what: str,
-    unit: str,
-    sign: float = 1.0,
-) -> None:
-    excess = values - bound
-    row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
-    if excess[row, joint] > 0.0:
-        raise ConfigurationError(
-            f"the walk asks too much of joint {biped.joint_names[joint]!r} at"
-            f" {plan.timing.time[row]:.3f} s: it allows {what} {sign * bound[joint]:.3f} {unit},"
-            f" the plan needs {sign * values[row, joint]:.3f} {unit}; use longer durations, a lower"
-            " lift or another hip height"
-        )
+    contact = biped.chains.loads(len(q), wrench=(forces, np.cross(arms, forces) + moments))
+    return dynamics.torque + biped.chains.torque(contact, q)

@@ -1,3 +1,1 @@
-"""Pictures in which one sees deviations of milliradians: they are drawn larger, by a factor that
-the picture shows.
-"""
+"""Pictures that enlarge deviations of milliradians, by a factor that they show."""

@@ -10,15 +10,14 @@ CURE = (
     "drawing needs OpenGL: with a display nothing more, without one libEGL (Debian, Ubuntu: "
     "apt-get install libegl1 libgl1-mesa-dri) and the environment variable MUJOCO_GL=egl"
 )
-"""What to tell someone whose machine cannot draw."""
+"""Cure for a machine that cannot draw."""
 
 
 def prefer_egl() -> None:
-    """Let MuJoCo draw through EGL where there is no display and EGL is installed; to be called
-    before its import.
-    """
-    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform == "linux" and not has_display and _VARIABLE not in os.environ and _has_egl():
+    """Let MuJoCo draw through EGL where there is no display. Call it before importing MuJoCo."""
+    is_told = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    is_told = is_told or _VARIABLE in os.environ
+    if sys.platform == "linux" and not is_told and _has_egl():
         os.environ[_VARIABLE] = "egl"
 
 

@@ -1,6 +1,4 @@
-"""What all pictures share: a MuJoCo model that is only drawn, as an image with a caption or in a
-window.
-"""
+"""MuJoCo models that are only drawn, as an image with a caption or in a window."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -69,7 +67,7 @@ class ModelPicture(ABC):
         """Lines of text for the state that was posed last."""
 
     def rgb(self, signals: Signals, world: int = 0) -> Image:
-        """See `Picture`."""
+        """An image of a world, (height, width, 3)."""
         caption = self._update(signals, world)
         if self._renderer is None:
             self._renderer = renderer(self._model)
@@ -77,7 +75,7 @@ class ModelPicture(ABC):
         return with_text(self._renderer.render(), caption, self._legend)
 
     def show(self, signals: Signals) -> None:
-        """See `Picture`."""
+        """Update the window, which shows the first world."""
         caption = self._update(signals, 0)
         if self._viewer is None:
             self._viewer = _window(self._model, self._data)
@@ -87,7 +85,7 @@ class ModelPicture(ABC):
         self._viewer.sync()
 
     def close(self) -> None:
-        """See `Picture`."""
+        """Free renderer and window."""
         if self._renderer is not None:
             self._renderer.close()
         if self._viewer is not None:
@@ -102,10 +100,15 @@ class ModelPicture(ABC):
         return self._caption(now, world)
 
 
+def paint(spec: mujoco.MjSpec, rgba: Rgba) -> None:
+    """Give all shapes one colour."""
+    for geom in spec.geoms:
+        geom.rgba = rgba
+        geom.material = ""
+
+
 def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
-    """Size of the images [pixels], a light background, and soft light from the side of the
-    camera.
-    """
+    """Set the size of the images [pixels], a light background and soft light."""
     spec.compiler.degree = False
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height
@@ -126,15 +129,16 @@ def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     try:
-        import glfw  # only here: a machine that only computes may have neither GLFW nor a display
-        import mujoco.viewer as viewers
+        # only here: a machine that only computes may have neither GLFW nor a display
+        import glfw
+        import mujoco.viewer as views
     except (ImportError, RuntimeError) as error:
         raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
     if not glfw.init():  # the viewer itself would end the process
         raise ElasticError(
             f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}"
         )
-    viewer = viewers.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    viewer = views.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     viewer.cam.fixedcamid = model.camera(CAMERA).id
     return viewer
@@ -147,7 +151,8 @@ def renderer(model: mujoco.MjModel) -> Any:
         ElasticError: The machine cannot draw.
     """
     try:
-        return mujoco.Renderer(model, model.vis.global_.offheight, model.vis.global_.offwidth)
+        size = model.vis.global_
+        return mujoco.Renderer(model, size.offheight, size.offwidth)
     except Exception as error:  # MuJoCo's OpenGL backends raise errors of many types
         raise ElasticError(f"the renderer could not start ({error}); {CURE}") from error
 
@@ -166,11 +171,7 @@ def with_text(image: Image, lines: list[str], legend: Legend = ()) -> Image:
         draw.text((_MARGIN, 10 + row * 1.25 * size), line, fill=_TEXT_RGB, font=font)
     x = float(_MARGIN)
     for word, rgba in legend:
-        draw.text(
-            (x, picture.height - 1.6 * size),
-            word,
-            fill=tuple(round(255 * c) for c in rgba[:3]),
-            font=font,
-        )
+        rgb = tuple(round(255 * share) for share in rgba[:3])
+        draw.text((x, picture.height - 1.6 * size), word, fill=rgb, font=font)
         x += draw.textlength(word, font=font) + size
     return np.asarray(picture)

@@ -1,6 +1,4 @@
-"""A robot that sags, in views side by side: deviations from a translucent reference are
-enlarged.
-"""
+"""A robot that sags beside its translucent reference, with enlarged deviations."""
 
 from collections.abc import Sequence
 
@@ -8,7 +6,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.rendering.picture import Image, renderer, set_stage
+from elastic_env.rendering.picture import Image, Rgba, paint, renderer, set_stage
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 
 ENLARGED = 8.0
@@ -37,7 +35,7 @@ class SagViews:
         self._model = shown.compile()
         self._joints = list(joints)
 
-    def drawn(self, q_ref: Array, links: Array) -> Image:
+    def draw(self, q_ref: Array, links: Array) -> Image:
         """Views in a row.
 
         Args:
@@ -52,7 +50,8 @@ class SagViews:
         with renderer(self._model) as renders:
             for wanted, q in zip(q_ref, links, strict=True):
                 enlarged = wanted + ENLARGED * (q - wanted)
-                for name, angle, reference in zip(self._joints, enlarged, wanted, strict=True):
+                angles = zip(self._joints, enlarged, wanted, strict=True)
+                for name, angle, reference in angles:
                     data.joint(name).qpos = angle
                     data.joint(_REFERENCE + name).qpos = reference
                 mujoco.mj_forward(self._model, data)
@@ -61,16 +60,15 @@ class SagViews:
         return np.concatenate(views, axis=1)
 
 
-def _painted(spec: mujoco.MjSpec, rgba: Sequence[float]) -> mujoco.MjSpec:
+def _painted(spec: mujoco.MjSpec, rgba: Rgba) -> mujoco.MjSpec:
     """A copy in one colour, without floors."""
     copy = spec.copy()
-    for geom in [geom for geom in copy.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-        copy.delete(geom)
+    for geom in list(copy.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            copy.delete(geom)
     if not copy.geoms:
         add_simple_bodies(copy)
-    for geom in copy.geoms:
-        geom.rgba = rgba
-        geom.material = ""
+    paint(copy, rgba)
     return copy
 
 

@@ -1,5 +1,6 @@
-"""A robot three times side by side, reference, motor side and link side, deviations from the
-reference enlarged.
+"""A robot three times side by side: reference, motor side and link side.
+
+Deviations from the reference are enlarged.
 
 What is drawn of a joint stands at q_ref + factor · (x − q_ref), where x is the angle of the motor
 or of the link. A floating base deviates from its planned pose by factor times its true deviation.
@@ -14,7 +15,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.rendering.picture import Rgba, set_stage
+from elastic_env.rendering.picture import paint, set_stage
 
 REFERENCE, MOTOR, LINK = COPIES = ("reference_", "motor_", "link_")
 """Prefixes of the names of the three robots, from left to right."""
@@ -69,7 +70,7 @@ class HasSides(Protocol):
         ...
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
-        """Where it is, from the present signals of a world."""
+        """Its posture, from the present signals of a world."""
         ...
 
 
@@ -101,28 +102,24 @@ class SideBySide:
     def __init__(self, robot: Alone) -> None:
         spec = mujoco.MjSpec()
         set_stage(spec, _SIZE, _SIZE)
-        for name in (
-            "cone",
-            "impratio",
-            "integrator",
-        ):  # as attaching wants them; nothing is stepped
+        for name in ("cone", "impratio", "integrator"):  # as attaching wants them
             setattr(spec.option, name, getattr(robot.spec.option, name))
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         robot.dress(spec)
-        forward = np.cross(
-            [0.0, 0.0, 1.0], robot.right
-        )  # where a viewer looks who sees them from left to right
-        spec.visual.global_.azimuth = float(np.degrees(np.arctan2(forward[1], forward[0])))
+        # where a viewer looks who sees them from left to right
+        forward = np.cross([0.0, 0.0, 1.0], robot.right)
+        azimuth = np.degrees(np.arctan2(forward[1], forward[0]))
+        spec.visual.global_.azimuth = float(azimuth)
         spec.visual.global_.elevation = _ELEVATION_DEG
-        self._offsets = {
-            copy: (number - 1) * np.array(robot.right) for number, copy in enumerate(COPIES)
-        }
-        for copy, rgba in zip(COPIES, (_REFERENCE_RGBA, _MOTOR_RGBA, None), strict=True):
-            spec.attach(
-                _painted(robot.spec, rgba),
-                prefix=copy,
-                frame=spec.worldbody.add_frame(pos=self._offsets[copy]),
-            )
+        right = np.array(robot.right)
+        self._offsets = {REFERENCE: -right, MOTOR: 0.0 * right, LINK: right}
+        colours = {REFERENCE: _REFERENCE_RGBA, MOTOR: _MOTOR_RGBA, LINK: None}
+        for copy, rgba in colours.items():
+            own = robot.spec.copy()
+            if rgba is not None:
+                paint(own, rgba)
+            frame = spec.worldbody.add_frame(pos=self._offsets[copy])
+            spec.attach(own, prefix=copy, frame=frame)
         self.model = spec.compile()
         self._robot = robot
 
@@ -135,7 +132,8 @@ class SideBySide:
             factor: By which deviations from the reference are enlarged.
         """
         bases = {REFERENCE: sides.base_ref, MOTOR: sides.base_ref, LINK: sides.base}
-        for copy, angles in ((REFERENCE, sides.q_ref), (MOTOR, sides.theta), (LINK, sides.q)):
+        sides_of = {REFERENCE: sides.q_ref, MOTOR: sides.theta, LINK: sides.q}
+        for copy, angles in sides_of.items():
             drawn = sides.q_ref + factor * (angles - sides.q_ref)
             for name, angle in zip(self._robot.joints, drawn, strict=True):
                 data.joint(copy + name).qpos = angle
@@ -143,11 +141,3 @@ class SideBySide:
                 pose = enlarged_pose(sides.base_ref, bases[copy], factor)
                 pose[:3] += self._offsets[copy]
                 data.joint(copy + self._robot.base).qpos = pose
-
-
-def _painted(spec: mujoco.MjSpec, rgba: Rgba | None) -> mujoco.MjSpec:
-    copy = spec.copy()
-    for geom in copy.geoms if rgba is not None else []:
-        geom.rgba = rgba
-        geom.material = ""
-    return copy

@@ -13,8 +13,7 @@ _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 def add_simple_bodies(spec: mujoco.MjSpec) -> None:
-    """Draw every link without a shape by rods to its next links, or by a ball about its center of
-    mass.
+    """Draw links without a shape by rods to the next links, or a ball about the center of mass.
 
     Rods and balls have no mass and touch nothing.
 

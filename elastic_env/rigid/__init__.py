@@ -1,3 +1,1 @@
-"""Rigid bodies, legs and what the ground does to feet: torques, Jacobians, contact, for many
-worlds in one pass.
-"""
+"""Rigid bodies and feet on the ground: torques, Jacobians, contact, for many worlds at once."""

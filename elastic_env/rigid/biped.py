@@ -1,4 +1,4 @@
-"""What a gait needs to know of a robot with two legs."""
+"""A robot with two legs, as its gait knows it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,13 @@ class Biped:
     @cached_property
     def chains_above_feet(self) -> LegChains:
         """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
-        return LegChains(self.rigid, self._legs, feet_weigh=False)
+        return LegChains(self.rigid, self._legs, weightless=self.feet)
+
+    @cached_property
+    def weightless_chains(self) -> LegChains:
+        """The legs as if all mass were in the pelvis."""
+        bodies = [int(self.rigid.joint(name).bodyid[0]) for name in self.joint_names]
+        return LegChains(self.rigid, self._legs, weightless=bodies)
 
     @cached_property
     def feet(self) -> list[int]:
@@ -74,7 +80,7 @@ class Biped:
 
     @property
     def ankles(self) -> Array:
-        """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
+        """Ankles with the feet flat on their footholds, left first, (2, 3) [m]."""
         return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
 
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:

@@ -1,5 +1,4 @@
-r"""How the ground's force is shared between the feet: Eqs. 5 and 6 of the paper, with the contact
-at the ZMP.
+r"""Share of the feet in the ground's force: Eqs. 5 and 6 of the paper, contact at the ZMP.
 
 Each foot takes its share of the force, F_r = μ F and F_l = (1 − μ) F, at a point of its own, so
 that both together act at the ZMP:
@@ -16,8 +15,9 @@ from elastic_env.core.signals import Array
 
 
 def load_share(point: Array, feet: Array) -> Array:
-    r"""Eq. 6: share μ of the weight on the right foot, \mathrm{clip}((p - p_l)·(p_r - p_l)/‖p_r -
-    p_l‖², 0, 1).
+    r"""Eq. 6: share μ of the weight on the right foot.
+
+    .. math:: \mu = \mathrm{clip}((p - p_l) \cdot (p_r - p_l) / \|p_r - p_l\|^2, 0, 1)
 
     Args:
         point: COM or ZMP in the ground plane, (..., 2) [m]; at rest they are the same.
@@ -38,9 +38,7 @@ def shares(share_right: Array) -> Array:
 
 
 def contact_points(zmp: Array, share_right: Array, feet: Array) -> Array:
-    """Where each foot's force acts, (..., 2, 2) [m]; arguments as `load_share`, zmp (..., 2)
-    [m].
-    """
+    """Points at which the forces of the feet act, (..., 2, 2) [m]; arguments as `load_share`."""
     weights = shares(share_right)
     rest = zmp - (weights[..., None] * feet).sum(axis=-2)
     return feet + rest[..., None, :]

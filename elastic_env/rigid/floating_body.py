@@ -17,8 +17,7 @@ from elastic_env.rigid.rigid_body import require_hinge_tree
 
 
 class FloatingBody:
-    """A robot whose base is free and level: translation of the base and its hinges, on (..., n)
-    arrays.
+    """A robot whose base is free and level, on (..., n) arrays.
 
     Args:
         model: Compiled rigid model with one free joint, at its base.
@@ -52,7 +51,7 @@ class FloatingBody:
     def inverse_dynamics(
         self, q: Array, base_dot: Array, q_dot: Array, base_ddot: Array, q_ddot: Array
     ) -> tuple[Array, Array]:
-        """What a motion needs besides gravity compensation, and gravity, without any contact.
+        """Forces and torques of a motion besides gravity compensation, without any contact.
 
         Args:
             q: Hinges, (N, n) [rad].
@@ -85,9 +84,7 @@ class FloatingBody:
         return wrench, torque
 
     def mass_matrix(self, q: Array) -> Array:
-        """Inertia of base translation, base rotation and hinges, (n,) [rad] to (6 + n, 6 + n)
-        [kg], [kg·m], [kg·m²].
-        """
+        """Inertia of base translation, base rotation, hinges: (n,) [rad] to (6 + n, 6 + n) [SI]."""
         position = np.zeros(self._model.nq)
         position[self._base_q + 6] = 1.0
         position[self._q] = q - self._zero
@@ -96,9 +93,7 @@ class FloatingBody:
         return np.triu(full)[np.ix_(rows, rows)] + np.triu(full, 1).T[np.ix_(rows, rows)]
 
     def center_of_mass(self, q: Array) -> Array:
-        """Center of mass of the whole robot in the frame of the base, (N, n) [rad] to (N, 3)
-        [m].
-        """
+        """Center of mass of the robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
         position = np.zeros(self._model.nq)
         position[self._base_q + 6] = 1.0
         com = np.empty((len(q), 3))

@@ -15,7 +15,7 @@ import numpy as np
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.rigid import leg_kernels as kernels
+from elastic_env.rigid.tree import kernels
 
 JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 """Joints of a leg, from the hip to the foot."""
@@ -35,8 +35,7 @@ class LegGeometry:
 
 
 def foot_pose(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
-    """Forward kinematics: ankle relative to the hip, and orientation of the foot, in the pelvis
-    frame.
+    """Forward kinematics: ankle from the hip and orientation of the foot, in the pelvis frame.
 
     Args:
         leg: Lengths.
@@ -53,8 +52,7 @@ def foot_pose(leg: LegGeometry, q: Array) -> tuple[Array, Array]:
 
 
 def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
-    """Inverse kinematics: joint angles that place the foot, with the knee bent backwards and the
-    hip above the sole.
+    """Inverse kinematics of a leg whose knee bends backwards and whose hip is above the sole.
 
     Args:
         leg: Lengths.

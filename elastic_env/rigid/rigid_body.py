@@ -14,13 +14,17 @@ from elastic_env.rigid.tree.links import Tree
 
 
 class RigidBody:
-    """A fixed-base tree of hinges, on (..., n) joint angles in a chosen order.
+    r"""Torques of the joints of a fixed-base tree of hinges, on (..., n) arrays.
+
+    .. math:: \tau = M \ddot q + c(q, \dot q) + \tau_g(q) - \tau_{gravcomp}(q) + k_s (q - q_s)
+
+    k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and
+    friction of the model are not in it.
 
     Args:
         model: Compiled rigid model.
         joints: Hinges of the model, in the order of the last axis.
         held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
-        gravcomp: Whether `gravcomp` of the bodies takes from their weight.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
@@ -31,42 +35,41 @@ class RigidBody:
         model: mujoco.MjModel,
         joints: Sequence[str],
         held: Mapping[str, float] | Mapping[int, float] | None = None,
-        gravcomp: bool = False,
     ) -> None:
         held = held or {}
         require_hinge_tree(model, joints, but=list(held))
-        self._tree = Tree.of(model, joints, held, gravcomp)
+        self._tree = Tree.of(model, joints, held)
         self._links: Any = self._tree.links
-        self._gravity = model.opt.gravity.copy()
+        self._loads: Any = np.zeros(1, kernels.loads_type(0))
+        self._loads["gravity"] = model.opt.gravity
         self._n = len(joints)
-        self._lanes: Any = np.zeros(len(self._links), kernels.LANES)
+        at = [int(model.joint(name).id) for name in joints]
+        self._spring = model.jnt_stiffness[at].copy()
+        self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
+        self._has_springs = bool(self._spring.any())
         compile_now(
             self._compile, np.zeros((1, len(joints)))
         )  # the first command of a live robot cannot wait
 
     def gravity_torque(self, q: Array) -> Array:
-        """τ_g that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
+        """Torque that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
         rows = self._rows(q)
         torque = np.empty(q.shape)
-        kernels.gravity_torques(
-            self._links, self._gravity, rows, self._lanes, torque.reshape(rows.shape)
-        )
-        return torque
+        kernels.gravity_torques(self._links, self._loads, rows, torque.reshape(rows.shape))
+        return self._with_springs(torque, q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         rows = self._rows(q)
         n = self._n
-        gradient = np.zeros((*q.shape, n))
-        kernels.gravity_gradients(
-            self._links, self._gravity, rows, self._lanes, gradient.reshape(len(rows), n, n)
-        )
+        gradient = np.empty((*q.shape, n))
+        kernels.gravity_gradients(self._links, self._loads, rows, gradient.reshape(len(rows), n, n))
+        if self._has_springs:
+            np.einsum("...ii->...i", gradient)[...] += self._spring
         return gradient
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
-        """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (...,
-        n) [N·m].
-        """
+        """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
         if not q.shape == q_dot.shape == q_ddot.shape:
             raise ElasticError(
                 f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape}"
@@ -74,10 +77,8 @@ class RigidBody:
             )
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
         torque = np.empty(q.shape)
-        kernels.inverse_dynamics(
-            self._links, self._gravity, motion, self._lanes, torque.reshape(motion[0].shape)
-        )
-        return torque
+        kernels.inverse_dynamics(self._links, self._loads, motion, torque.reshape(motion[0].shape))
+        return self._with_springs(torque, q)
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
         """Let a body carry one point mass, in the place of the last one.
@@ -87,7 +88,10 @@ class RigidBody:
             mass: Of the load, 0 for none [kg].
             place: In the frame of the body, (3,) [m].
         """
-        self._links = self._tree.loaded(body, mass, place)
+        self._links = self._tree.add_load(body, mass, place)
+
+    def _with_springs(self, torque: Array, q: Array) -> Array:
+        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
 
     def _rows(self, values: Array) -> Array:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
@@ -105,11 +109,15 @@ class RigidBody:
         self.inverse_dynamics(zero, zero, zero)
 
 
+def needs_more_than_gravity(model: mujoco.MjModel) -> bool:
+    """True where springs of joints or `gravcomp` act on the links of a model."""
+    return bool(model.jnt_stiffness.any() or model.body_gravcomp.any())
+
+
 def require_hinge_tree(
     model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()
 ) -> None:
-    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints by
-    name or number.
+    """Check that a rigid model moves by the named hinges alone, `but` some joints.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.

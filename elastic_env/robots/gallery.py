@@ -24,7 +24,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.known_torque import hinges_of
 from elastic_env.joint.model_file import read_model
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.rigid.rigid_body import RigidBody
 
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
@@ -230,8 +230,9 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
 def random_poses(
     model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES
 ) -> Array:
-    """Poses within the inner part of the joints' ranges, (number, n) [rad]; they may cross the
-    robot itself.
+    """Poses within the inner part of the joints' ranges, (number, n) [rad].
+
+    The robot may cross itself in them.
     """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
@@ -271,7 +272,7 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
     """  # noqa: E501
     names = hinges_of(model)
     poses = random_poses(model, np.random.default_rng(0))
-    torque = np.abs(TreeTorque(model, names).gravity_torque(poses)).max(axis=0)
+    torque = np.abs(RigidBody(model, names).gravity_torque(poses)).max(axis=0)
     inertia = np.array([_inertia(model, pose) for pose in poses])
     links = np.diagonal(inertia, axis1=1, axis2=2).max(axis=0)
     free = (1.0 / np.diagonal(np.linalg.inv(inertia), axis1=1, axis2=2)).min(axis=0)
@@ -296,8 +297,9 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
 
 
 def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:
-    """A servo that holds its angle: three equal poles for a rigid load, and no softer than the
-    spring behind it.
+    """A servo that holds its angle, no softer than the spring behind it.
+
+    It gives a rigid load three equal poles.
     """
     carried = max(inertia, stiffness / (3.0 * _SERVO_RATE**2))
     return Servo(

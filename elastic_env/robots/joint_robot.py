@@ -22,7 +22,7 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
-from elastic_env.joint.make_elastic import transformed
+from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.motion.arm_references import (
     AnyArmReference,
     ArmMotion,
@@ -32,25 +32,28 @@ from elastic_env.motion.arm_references import (
     make_arm_reference,
 )
 from elastic_env.motion.references import Multisine
-from elastic_env.registration import Robot, require_models
+from elastic_env.registration import Robot, as_model
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.robots.deviations import (
+    ENLARGEMENT,
+    HEIGHT,
+    REFERENCE_RGBA,
+    REFERENCE_WORD_RGBA,
+    WIDTH,
+    deviation_caption,
+)
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
 from elastic_env.world.joint_task import JointPlant, JointTask
-from elastic_env.world.robot_model import RobotModel, read_stiffness, with_stiffness
+from elastic_env.world.robot_model import RobotModel, joint_ranges, read_stiffness, with_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 from elastic_env.world.task import ACTION_BOUND_RAD
 
-_WIDTH = 640
-_HEIGHT = 480
-_ENLARGED = 8.0
-"""Factor by which a picture enlarges deviations from the reference."""
 _REFERENCE = "elastic_env_reference_"
-_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
-"""Prefix and colour of the robot that is the reference."""
+"""Prefix of the names of the robot that is the reference."""
 _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
 _POINT = 1e-4
@@ -77,18 +80,16 @@ class JointRobot:
         rigid: Makes the rigid model, all of whose joints are hinges.
         joints: Elastic joint of every hinge, with servo, in the order of all arrays.
         home: Angle about which each joint follows the reference, (n,) [rad]; None for zeros.
-        load: Body that carries what the scenario `payload` adds; None for that of the last joint.
         imu: Site of the accelerometer; None for a robot without one.
         end_effector: Site or body whose place and tilt are scored; None to score the joints alone.
         load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; None to
-            scale the mass of `load`.
+            scale the mass of the body of the last joint.
     """
 
     name: str
     rigid: Callable[[], mujoco.MjSpec]
     joints: Mapping[str, ElasticJoint]
     home: Sequence[float] | None = None
-    load: str | None = None
     imu: str | None = None
     end_effector: str | None = None
     load_kg: float | None = None
@@ -135,7 +136,6 @@ class JointRobot:
         Raises:
             ConfigurationError: A name, a parameter or a combination that does not exist.
         """
-        require_models(reward=(reward, RewardWeights))
         joints = dict(self.joints)
         if stiffness is not None:
             joints = with_stiffness(joints, read_stiffness(stiffness))
@@ -145,7 +145,7 @@ class JointRobot:
             joints=joints,
             form=form,
             sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
-            reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
+            reward=as_model("reward", reward, RewardWeights()),
             **({} if timestep_s is None else {"timestep_s": timestep_s}),
         )
 
@@ -159,7 +159,7 @@ class JointRobot:
         true = RobotModel(
             self._true_joints(config), self._loaded(config).compile(), config.control_period_s
         )
-        body = TreeTorque(true.rigid, true.joint_names)
+        body = RigidBody(true.rigid, true.joint_names)
         home = (
             np.zeros(len(true.joints))
             if self.home is None
@@ -196,12 +196,12 @@ class JointRobot:
         )
 
     def elastic(self, config: JointRobotConfig) -> mujoco.MjSpec:
-        """What moves: the model with the scenario's load and elastic joints, and with the sensors.
+        """The plant: the model with the scenario's load, with elastic joints, and with sensors.
 
         Raises:
             ConfigurationError: A sensor has no place.
         """
-        spec = transformed(self._loaded(config), self._true_joints(config), config.form)
+        spec = transform_hinges(self._loaded(config), self._true_joints(config), config.form)
         spec.option.timestep = config.timestep_s
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode, not restart the world behind the task's back
@@ -225,21 +225,15 @@ class JointRobot:
             return spec
         if self.load_kg is not None:
             return _carrying(spec, self.end_effector, (scale - 1.0) * self.load_kg)
-        return _scaled(spec, self._load_body(), scale)
-
-    def _load_body(self) -> str:
-        if self.load is not None:
-            return self.load
-        model = self.rigid().compile()
-        return str(model.body(model.joint(list(self.joints)[-1]).bodyid[0]).name)
+        last = spec.copy().compile().joint(list(self.joints)[-1])
+        return _scaled(spec, int(last.bodyid[0]), scale)
 
     def _task(self, config: JointRobotConfig, num_worlds: int) -> JointTask:
         return JointTask(config, self.plant(config), num_worlds)
 
 
 class JointPicture(ModelPicture):
-    """The robot, its deviations from the reference enlarged, and the reference as a translucent
-    robot.
+    """The robot with its deviations enlarged, and the reference as a translucent robot.
 
     Args:
         robot: What is drawn.
@@ -248,7 +242,7 @@ class JointPicture(ModelPicture):
 
     def __init__(self, robot: JointRobot, task: JointTask) -> None:
         spec = robot.rigid()
-        set_stage(spec, _WIDTH, _HEIGHT)
+        set_stage(spec, WIDTH, HEIGHT)
         look = spec.copy().compile().stat
         x, y, z = look.center
         spec.worldbody.add_camera(
@@ -265,20 +259,20 @@ class JointPicture(ModelPicture):
         )
         reference = robot.rigid()
         for geom in reference.geoms:
-            geom.rgba = _REFERENCE_RGBA
+            geom.rgba = REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-        super().__init__(spec, (("translucent: reference", (0.27, 0.55, 0.37, 1.0)),))
+        super().__init__(spec, (("translucent: reference", REFERENCE_WORD_RGBA),))
         self._robot = robot
         self._task = task
         self._joints = list(robot.joints)
 
     def alone(self) -> Alone:
-        """See `HasSides`."""
+        """The robot of a side-by-side picture."""
         extent = self._robot.rigid().compile().stat.extent
         return Alone(self._robot.rigid(), self._joints, (1.5 * extent, 0.0, 0.0))
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
-        """See `HasSides`."""
+        """Reference, motor side and link side of a world."""
         truth = self._task.truth()
         q_ref = self._task.sample().joints["truth"]["q_ref"]
         return Sides(q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
@@ -286,25 +280,17 @@ class JointPicture(ModelPicture):
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         q = self._task.truth().q[world]
         q_ref = self._task.sample().joints["truth"]["q_ref"][world]
-        drawn = q_ref + _ENLARGED * (q - q_ref)
+        drawn = q_ref + ENLARGEMENT * (q - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return [
-            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {_ENLARGED:g}",
-            (
-                f"deflection {1e3 * now['deflection']:6.2f} mrad     link error"
-                f" {1e3 * now['link_error']:6.2f} mrad"
-            ),
-        ]
+        return deviation_caption(now)
 
 
 def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
-    """Joints as a compensator knows them: where the scenario is without friction, it knows of
-    none.
-    """
+    """Joints as a compensator knows them: without friction where the scenario has none."""
     if config.scenario.friction_scale > 0.0:
         return config.joints
     return {
@@ -313,14 +299,14 @@ def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
     }
 
 
-def _scaled(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
+def _scaled(spec: mujoco.MjSpec, body: int, scale: float) -> mujoco.MjSpec:
     """A model with the mass of a body scaled, where it is."""
-    made = spec.copy().compile().body(body)
-    carrier = spec.body(body)
-    carrier.mass = float(made.mass[0]) * scale
-    carrier.inertia = made.inertia * scale
-    carrier.ipos = made.ipos
-    carrier.iquat = made.iquat
+    compiled = spec.copy().compile().body(body)
+    carrier = spec.body(compiled.name)
+    carrier.mass = float(compiled.mass[0]) * scale
+    carrier.inertia = compiled.inertia * scale
+    carrier.ipos = compiled.ipos
+    carrier.iquat = compiled.iquat
     carrier.explicitinertial = True
     return spec
 
@@ -343,29 +329,16 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
 
 
 def _workspace(
-    robot: RobotModel, body: TreeTorque, home: Array, tool: EndEffector | None
+    robot: RobotModel, body: RigidBody, home: Array, tool: EndEffector | None
 ) -> Workspace:
-    """What references have to know of a robot, by its true model."""
-    at = [int(robot.rigid.joint(name).id) for name in robot.joint_names]
-    ranges = np.where(
-        robot.rigid.jnt_limited[at].astype(bool)[:, None],
-        robot.rigid.jnt_range[at],
-        [-np.inf, np.inf],
-    )
-    return Workspace(
-        tuple(robot.joint_names),
-        ranges[:, 0],
-        ranges[:, 1],
-        home,
-        partial(_holds, robot, body),
-        tool,
-    )
+    """Joint ranges, home and load limits of a robot, which references need; by its true model."""
+    lowest, highest = joint_ranges(robot.rigid, robot.joint_names)
+    holds = partial(_holds, robot, body)
+    return Workspace(tuple(robot.joint_names), lowest, highest, home, holds, tool)
 
 
-def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
-    """Whether servos hold poses with a fifth of their torque to spare, from (..., n) [rad] to
-    (...).
-    """
+def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
+    """True if servos hold poses with a fifth of their torque to spare, (..., n) [rad] to (...)."""
     limits = np.array([servo.torque_limit for servo in robot.servos])
     return np.all(
         np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1
@@ -375,11 +348,12 @@ def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
 def _require_torque(
     config: JointRobotConfig,
     robot: RobotModel,
-    body: TreeTorque,
+    body: RigidBody,
     motion: tuple[Array, Array, Array],
 ) -> None:
-    """Refuse a reference that the servos cannot follow; `motion` has its angles, rates and
-    accelerations.
+    """Refuse a reference that the servos cannot follow.
+
+    `motion` has its angles, rates and accelerations.
     """
     q, q_dot, q_ddot = motion
     needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(
@@ -423,16 +397,13 @@ def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: A
 
 def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> None:
     """Refuse a reference that presses a joint against its limit."""
-    for column, name in enumerate(robot.joint_names):
-        joint = robot.rigid.joint(name).id
-        lowest, highest = robot.rigid.jnt_range[joint]
-        least = float(q[:, column].min())
-        most = float(q[:, column].max())
-        if robot.rigid.jnt_limited[joint] and (least < lowest or most > highest):
+    ranges = joint_ranges(robot.rigid, robot.joint_names)
+    for name, lowest, highest, own in zip(robot.joint_names, *ranges, q.T, strict=True):
+        if own.min() < lowest or own.max() > highest:
             raise ConfigurationError(
-                f"the reference {config.reference.kind!r} moves joint {name!r} from {least:.3f} to"
-                f" {most:.3f} rad, and its range is {lowest:.3f} to {highest:.3f} rad; lower the"
-                " amplitude, or choose another home"
+                f"the reference {config.reference.kind!r} moves joint {name!r} from"
+                f" {own.min():.3f} to {own.max():.3f} rad, and its range is {lowest:.3f} to"
+                f" {highest:.3f} rad; lower the amplitude, or choose another home"
             )
 
 
@@ -443,10 +414,11 @@ def _rest_angle(
     *,
     form: str,
     true: RobotModel,
-    body: TreeTorque,
+    body: RigidBody,
 ) -> Array:
-    """Link angles at rest without friction: a dead band is crossed to the side to which the load
-    pulls.
+    """Link angles at rest without friction.
+
+    A dead band is crossed to the side to which the load pulls.
     """
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():

@@ -1,3 +1,1 @@
-"""Worlds in time: physics, sensors, scenarios, episodes with their metrics, and the faces that
-Gymnasium sees.
-"""
+"""Worlds in time: physics, sensors, scenarios, episodes, metrics, and their Gymnasium faces."""

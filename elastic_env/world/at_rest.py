@@ -1,4 +1,4 @@
-"""Whether joints rest where scores at rest are taken."""
+"""A warning where joints move while they are scored at rest."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -80,8 +80,9 @@ class RestWatch:
             self._judge(q_ref[ended], (self._most - self._least)[:, ended], rest[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
-        """Warn of windows that end; `moved` is by how much links and commands moved within them,
-        (2, ended, n).
+        """Warn of windows that end.
+
+        `moved` says by how much links and commands moved within them, (2, ended, n).
         """
         sag = np.abs(self._static_torque(q_ref) / self._stiffness).max(axis=-1)
         links, commands = moved.max(axis=-1)

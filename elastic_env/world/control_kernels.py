@@ -24,7 +24,7 @@ SECOND_HALF = 2
 
 
 class Joints(NamedTuple):
-    """What does not change of the joints within an episode.
+    """Constants of the joints within an episode.
 
     Attributes:
         at: Where they stand in the physics, (n,).
@@ -44,16 +44,14 @@ class Joints(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,),
-    which is counted here.
-    """
+    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,)."""
 
     samples: Any
     used: IntArray
 
 
 class Commanded(NamedTuple):
-    """What was commanded in the control step that has gone by.
+    """Commands of the control step that has gone by.
 
     Attributes:
         offset: Within their bounds, (num_worlds, n) [rad].
@@ -70,8 +68,9 @@ class Commanded(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The control step before and the present one, which is filled: joints (num_worlds, n),
-    worlds (num_worlds,).
+    """The control step before, and the present one, which is filled.
+
+    Joints are (num_worlds, n), worlds (num_worlds,).
     """
 
     last_joints: Any
@@ -81,7 +80,7 @@ class Steps(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What a step fills beside its records.
+    """Arrays that a step fills beside its records.
 
     Attributes:
         observed: Observation, (num_worlds, columns).
@@ -105,8 +104,9 @@ def command(
     is_clipped: BoolArray,
     inputs: Array,
 ) -> bool:
-    """Servo inputs of the coming control period, q_ref + offset, by encoders that are off by their
-    homing error.
+    """Servo inputs of the coming control period, q_ref + offset.
+
+    Encoders are off by their homing error.
 
     Args:
         joints: `Joints`.
@@ -143,8 +143,9 @@ def command(
 
 @compiled
 def begin_joints(qpos: Array, qvel: Array, joints: Joints, worlds: BoolArray, steps: Steps) -> None:
-    """Truth and measurements of joints at the start of an episode in some worlds, where they
-    have been at rest.
+    """Truth and measurements of joints at the start of an episode in some worlds.
+
+    The joints have been at rest.
     """
     for world in range(len(worlds)):
         if worlds[world]:
@@ -170,9 +171,7 @@ def begin_joints(qpos: Array, qvel: Array, joints: Joints, worlds: BoolArray, st
 def sense_joints(
     qpos: Array, qvel: Array, joints: Joints, commanded: Commanded, steps: Steps, observed: Array
 ) -> None:
-    """The joints' part of a control step after the physics: keep the command, read, measure,
-    observe.
-    """
+    """Joints after the physics of a control step: keep the command, read, measure, observe."""
     offset = commanded.offset
     diverged = commanded.diverged
     n = len(joints.at)
@@ -259,7 +258,7 @@ def observe_joints(
     period_s: float,
     observed: Array,
 ) -> None:
-    """What a policy sees of the joints, and what they are to do in the coming control period."""
+    """Fill the joints' columns of an observation, the coming reference among them."""
     columns = joints.columns[0]
     coming = min(step + 1, len(plan) - 1)
     for i in range(len(joints.at)):
@@ -276,7 +275,7 @@ def observe_joints(
 
 
 class Links(NamedTuple):
-    """What does not change of links on a fixed base.
+    """Constants of links on a fixed base.
 
     Attributes:
         schedule: What the reference says of every step, (steps,).
@@ -298,8 +297,9 @@ class Links(NamedTuple):
 def begin_links(
     qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, worlds: BoolArray, steps: Any
 ) -> None:
-    """Truth and measurements of links at the start of an episode in some worlds, which have been
-    at rest.
+    """Truth and measurements of links at the start of an episode in some worlds.
+
+    The links have been at rest.
     """
     joints = Joints(*joints)
     links = Links(*links)
@@ -378,10 +378,10 @@ def sense_links(
         for i in range(len(joints.at)):
             error = steps.joints[world, i].truth.q_ref - steps.joints[world, i].truth.q
             total += error * error
-        weights = constants.weights
-        scores.link_error = weights.link_error * tracking_penalty(math.sqrt(total / len(joints.at)))
-        scores.command_rate = weights.command_rate * smoothness_penalty(truth.command_rate)
-        scores.divergence = weights.divergence * divergence_penalty(diverged[world])
+        weights = constants.weights  # of penalties that grow without saturating
+        scores.link_error = weights.link_error * -math.sqrt(total / len(joints.at))
+        scores.command_rate = weights.command_rate * -truth.command_rate
+        scores.divergence = weights.divergence * (-1.0 if diverged[world] else -0.0)
         results.reward[world] = scores.link_error + scores.command_rate + scores.divergence
     return is_over
 
@@ -403,20 +403,6 @@ def show_link(
     )
 
 
-@compiled
-def tracking_penalty(link_error: float) -> float:
-    """−rms of q_ref − q over the joints [rad]: linear, so that a large error never stops to
-    matter.
-    """
-    return -link_error
-
-
-@compiled
-def divergence_penalty(diverged: bool) -> float:
-    """−1 in the step in which the simulation diverges."""
-    return -1.0 if diverged else -0.0
-
-
 # walkers
 
 
@@ -432,7 +418,7 @@ class Physics(NamedTuple):
 
 
 class Walker(NamedTuple):
-    """What does not change of walkers within an episode.
+    """Constants of walkers within an episode.
 
     Attributes:
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
@@ -454,8 +440,9 @@ class Walker(NamedTuple):
 def begin_walk(
     physics: Any, joints: Any, walker: Any, noise: Any, worlds: BoolArray, steps: Any
 ) -> None:
-    """Truth and measurements of walkers at the start of an episode in some worlds, which have
-    been at rest.
+    """Truth and measurements of walkers at the start of an episode in some worlds.
+
+    The walkers have been at rest.
     """
     physics = Physics(*physics)
     joints = Joints(*joints)
@@ -463,29 +450,19 @@ def begin_walk(
     noise = Noise(*noise)
     steps = Steps(*steps)
     begin_joints(physics.qpos, physics.qvel, joints, worlds, steps)
-    feet = feet_to_be_filled()
     for world in range(len(worlds)):
         if worlds[world]:
             truth = steps.worlds[world].truth
             shown = steps.worlds[world].shown
-            bias = walker.bias[world]
             kind = joints.kind[world]
             constants = walker.constants[kind]
             truth.contact_since = -1
             read_body(physics, constants, world, truth)
-            stand(physics, constants, world, truth, feet)
+            stand(physics, constants, world, truth)
             drawn = sample_of(noise, world)
-            settle_imu(walker.inertial, kind, truth, drawn, bias, constants.quality, shown)
-            measure(
-                walker.inertial,
-                kind,
-                truth,
-                drawn,
-                bias,
-                constants.quality,
-                walker.plan[0].imu_is_due,
-                shown,
-            )
+            is_due = walker.plan[0].imu_is_due
+            settle_imu(walker.inertial, walker, kind, world, truth, drawn, shown)
+            measure(walker.inertial, walker, kind, world, truth, drawn, is_due, shown)
 
 
 @compiled
@@ -516,10 +493,8 @@ def sense_walk(
     sense_joints(physics.qpos, physics.qvel, joints, commanded, steps, results.observed)
     diverged = commanded.diverged
     is_over = False
-    feet = feet_to_be_filled()
     for world in range(len(diverged)):
         kind = joints.kind[world]
-        bias = walker.bias[world]
         last = steps.last_worlds[world]
         constants = walker.constants[kind]
         rules = constants.rules
@@ -529,23 +504,13 @@ def sense_walk(
         planned = row_of(walker.plan, truth.step)
         if not diverged[world]:
             read_body(physics, constants, world, truth)
-            stand(physics, constants, world, truth, feet)
+            stand(physics, constants, world, truth)
             drawn = sample_of(noise, world)
-            quality = constants.quality
+            is_due = planned.imu_is_due
             period_s = joints.rules[kind].control_period_s
-            advance_imu(
-                walker.inertial, kind, last.truth, truth, drawn, bias, quality, period_s, shown
-            )
-            measure(
-                walker.inertial,
-                kind,
-                truth,
-                drawn,
-                bias,
-                constants.quality,
-                planned.imu_is_due,
-                shown,
-            )
+            before = last.truth
+            advance_imu(walker.inertial, walker, kind, world, before, truth, drawn, period_s, shown)
+            measure(walker.inertial, walker, kind, world, truth, drawn, is_due, shown)
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
         is_over = end(truth, rules, diverged[world], is_last, results.ends[:, world]) or is_over
@@ -588,8 +553,9 @@ def sample_of(noise: Noise, world: int) -> Any:
 
 @compiled
 def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
-    """State of pelvis and feet as the physics has it; MuJoCo's wrench acts on the foot, ours on
-    the leg.
+    """State of pelvis and feet as the physics has it.
+
+    MuJoCo's wrench acts on the foot, ours on the leg.
     """
     qpos = physics.qpos[world]
     qvel = physics.qvel[world]
@@ -606,41 +572,31 @@ def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
             row.ankles[foot, i] = physics.site_xpos[world, at.ankles[foot], i]
             row.wrench[foot, 0, i] = -physics.sensordata[world, 6 * foot + i]
             row.wrench[foot, 1, i] = -physics.sensordata[world, 6 * foot + 3 + i]
-    row.roll, row.pitch, row.tilt = attitude_of(row.quaternion)
-
-
-@compiled
-def attitude_of(quaternion: Array) -> tuple[float, float, float]:
-    """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad]."""
-    w = quaternion[0]
-    x = quaternion[1]
-    y = quaternion[2]
-    z = quaternion[3]
-    # the vertical in the frame of the pelvis
-    return attitude_by(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    w = row.quaternion[0]
+    x = row.quaternion[1]
+    y = row.quaternion[2]
+    z = row.quaternion[3]
+    up_x = 2.0 * (x * z - w * y)
+    up_y = 2.0 * (y * z + w * x)
+    row.roll, row.pitch, row.tilt = attitude_by(up_x, up_y, 1.0 - 2.0 * (x * x + y * y))
 
 
 @compiled
 def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, float]:
-    """As `attitude_of`, by the vertical in the frame that is tilted, a unit vector [1]."""
+    """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad].
+
+    They follow from the vertical in the frame that is tilted, a unit vector [1].
+    """
     pitch = math.asin(min(max(-up_x, -1.0), 1.0))
     return math.atan2(up_y, up_z), pitch, math.atan2(math.hypot(up_x, up_y), up_z)
 
 
 @compiled
-def feet_to_be_filled() -> tuple[Array, Array, Array]:
-    """Orientation of two feet, (2, 3, 3), force and moment of the ground on them, (2, 3) each,
-    for `stand`.
-    """
-    return np.empty((2, 3, 3)), np.empty((2, 3)), np.empty((2, 3))
-
-
-@compiled
-def stand(
-    physics: Physics, constants: Any, world: int, row: Any, feet: tuple[Array, Array, Array]
-) -> None:
+def stand(physics: Physics, constants: Any, world: int, row: Any) -> None:
     """Force of the ground on the feet, and the ZMP."""
-    foot_R, force, moment = feet
+    foot_R = np.empty((2, 3, 3))
+    force = np.empty((2, 3))
+    moment = np.empty((2, 3))
     for foot in range(2):
         for i in range(3):
             for j in range(3):
@@ -667,15 +623,17 @@ def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
 @compiled
 def measure(
     inertial: Any,
+    walker: Walker,
     kind: int,
+    world: int,
     row: Any,
     noise: Any,
-    bias: Any,
-    quality: Any,
     imu_is_due: bool,
     shown: Any,
 ) -> None:
-    """What IMU and foot sensors show; an IMU that is not due shows its last sample."""
+    """Sample IMU and foot sensors; an IMU that is not due shows its last sample."""
+    bias = walker.bias[world]
+    quality = walker.constants[kind].quality
     for foot in range(2):
         for i in range(3):
             force = row.wrench[foot, 0, i]
@@ -700,8 +658,9 @@ def measure(
 
 @compiled
 def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any) -> bool:
-    """What an inertial IMU shows of its own state, and whether one is fitted: errors of the
-    mounting come on top.
+    """Show the state of an inertial IMU, where one is fitted; the result says so.
+
+    Errors of the mounting come on top.
     """
     if inertial is None:
         return False
@@ -719,14 +678,14 @@ def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any)
 
 @compiled
 def settle_imu(
-    inertial: Any, kind: int, row: Any, noise: Any, bias: Any, quality: Any, shown: Any
+    inertial: Any, walker: Walker, kind: int, world: int, row: Any, noise: Any, shown: Any
 ) -> None:
-    """An inertial IMU that has been at rest for long: its filter has settled, a bias of the
-    gyroscope included.
-    """
+    """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
     if inertial is None:
         return
     sensor = inertial[kind]
+    bias = walker.bias[world]
+    quality = walker.constants[kind].quality
     force = np.empty(3)
     if not sensor.is_fitted:
         return
@@ -740,33 +699,37 @@ def settle_imu(
 @compiled
 def advance_imu(
     inertial: Any,
+    walker: Walker,
     kind: int,
+    world: int,
     before: Any,
     row: Any,
     noise: Any,
-    bias: Any,
-    quality: Any,
     period_s: float,
     shown: Any,
 ) -> None:
-    """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical
-    by its filter.
+    """Advance an inertial IMU by a control period.
+
+    Its gyroscope measures the mean rate, and its filter turns the vertical.
 
     Args:
-        inertial: Records of `INERTIAL`, or None.
-        kind: Which of them.
+        inertial: That of `walker`, as an argument of its own: Numba then leaves out all of this
+            where it is None.
+        walker: `Walker`.
+        kind: Which of its constants hold.
+        world: Number of the world.
         before: Truth at the beginning of the period.
         row: And at its end.
         noise: Sample of the sensors; that of the attitude is of the accelerometer, across the
             vertical.
-        bias: Of the world.
-        quality: One record of `QUALITY`.
         period_s: Control period [s].
         shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
     """
     if inertial is None:
         return
     sensor = inertial[kind]
+    bias = walker.bias[world]
+    quality = walker.constants[kind].quality
     if not sensor.is_fitted:
         return
     force = np.empty(3)
@@ -790,8 +753,9 @@ def advance_imu(
 def specific_force(
     before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array
 ) -> None:
-    """Mean specific force over a period, acceleration minus gravity, in the frame at its end:
-    into `force` [m/s²].
+    """Mean specific force over a period, in the frame at its end: into `force` [m/s²].
+
+    It is acceleration minus gravity.
     """
     w = row.quaternion[0]
     x = row.quaternion[1]
@@ -807,8 +771,9 @@ def specific_force(
 
 @compiled
 def rotation_between(before: Array, after: Array, turned: Array) -> None:
-    """Rotation vector from one unit quaternion to another, in the frame that turns: into
-    `turned`, (3,) [rad].
+    """Rotation vector from one unit quaternion to another: into `turned`, (3,) [rad].
+
+    It stands in the frame that turns.
     """
     a = before
     b = after
@@ -825,8 +790,9 @@ def rotation_between(before: Array, after: Array, turned: Array) -> None:
 
 @compiled
 def complementary_filter(up: Array, turned: Array, force: Array, gain: float) -> None:
-    r"""One step of a complementary filter of the vertical, the explicit one of [Mahony2008] without
-    bias estimation.
+    r"""One step of the explicit complementary filter of the vertical [Mahony2008].
+
+    The bias is not estimated.
 
     .. math:: \dot u = u \times (\omega + \tfrac{1}{\tau} \, f / |f| \times u)
 
@@ -866,8 +832,9 @@ def complementary_filter(up: Array, turned: Array, force: Array, gain: float) ->
 
 @compiled
 def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: float) -> None:
-    """The vertical where the filter rests, for a constant force and a small bias of the
-    gyroscope: into `up`, (3,).
+    """The vertical where the filter rests: into `up`, (3,).
+
+    The force is constant, and the bias of the gyroscope is small.
     """
     size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     x = force[0] / size
@@ -922,9 +889,9 @@ def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any)
     deviation = math.hypot(row.zmp[0] - planned.zmp[0], row.zmp[1] - planned.zmp[1])
     terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
     terms.zmp = weights.zmp * planned.weight * zmp_penalty(deviation)
-    terms.effort = weights.effort * effort_penalty(row.servo_torque)
-    terms.smoothness = weights.smoothness * smoothness_penalty(row.command_rate)
-    terms.fall = weights.fall * fall_penalty(is_terminated)
+    terms.effort = weights.effort * -row.servo_torque
+    terms.smoothness = weights.smoothness * -row.command_rate
+    terms.fall = weights.fall * (-1.0 if is_terminated else 0.0)
     return terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
 
 
@@ -941,28 +908,8 @@ def zmp_penalty(zmp_deviation: Parameter) -> Any:
 
 
 @compiled
-def effort_penalty(servo_torque: float) -> float:
-    """−rms of the servos' torques over the joints [N·m]."""
-    return -servo_torque
-
-
-@compiled
-def smoothness_penalty(command_rate: float) -> float:
-    """−rms over the joints of the change of the offsets [rad/s]."""
-    return -command_rate
-
-
-@compiled
-def fall_penalty(is_terminated: bool) -> float:
-    """−1 in the step in which the robot falls or the simulation diverges."""
-    return -1.0 if is_terminated else 0.0
-
-
-@compiled
 def observe_walk(shown: Any, coming: Any, columns: Any, observed: Array) -> None:
-    """What a policy sees of a walker beside its joints, see the table of
-    `elastic_env.robots.thormang.task`.
-    """
+    """Fill the walker's columns of an observation, beside those of its joints."""
     observed[columns.load_share] = coming.share
     for i in range(2):
         observed[columns.imu_attitude + i] = shown.imu_attitude[i]
@@ -997,8 +944,9 @@ def rms_of_rows(values: Array) -> Array:
 def ground_wrench(
     sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
 ) -> None:
-    """Wrench of the ground on the feet of one robot, see `FootSensors`: into `force` and
-    `moment`, (L, 3).
+    """Wrench of the ground on the feet of one robot: into `force` and `moment`, (L, 3).
+
+    `FootSensors` has the equation.
     """
     c = np.empty(3)
     for foot in range(len(sensors)):

@@ -28,7 +28,7 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class _Faces:
-    """What both environments show of their task."""
+    """Properties of both environments."""
 
     task: Task
     """The rules of this environment."""
@@ -49,7 +49,7 @@ class _Faces:
 
     @property
     def assumed_model(self) -> RobotModel:
-        """What a compensator may know of the robot."""
+        """The robot as a compensator may know it."""
         return self.task.assumed_model
 
     @property
@@ -58,15 +58,17 @@ class _Faces:
         return self.task.simulation
 
     def truth(self) -> Any:
-        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing
-        else.
-        """
+        """Noise-free state and true parameters, for scoring and the `oracle` policy alone."""
         return self.task.truth()
 
     @property
     def picture(self) -> Picture:
-        """What draws the worlds, made when it is first asked for."""
-        return self._draw()
+        """The picture of the worlds, made when it is first asked for."""
+        if self._picture is None:
+            if self._make_picture is None:
+                raise ConfigurationError("this environment has no picture")
+            self._picture = self._make_picture()
+        return self._picture
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but window and renderer, which are made again when they are needed."""
@@ -78,13 +80,6 @@ class _Faces:
         if self._picture is not None:
             self._picture.close()
             self._picture = None
-
-    def _draw(self) -> Picture:
-        if self._picture is None:
-            if self._make_picture is None:
-                raise ConfigurationError("this environment has no picture")
-            self._picture = self._make_picture()
-        return self._picture
 
 
 class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -122,8 +117,9 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode, with options["robot_seed"] = s of the robot, and motion, that
-        `reset(seed=s)` draws.
+        """Begin an episode.
+
+        With options["robot_seed"] = s it has the robot, and the motion, that `reset(seed=s)` draws.
         """
         super().reset(seed=seed, options=options)
         self.task.restart(
@@ -147,10 +143,8 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         )
 
     def render(self) -> Any:
-        """The present picture as an RGB array, (height, width, 3) uint8; None in the other
-        modes.
-        """
-        return self._draw().rgb(self.task.signals()) if self.render_mode == "rgb_array" else None
+        """The present picture, (height, width, 3) uint8; None unless the mode is "rgb_array"."""
+        return self.picture.rgb(self.task.signals()) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Close the window, free the renderer, let hardware go."""
@@ -158,7 +152,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
     def _render_human(self) -> None:
         if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
-            self._draw().show(self.task.signals())
+            self.picture.show(self.task.signals())
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
@@ -249,7 +243,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
 
     @property
     def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What Gymnasium's wrappers ask for."""
+        """Metadata for Gymnasium's wrappers."""
         return {
             **ElasticEnv.metadata,
             "render_modes": ["rgb_array"],
@@ -257,13 +251,11 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         }
 
     def render(self) -> tuple[Observation, ...] | None:
-        """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms
-        each.
-        """
+        """The present picture of every world, (height, width, 3) uint8; each takes some 20 ms."""
         if self.render_mode is None:
             return None
         signals = self.task.signals()
-        return tuple(self._draw().rgb(signals, world) for world in range(self.num_envs))
+        return tuple(self.picture.rgb(signals, world) for world in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
         """Free the renderer, let hardware go."""
@@ -274,9 +266,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
-        """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts
-        for nothing.
-        """
+        """NEXT_STEP: worlds that ended in the last step begin anew, and this one does not count."""
         self._begin(worlds)
         fresh = self.task.signals()
         info = _restarted_info(result.info, worlds, fresh)
@@ -289,8 +279,9 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         )
 
     def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
-        """SAME_STEP: the worlds that end begin anew at once; their last observation and info are
-        kept beside.
+        """SAME_STEP: the worlds that end begin anew at once.
+
+        Their last observation and info are kept.
         """
         final = final_of(result.observation, _with_mask(result.info, result.done), result.done)
         self._begin(result.done)
@@ -299,9 +290,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
 
 
 def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
-    """What Gymnasium's SAME_STEP keeps of the worlds that end: their last observation, and the
-    info of the step.
-    """
+    """Last observation and info of worlds that end, as Gymnasium's SAME_STEP keeps them."""
     last = np.full(len(done), None, dtype=object)
     for world in np.flatnonzero(done):
         last[world] = observation[world].copy()

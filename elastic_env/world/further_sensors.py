@@ -1,5 +1,4 @@
-"""Sensors beyond the standard set of a robot: each is declared once, and observed where
-`sensors=[...]` asks for it.
+"""Sensors beyond the standard set of a robot, observed where `sensors=[...]` asks for them.
 
 | name | columns | unit | shows | error in `nominal`, none in `ideal` |
 |---|---|---|---|---|
@@ -30,7 +29,7 @@ from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
 
 @dataclass(frozen=True)
 class SensorInputs:
-    """What sensors need of the truth of a task, one row per world.
+    """The truth that sensors need, one row per world.
 
     Attributes:
         q: Link angles, (num_worlds, n) [rad].
@@ -113,7 +112,7 @@ def specific_force(model: mujoco.MjModel, sensordata: Array | None, num_worlds: 
 
 
 class FurtherSensors:
-    """What some sensors of all worlds show.
+    """Further sensors of all worlds.
 
     Args:
         names: Of `SENSORS`.
@@ -181,8 +180,9 @@ class FurtherSensors:
         self._now = np.where(worlds[:, None], np.hstack(shown), self._now)
 
     def columns(self, is_delayed: BoolArray) -> Array:
-        """What they show, (num_worlds, columns); in worlds whose measurements are old, a control
-        step ago.
+        """Measurements, (num_worlds, columns).
+
+        In worlds whose measurements are delayed they are one control step old.
         """
         return np.where(is_delayed[:, None], self._before, self._now)
 

@@ -25,14 +25,14 @@ class RewardWeights(Model):
 
 
 class JointConfig(Model):
-    """What all tasks of elastic joints have."""
+    """Parameters of all tasks of elastic joints."""
 
     reference: Reference = Hold()
     scenario: Scenario = make_scenario("nominal")
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
+    """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
     timestep_s: float = quantity("s", 5e-4, gt=0)
@@ -50,9 +50,7 @@ class JointConfig(Model):
         return self
 
     def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A joint as the plant has it, which the scenario makes differ from the one that is
-        known.
-        """
+        """A known joint as the plant of the scenario has it."""
         scenario = self.scenario
         return joint.replace(
             stiffness=joint.stiffness * scenario.stiffness_scale,

@@ -1,5 +1,4 @@
-"""A task of n elastic joints: make the links follow a reference although the joints bend under
-gravity.
+"""A task of n elastic joints: the links follow a reference while the joints bend under gravity.
 
 The observation has the encoders, the reference of the coming control period, the last command, and
 the sensors that are asked for; the action is the command offset of every joint. With one joint its
@@ -8,33 +7,32 @@ together under the plain names: rms of the link errors, of the deflections, of t
 of the offsets' rates, largest joint torque.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
+from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotDraw, draw_robot
+from elastic_env.core.robot_ranges import draw_robot
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals
-from elastic_env.joint.joint_names import spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.at_rest import RestWatch
+from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import COURSE, REAL, RULES, WHOLE, Records, Sample, one, record_type
-from elastic_env.world.scenario import Scenario
-from elastic_env.world.sensors import PendulumImu, angle_of_count, is_due
-from elastic_env.world.task import Task, joint_groups, spring_torque
+from elastic_env.world.rows import COURSE, REAL, WHOLE, Records, Sample, one, record_type
+from elastic_env.world.sensors import PendulumImu, is_due
+from elastic_env.world.task import Task, joint_groups, joint_rules, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
@@ -84,7 +82,7 @@ METRICS_OF_END_EFFECTOR = (
 
 @dataclass(frozen=True)
 class JointPlant:
-    """What moves, and what is known of it.
+    """The plant, and what is known of it.
 
     Attributes:
         name: Of the robot.
@@ -166,12 +164,11 @@ class JointTask(Task):
                 f" {len(joints)}; choose link_encoder to observe the links of several"
             )
         scenario = config.scenario
+        scenarios = [scenario] * num_worlds
         period_s = config.control_period_s
-        count_rad = angle_of_count(
-            plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
-        )
+        counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
         reference = PlanTable(plant.motion, period_s, num_worlds)
-        require_stable(stiffest(plant.model, scenario), period_s)
+        require_stable(stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
             name=plant.name,
@@ -182,25 +179,15 @@ class JointTask(Task):
             sensors=FurtherSensors(
                 names=[sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR],
                 joints=dict.fromkeys(joints),
-                scenarios=[scenario] * num_worlds,
+                scenarios=scenarios,
                 counts_per_turn=plant.true.encoder_counts_per_turn,
             ),
+            scenarios=scenarios,
             metrics=(
                 *(METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL),
                 *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
             ),
-            rules=np.concatenate(
-                [
-                    one(
-                        RULES,
-                        control_period_s=period_s,
-                        is_delayed=is_delayed,
-                        count_rad=count_rad,
-                        highest_rad_s=DIVERGED_RAD_S,
-                    )
-                    for is_delayed in (False, True)
-                ]
-            ),
+            rules=joint_rules(period_s, [(counts, False), (counts, True)]),
         )
         self._plant = plant
         self._joint_names = joints
@@ -224,11 +211,7 @@ class JointTask(Task):
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
-        self._springs = [
-            int(self.model.tendon(spring_name(joint)).id)
-            for joint in joints
-            if config.form == "tendon"
-        ]
+        self._springs = spring_ids(self.model, joints, config.form)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes, also for the watch over windows at rest."""
@@ -236,9 +219,7 @@ class JointTask(Task):
         self._rest_watch.restart(worlds)
 
     def score(self) -> None:
-        """Take further steps into the metrics, and look whether the joints rest in windows at
-        rest.
-        """
+        """Score further steps, and look whether the joints rest in windows at rest."""
         if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
             for row in range(self._unscored, self._row + 1):
                 joints = self._joints[row]["truth"]
@@ -272,9 +253,6 @@ class JointTask(Task):
             model=self._true_model,
         )
 
-    def _has_ranges(self, world: int) -> bool:  # noqa: ARG002  all worlds have one scenario
-        return bool(self.config.scenario.ranges)
-
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         scenario = self.config.scenario
         generator = random.robot
@@ -288,16 +266,11 @@ class JointTask(Task):
         factor = np.ones(n)
         if scenario.stiffness_spread > 0.0:
             factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
-        robot = RobotDraw(
-            stiffness_factor=tuple(factor.tolist()),
-            encoder_bias_rad=tuple(homing.tolist()),
-            imu_bias_rad=(float(mounting), 0.0),
-            is_delayed=scenario.delay_steps > 0,
-        )
+        robot = scenario.make_robot(factor, homing, mounting_rad=(float(mounting), 0.0))
         if scenario.ranges:
             robot = draw_robot([ranges.on_fixed_base() for ranges in scenario.ranges], n, generator)
         self._take_robot(world, robot, self._true_model)
-        self._imu_bias[world] = robot.imu_bias_rad[0]
+        self._imu_bias[world] = robot.mounting_rad[0]
         self._kind[world] = int(robot.is_delayed)
 
     def _place(self, worlds: BoolArray) -> None:
@@ -305,10 +278,17 @@ class JointTask(Task):
         simulation = self.simulation
         at = self._at
         truth = self._joints[self._row]["truth"][worlds]
-        self._vary(worlds, truth)
+        robots = {world: self._robots[world] for world in np.flatnonzero(worlds).tolist()}
+        if self.config.scenario.ranges or self.config.scenario.stiffness_spread > 0.0:
+            for world, robot in robots.items():
+
+                def field(name: str, world: int = world) -> Array:
+                    return simulation.vary(name)[world]
+
+                set_joints(field, self.model, self._springs, at["q_dot"], robot)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
-        factor = np.array([robot.stiffness_factor for robot in self._drawn(worlds)])
+        factor = np.array([robot.stiffness for robot in robots.values()])
         q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
         simulation.qpos[np.ix_(worlds, at["theta"])] = (
@@ -324,33 +304,6 @@ class JointTask(Task):
             simulation.bind("sensordata")
             simulation.refresh(worlds)
 
-    def _vary(self, worlds: BoolArray, truth: Records) -> None:
-        """Give the physics the joints that were drawn, (worlds, n)."""
-        scenario = self.config.scenario
-        model = self.model
-        simulation = self.simulation
-        if not scenario.ranges and scenario.stiffness_spread == 0.0:
-            return
-        springs = np.ix_(worlds, np.array(self._springs, dtype=np.int64))
-        if self._springs:
-            simulation.vary("tendon_stiffness")[springs] = truth["stiffness"]
-        if not scenario.ranges:
-            return
-        robots = self._drawn(worlds)
-        if self._springs:
-            further_backlash = np.array([[[robot.backlash_rad]] for robot in robots]) * [-0.5, 0.5]
-            simulation.vary("tendon_damping")[springs] = truth["damping"]
-            ends = model.tendon_lengthspring[self._springs] + further_backlash
-            simulation.vary("tendon_lengthspring")[springs] = ends
-        links = np.ix_(worlds, self._at["q_dot"])
-        factor = np.array([[robot.friction_factor] for robot in robots])
-        for field in ("dof_frictionloss", "dof_damping"):
-            simulation.vary(field)[links] = factor * getattr(model, field)[self._at["q_dot"]]
-
-    def _drawn(self, worlds: BoolArray) -> list[RobotDraw]:
-        """The robots of some worlds."""
-        return [self._robot(world) for world in np.flatnonzero(worlds).tolist()]
-
     def _begin_worlds(self, worlds: BoolArray) -> None:
         simulation = self.simulation
         joints = self._constants
@@ -361,19 +314,24 @@ class JointTask(Task):
             simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps()
         )
 
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        simulation = self.simulation
-        joints = self._constants
-        qpos = simulation.qpos
-        qvel = simulation.qvel
+    @override
+    def _sense_worlds(
+        self,
+        joints: tuple[Any, ...],
+        noise: tuple[Any, ...],
+        commanded: tuple[Any, ...],
+        steps: tuple[Any, ...],
+        results: tuple[Any, ...],
+    ) -> bool:
+        qpos = self.simulation.qpos
+        qvel = self.simulation.qvel
         if self._imu is not None:
             too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
             self._imu.advance(
                 ~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]]
             )
-        noise = self._noise.ready()
         return kernels.sense_links(
-            qpos, qvel, joints, self._links, noise, commanded, self._steps(), results
+            qpos, qvel, joints, self._links, noise, commanded, steps, results
         )
 
     def _show_worlds(self, observed: Array) -> None:
@@ -449,22 +407,6 @@ def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Reco
     rows["imu_is_due"] = is_due(np.arange(len(rows)), imu_rate_hz, period_s)
     rows.flags.writeable = False
     return rows
-
-
-def stiffest(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
-    """A model with the stiffest springs and strongest dampers that a scenario draws; tendons
-    count as springs.
-    """
-    stiffness = [1.0 + scenario.stiffness_spread] + [
-        own.stiffness[1] * own.joint_stiffness[1] for own in scenario.ranges
-    ]
-    damping = [1.0] + [own.damping[1] for own in scenario.ranges]
-    if max(stiffness) == max(damping) == 1.0:
-        return model
-    stiff = copy.copy(model)
-    stiff.tendon_stiffness[:] *= max(stiffness)
-    stiff.tendon_damping[:] *= max(damping)
-    return stiff
 
 
 def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> PendulumImu | None:

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.core.signals import Array, BoolArray, Signals
 
 
@@ -24,65 +23,46 @@ class Metric:
     over: str = "scored"
 
 
-@dataclass(frozen=True)
-class _Fold:
-    """How a statistic comes about: what is taken of a sample, how that of two is joined, and
-    what changes nothing.
-    """
-
-    taken: Callable[[Array], Array]
-    joined: np.ufunc
-    neutral: float
-
-
-_FOLDS = {
-    "rms": _Fold(np.square, np.add, 0.0),
-    "mean": _Fold(np.positive, np.add, 0.0),
-    "min": _Fold(np.positive, np.minimum, np.inf),
-    "max": _Fold(np.positive, np.maximum, -np.inf),
-    "peak": _Fold(np.abs, np.maximum, 0.0),
-    "count": _Fold(np.ones_like, np.add, 0.0),
+_FOLDS: dict[str, tuple[Callable[[Array], Array], np.ufunc, float]] = {
+    "rms": (np.square, np.add, 0.0),
+    "mean": (np.positive, np.add, 0.0),
+    "min": (np.positive, np.minimum, np.inf),
+    "max": (np.positive, np.maximum, -np.inf),
+    "peak": (np.abs, np.maximum, 0.0),
+    "count": (np.ones_like, np.add, 0.0),
 }
+"""A function of every sample, how two of its values are joined, and what changes nothing, by
+statistic.
+"""
 
 
 class RunningStatistic:
-    """One statistic of the rows of an array, over the steps at which they were sampled, in every
-    world.
-    """
+    """One statistic of the rows of an array over the sampled steps, in every world."""
 
     def __init__(self, name: str, num_rows: int, num_worlds: int) -> None:
         self._name = name
-        self._total = np.full((num_rows, num_worlds), _FOLDS[name].neutral)
+        self._function, self._join, self._neutral = _FOLDS[name]
+        self._total = np.full((num_rows, num_worlds), self._neutral)
         self._count = np.zeros((num_rows, num_worlds), dtype=np.int64)
 
     def restart(self, worlds: BoolArray) -> None:
         """Forget the samples of some worlds, (num_worlds,) mask."""
-        self._total[:, worlds] = _FOLDS[self._name].neutral
+        self._total[:, worlds] = self._neutral
         self._count[:, worlds] = 0
 
     def update(self, values: Array, sampled: BoolArray) -> None:
-        """Take the samples of some steps where `sampled` is true, (num_rows, num_steps, num_worlds)
-        both.
+        """Take samples where `sampled` is true, (num_rows, num_steps, num_worlds) both.
 
-        The result does not depend on how many steps are taken at once.
+        The result does not depend on how many steps are taken at once: they are added in order.
         """
-        fold = _FOLDS[self._name]
         # where, not a product: a nan outside does not count
-        taken = np.where(sampled, fold.taken(values), fold.neutral)
+        samples = np.where(sampled, self._function(values), self._neutral)
         self._count += sampled.sum(axis=1)
-        if fold.joined is np.add:
-            _add_in_order(taken, self._total)
-        else:
-            fold.joined(
-                self._total,
-                fold.joined.reduce(taken, axis=1, initial=fold.neutral),
-                out=self._total,
-            )
+        steps = np.concatenate([self._total[:, None], samples], axis=1)
+        self._total = self._join.accumulate(steps, axis=1)[:, -1].copy()
 
     def values(self) -> Array:
-        """The statistic of every row, (num_rows, num_worlds); nan where there was no sample, but
-        for their number.
-        """
+        """The statistic of every row, (num_rows, num_worlds); nan without a sample."""
         if self._name == "count":
             return self._total.copy()
         value = (
@@ -93,22 +73,8 @@ class RunningStatistic:
         return np.where(self._count > 0, np.sqrt(value) if self._name == "rms" else value, np.nan)
 
 
-@compiled
-def _add_in_order(values: Array, total: Array) -> None:
-    """Add values, (num_rows, num_steps, num_worlds), to a total, (num_rows, num_worlds), step
-    after step.
-    """
-    for row in range(values.shape[0]):
-        for step in range(values.shape[1]):
-            for world in range(values.shape[2]):
-                total[row, world] += values[row, step, world]
-
-
 class EpisodeMetrics:
-    """The metrics of a task, accumulated step by step in every world.
-
-    What it compiles it compiles now: a motion of hardware cannot wait for the compiler.
-    """
+    """The metrics of a task, accumulated step by step in every world."""
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._names = [metric.name for metric in metrics]
@@ -117,12 +83,6 @@ class EpisodeMetrics:
         self._statistics = {
             name: RunningStatistic(name, len(m), num_worlds) for name, m in self._metrics.items()
         }
-        none = np.zeros((1, num_worlds))
-        compile_now(
-            self.update,
-            {m.signal: none for m in metrics},
-            {m.over: none.astype(np.bool_) for m in metrics},
-        )
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""
@@ -130,9 +90,7 @@ class EpisodeMetrics:
             statistic.restart(worlds)
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
-        """Take steps: the task's signals and the masks by name, (num_steps, num_worlds) each, or
-        (num_worlds,).
-        """
+        """Take signals and masks by name, (num_steps, num_worlds) or (num_worlds,) each."""
         for name, metrics in self._metrics.items():
             values = np.array(
                 [np.atleast_2d(signals[metric.signal]) for metric in metrics], dtype=np.float64

@@ -1,5 +1,6 @@
-"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one, the same results
-bit for bit.
+"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one.
+
+The results are the same bit for bit.
 
 Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one
 call.
@@ -14,13 +15,14 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 from mujoco import batch
+from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, IntArray
 
 
 class Simulation(Protocol):
-    """What a task needs of the physics.
+    """The physics of a task.
 
     The state arrays are live views; writing `ctrl` commands the next advance.
     """
@@ -46,14 +48,13 @@ class Simulation(Protocol):
         ...
 
     def vary(self, field: str) -> Array:
-        """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now
-        on.
-        """
+        """A live (num_worlds, ...) array of a field of `MjModel`, from now on each world's own."""
         ...
 
     def take(self, world: int, model: mujoco.MjModel) -> None:
-        """Give a world a model of its own, with as many bodies, joints and sensors, instead of
-        varied fields.
+        """Give a world a model of its own, in place of varied fields.
+
+        It must have as many bodies, joints and sensors.
 
         The state of the world stays.
         """
@@ -64,20 +65,20 @@ class Simulation(Protocol):
         ...
 
     def refresh(self, worlds: BoolArray) -> None:
-        """Compute derived fields and sensors of the present state in some worlds, a
-        (num_worlds,) mask.
-        """
+        """Compute derived fields and sensors of some worlds, a (num_worlds,) mask."""
         ...
 
     def restart(self, worlds: BoolArray) -> None:
-        """Set some worlds, a (num_worlds,) mask, to the model's defaults; write their state
-        afterwards.
+        """Set some worlds, a (num_worlds,) mask, to the model's defaults.
+
+        Write their state afterwards.
         """
         ...
 
-    def diverged(self) -> BoolArray:
-        """Worlds whose state, acceleration or control has been a bad number since their restart,
-        (num_worlds,).
+    def divergence(self) -> BoolArray:
+        """Worlds with a bad number in state, acceleration or control since their restart.
+
+        A (num_worlds,) mask.
         """
         ...
 
@@ -92,167 +93,155 @@ servos.
 """
 
 _BAD = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}"))
-    for what in ("QPOS", "QVEL", "QACC", "CTRL")
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{quantity}"))
+    for quantity in ("QPOS", "QVEL", "QACC", "CTRL")
 ]
 _OTHERS = {
-    int(
-        mujoco.mjtWarning.mjWARN_INERTIA
-    ): "a nearly singular inertia matrix: look at the inertias of its bodies",
-    int(
-        mujoco.mjtWarning.mjWARN_CONTACTFULL
-    ): 'too many contacts for its memory: enlarge <size memory="..."/>',
-    int(
-        mujoco.mjtWarning.mjWARN_CNSTRFULL
-    ): 'too many constraints for its memory: enlarge <size memory="..."/>',
+    "INERTIA": "a nearly singular inertia matrix: look at the inertias of its bodies",
+    "CONTACTFULL": 'too many contacts for its memory: enlarge <size memory="..."/>',
+    "CNSTRFULL": 'too many constraints for its memory: enlarge <size memory="..."/>',
 }
 
 
-class _Warnings:
-    """What MuJoCo warns of: bad numbers, which end an episode, and anything else, which is said
-    once.
-    """
+class _Worlds(Simulation):
+    """Bound fields and warnings of both simulations."""
 
-    def __init__(self) -> None:
-        self._said: set[int] = set()
+    _counts: IntArray
+    """Numbers of all warnings, (num_worlds, kinds)."""
+    _said: set[str]
+    """Warnings of MuJoCo that were passed on, once."""
+    _views: dict[tuple[str, ...], tuple[Array, ...]]
 
-    def diverged(self, counts: IntArray) -> BoolArray:
-        """Worlds with a bad number, from the counts of all warnings, (num_worlds, kinds)."""
+    @override
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        if fields not in self._views:
+            self._views[fields] = tuple(self.bind(field) for field in fields)
+        return self._views[fields]
+
+    @override
+    def divergence(self) -> BoolArray:
+        counts = self._counts
         if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
         is_bad = np.asarray(counts[:, _BAD].any(axis=1))
-        for kind in np.flatnonzero(
-            counts[~is_bad].any(axis=0)
-        ).tolist():  # what explodes has every fault
-            if kind in _OTHERS and kind not in self._said:
+        others = np.asarray(counts[~is_bad].any(axis=0))  # what explodes has every fault
+        for kind, meaning in _OTHERS.items():
+            number = int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
+            if others[number] and kind not in self._said:
                 self._said.add(kind)
-                warnings.warn(
-                    f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2
-                )
+                warnings.warn(f"MuJoCo goes on, less exact; the model has {meaning}", stacklevel=2)
         return is_bad
 
+    @override
+    def close(self) -> None:
+        pass
 
-class SingleWorld:
+
+class SingleWorld(_Worlds):
     """One world on `mj_step`."""
 
     num_worlds = 1
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.__setstate__(
-            {"model": model, "varied": set(), "data": mujoco.MjData(model), "warnings": _Warnings()}
-        )
+        self._start(model, mujoco.MjData(model), set(), is_own=False)
+
+    def _start(
+        self, model: mujoco.MjModel, data: mujoco.MjData, said: set[str], is_own: bool
+    ) -> None:
+        self.model = model
+        self._data = data
+        self._said = said
+        self._is_own = is_own
+        self._counts = data.warning.number[None]
+        self._views = {}
+        self.qpos = data.qpos[None]
+        self.qvel = data.qvel[None]
+        self.act = data.act[None]
+        self.ctrl = data.ctrl[None]
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views, for `copy.deepcopy` and pickle."""
         return {
             "model": self.model,
-            "varied": self._varied,
             "data": self._data,
-            "warnings": self._warnings,
+            "said": self._said,
+            "is_own": self._is_own,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.model: mujoco.MjModel = state["model"]
-        self._varied: set[str] = state["varied"]
-        self._data = state["data"]
-        self._warnings = state["warnings"]
-        self._counts = self._data.warning.number[None]
-        self._views = dict[tuple[str, ...], tuple[Array, ...]]()
-        self.qpos = self._data.qpos[None]
-        self.qvel = self._data.qvel[None]
-        self.act = self._data.act[None]
-        self.ctrl = self._data.ctrl[None]
+        self._start(**state)
 
+    @override
     def bind(self, field: str) -> Array:
-        """See `Simulation`."""
         return getattr(self._data, field)[None]
 
-    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """See `Simulation`."""
-        if fields not in self._views:
-            self._views[fields] = tuple(self.bind(field) for field in fields)
-        return self._views[fields]
-
+    @override
     def vary(self, field: str) -> Array:
-        """See `Simulation`."""
-        if not self._varied:
+        if not self._is_own:
             self.model = copy.copy(self.model)
-        self._varied.add(field)
+            self._is_own = True
         return getattr(self.model, field)[None]
 
-    def take(self, world: int, model: mujoco.MjModel) -> None:  # noqa: ARG002  there is one
-        """See `Simulation`."""
+    @override
+    def take(self, world: int, model: mujoco.MjModel) -> None:
         self.model = model
 
     def model_of(self, world: int) -> mujoco.MjModel:  # noqa: ARG002  there is one
         """The model of a world with all that is its own, for reading."""
         return self.model
 
+    @override
     def advance(self, num_substeps: int) -> None:
-        """See `Simulation`."""
         mujoco.mj_step(self.model, self._data, num_substeps)
 
+    @override
     def restart(self, worlds: BoolArray) -> None:
-        """See `Simulation`."""
         if worlds[0]:
             mujoco.mj_resetData(self.model, self._data)
 
+    @override
     def refresh(self, worlds: BoolArray) -> None:
-        """See `Simulation`."""
         if worlds[0]:
             mujoco.mj_forward(self.model, self._data)
 
-    def diverged(self) -> BoolArray:
-        """See `Simulation`."""
-        return self._warnings.diverged(self._counts)
 
-    def close(self) -> None:
-        """See `Simulation`; there is nothing to give back."""
-
-
-class ManyWorlds:
+class ManyWorlds(_Worlds):
     """Many worlds on `mujoco.batch`, stepped by a pool of threads."""
 
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:
         threads = min(num_threads or os.cpu_count() or 1, num_worlds)
-        self._start(model, num_worlds, threads, _Warnings())
+        self._start(model, num_worlds, threads, set())
 
     def _start(
         self,
         model: mujoco.MjModel,
         num_worlds: int,
         num_threads: int,
-        said: _Warnings,
+        said: set[str],
         own: list[mujoco.MjModel] | None = None,
     ) -> None:
         """Begin with worlds in the model's default state, and threads of this process."""
         self.model = model
         self.num_worlds = num_worlds
-        self._warnings = said
+        self._said = said
         self._process = os.getpid()
         self._own_models = own
         self._are_given = own is None
         self._varied: set[str] = set()
         self._bound: set[str] = set()
-        self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
+        self._views = {}
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
+        self._counts = self._batch.warning[..., 1]
         self.qpos = self._batch.bind("qpos")
         self.qvel = self._batch.bind("qvel")
         self.act = self._batch.bind("act")
         self.ctrl = self._batch.bind("ctrl")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a
-        process that was forked.
-        """
+        """State without live views and threads, for copies, pickle, and a forked process."""
+        threads = self._batch.nthread
         return {
-            "made": (
-                self.model,
-                self.num_worlds,
-                self._batch.nthread,
-                self._warnings,
-                self._own_models,
-            ),
+            "made": (self.model, self.num_worlds, threads, self._said, self._own_models),
             "bound": self._bound,
             "varied": {field: self.vary(field).copy() for field in self._varied},
             "state": self._batch.state.copy(),
@@ -269,8 +258,9 @@ class ManyWorlds:
         self._batch.warning[:] = state["warning"]
 
     def _ready(self) -> batch.Batch:
-        """The batch with the models of its worlds, and threads of this process: a fork leaves
-        those of the parent.
+        """The batch with the models of its worlds, and threads of this process.
+
+        A fork leaves the threads of the parent.
         """
         if self._process != os.getpid():
             inherited = self._batch
@@ -282,24 +272,18 @@ class ManyWorlds:
             self._are_given = True
         return self._batch
 
+    @override
     def bind(self, field: str) -> Array:
-        """See `Simulation`."""
         self._bound.add(field)
         return self._batch.bind(field)
 
-    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """See `Simulation`."""
-        if fields not in self._views:
-            self._views[fields] = tuple(self.bind(field) for field in fields)
-        return self._views[fields]
-
+    @override
     def vary(self, field: str) -> Array:
-        """See `Simulation`."""
         self._varied.add(field)
         return self._batch.expand(field)
 
+    @override
     def take(self, world: int, model: mujoco.MjModel) -> None:
-        """See `Simulation`."""
         if self._own_models is None:
             self._own_models = [self.model] * self.num_worlds
         self._own_models[world] = model
@@ -309,26 +293,19 @@ class ManyWorlds:
         """The model of a world with all that is its own, for reading."""
         return self._ready().get_model(world)
 
+    @override
     def advance(self, num_substeps: int) -> None:
-        """See `Simulation`."""
         self._ready().step(nstep=num_substeps)
 
+    @override
     def restart(self, worlds: BoolArray) -> None:
-        """See `Simulation`."""
         if worlds.any():
             self._ready().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
 
+    @override
     def refresh(self, worlds: BoolArray) -> None:
-        """See `Simulation`."""
         if worlds.any():
             self._ready().forward(worlds)
-
-    def diverged(self) -> BoolArray:
-        """See `Simulation`."""
-        return self._warnings.diverged(self._batch.warning[..., 1])
-
-    def close(self) -> None:
-        """See `Simulation`; there is nothing to give back."""
 
 
 def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:

@@ -1,6 +1,4 @@
-"""What a compensator may know of a robot: its rigid model and the parameters of its elastic
-joints.
-"""
+"""The robot as a compensator may know it: its rigid model and its elastic joints."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +18,7 @@ from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rigid.biped import Biped
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
-"""Where an identification file holds K."""
+"""Key of K in an identification file."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class RobotModel:
     rigid: mujoco.MjModel
     control_period_s: float
     observation_table: SignalTable = NO_SIGNALS
-    """What its observation holds, in order."""
+    """Columns of its observation, in order."""
 
     @property
     def joint_names(self) -> list[str]:
@@ -93,9 +91,7 @@ class RobotModel:
 
     @property
     def servo_compliance(self) -> Array:
-        """How far a servo itself gives way under a torque, (n,) [rad/(N·m)]: 1/k_p, 0 where an
-        integrator holds it.
-        """
+        """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p, 0 with an integrator."""
         servos = [joint.servo for joint in self.joints.values()]
         return np.array(
             [0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos]
@@ -128,8 +124,7 @@ class RobotModel:
         )
 
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
-        """The same robot with another stiffness, one number for all joints or one per joint
-        [N·m/rad].
+        """The same robot with another stiffness, one number or one per joint [N·m/rad].
 
         Raises:
             ConfigurationError: The number of values does not fit, or one is not positive and
@@ -168,17 +163,24 @@ def with_stiffness(
     }
 
 
+def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
+    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit."""
+    at = [model.joint(name).id for name in joints]
+    limited = model.jnt_limited[at].astype(bool)[:, None]
+    lowest, highest = np.where(limited, model.jnt_range[at], [-np.inf, np.inf]).T
+    return lowest, highest
+
+
 @dataclass(frozen=True)
 class WalkerModel(RobotModel):
-    """What is known of a walker: also its legs and the walk that it is to do."""
+    """A walker as a policy may know it, with its legs and its walk plan."""
 
     biped: Biped = field(kw_only=True)
     plan: WalkPlan = field(kw_only=True)
 
 
 def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "float | Array":
-    """A stiffness given as a number, as one per joint, or as the file that `elastic identify`
-    writes [N·m/rad].
+    """Read a stiffness: a number, one per joint, or a file of `elastic identify` [N·m/rad].
 
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.

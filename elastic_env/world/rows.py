@@ -76,7 +76,7 @@ ADDRESS = record_type(
     ("q_dot", WHOLE),  # in qvel
     ("servo", WHOLE),  # in ctrl
 )
-"""Where a joint stands in the physics."""
+"""Addresses of a joint in the physics."""
 
 JOINT_COLUMNS = (
     "encoder_angle",

@@ -13,7 +13,8 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.robot_ranges import RobotRanges
+from elastic_env.core.robot_ranges import DrawnRobot, RobotRanges
+from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
@@ -44,7 +45,7 @@ class Scenario(Model):
     slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5)
     """Walker: slope of the floor, direction drawn [rad]."""
     encoder_counts: bool = True
-    """Whether the encoders have whole counts."""
+    """True if the encoders have whole counts."""
     encoder_bias_rad: float = quantity("rad", 0.0, ge=0)
     """Half-width of the encoders' homing error [rad]."""
     imu: AttitudeSensor = AttitudeSensor()
@@ -84,8 +85,9 @@ class Scenario(Model):
         return self
 
     def with_ranges(self, changes: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Self:
-        """The scenario with other intervals; one that draws from none, or from several ranges, is
-        as it was.
+        """The scenario with other intervals.
+
+        One that draws from none, or from several ranges, stays as it is.
 
         Args:
             changes: Fields of `RobotRanges` that differ from the scenario's; of several such
@@ -96,10 +98,29 @@ class Scenario(Model):
         each = [changes] if isinstance(changes, Mapping) else changes
         return self.replace(ranges=[self.ranges[0].replace(**own) for own in each])
 
+    def make_robot(self, stiffness: Array, homing_rad: Array, **drawn: Any) -> DrawnRobot:
+        """A robot of the scenario without its ranges.
+
+        Args:
+            stiffness: Factor on K of every joint, (n,) [1].
+            homing_rad: Error of the encoder of every joint, (n,) [rad].
+            **drawn: Other quantities that were drawn.
+        """
+        return DrawnRobot(
+            stiffness=tuple(stiffness.tolist()),
+            homing_rad=tuple(homing_rad.tolist()),
+            slope_rad=self.slope_rad,
+            push_n=self.push_n,
+            is_delayed=self.delay_steps > 0,
+            is_inertial=self.inertial is not None,
+            **drawn,
+        )
+
     @property
     def draws_robots(self) -> bool:
-        """Whether episodes of the same motion differ in more than noise: joints, offsets of
-        sensors, push or slope.
+        """True if episodes of the same motion differ in more than noise.
+
+        That is in joints, offsets of sensors, push or slope.
         """
         drawn = (
             self.stiffness_spread,
@@ -113,34 +134,16 @@ class Scenario(Model):
 
     @property
     def is_random(self) -> bool:
-        """Whether episodes of the same motion differ: in what `draws_robots` says, or by noise."""
+        """True if episodes of the same motion differ, be it by noise alone."""
         noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
         return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
 
     @property
     def homing_width_rad(self) -> float:
-        """Half-width of the homing error of encoders beside those of the motors; of ranges their
-        largest error.
-        """
+        """Half-width of the homing error of link encoders; of ranges their largest error."""
         return max(
             [self.encoder_bias_rad, *(abs(end) for own in self.ranges for end in own.homing_rad)]
         )
-
-    @property
-    def pelvis_noise_rad(self) -> float:
-        """Walker: standard deviation of the noise of roll and pitch, in an inertial IMU before
-        its filter.
-        """
-        return (
-            self.pelvis_imu.noise_rad
-            if self.inertial is None
-            else self.inertial.accelerometer_noise_rad
-        )
-
-    @property
-    def pelvis_gyro_noise_rad_s(self) -> float:
-        """Walker: standard deviation of the gyroscope's noise."""
-        return self.gyro_noise_rad_s if self.inertial is None else self.inertial.gyro_noise_rad_s
 
 
 _LEFT_TO_RANGES = (
@@ -231,7 +234,7 @@ _BEYOND: tuple[dict[str, Any], ...] = (
     {"slope_rad": (math.radians(1.5), math.radians(2.5))},
     {"push_n": (50.0, 80.0), "push_share": 1.0},
 )
-"""What a ninth of the robots of `drawn_beyond` each has beyond the ranges of `drawn`."""
+"""Intervals beyond those of `drawn`, each of a ninth of the robots of `drawn_beyond`."""
 
 DISTRIBUTIONS: dict[str, ScenarioChange] = {
     "drawn": lambda _: {"ranges": [TRAINING_RANGES]},
@@ -250,8 +253,9 @@ WALKER_ONLY = tuple(
 
 
 def scenario_names(walks: bool = True) -> list[str]:
-    """Named conditions, joined names and distributions aside; only those of robots that do not
-    walk if asked.
+    """Named conditions without joined names and distributions.
+
+    On request only those of robots that do not walk.
     """
     return [*GROUNDS, *(name for name in CHANGES if walks or name not in WALKER_ONLY)]
 

@@ -1,5 +1,4 @@
-"""What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate
-of its own.
+"""Sensors of a robot: motor encoders with counts, and IMUs.
 
 An `AttitudeSensor` shows the true attitude with errors. An `InertialSensor` computes it from a
 gyroscope and an accelerometer, as a device does, so that the acceleration of what carries it
@@ -23,9 +22,7 @@ from elastic_env.world.control_kernels import (
 
 
 class AttitudeSensor(Model):
-    """IMU attitude of one axis: bias, white noise, and a sample rate below or at the control
-    rate.
-    """
+    """IMU attitude of one axis: bias, white noise, and a sample rate up to the control rate."""
 
     noise_rad: float = quantity("rad", 0.0, ge=0)
     """Standard deviation of the white noise [rad]."""
@@ -40,7 +37,7 @@ class AttitudeSensor(Model):
 
     @property
     def is_random(self) -> bool:
-        """Whether it measures the same motion differently from episode to episode."""
+        """True if it measures the same motion differently from episode to episode."""
         return self.noise_rad > 0.0 or self.bias_spread_rad > 0.0
 
 
@@ -48,8 +45,7 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 class InertialSensor(Model):
-    r"""IMU that computes its attitude from its gyroscope and its accelerometer; by default the
-    3DM-GX4-25.
+    r"""IMU that computes its attitude from gyroscope and accelerometer; by default the 3DM-GX4-25.
 
     Its filter is the explicit complementary filter of [Mahony2008] for the vertical u, without
     estimation of the bias: it integrates the gyroscope's rate ω, and turns towards the
@@ -106,8 +102,7 @@ class InertialSensor(Model):
 
     @property
     def accelerometer_noise_rad(self) -> float:
-        """Standard deviation of roll and pitch by the accelerometer's mean over a control period
-        [rad].
+        """Standard deviation of roll and pitch by the accelerometer's mean over a period [rad].
 
         Only noise across the vertical tilts the attitude, that along it has no effect to first
         order.
@@ -165,7 +160,7 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
-    """Whether a sensor of its own rate delivers a new sample at a control step, (n,).
+    """True at the control steps at which a sensor of its own rate delivers a sample, (n,).
 
     Step 0, the start of an episode, always does; a sensor faster than the control loop does at
     every step.
@@ -205,8 +200,9 @@ class NoiseStream:
         self._refill(world)
 
     def next(self, worlds: BoolArray) -> Any:
-        """The next sample of some worlds, (num_worlds,); the rows of the others are not to be
-        used.
+        """The next sample of some worlds, (num_worlds,).
+
+        The rows of the others are not to be used.
         """
         samples, used = self.ready()
         sample = samples[np.minimum(used, len(samples) - 1), self._world]
@@ -242,8 +238,7 @@ the motion [1].
 
 
 class PendulumImu:
-    r"""An `InertialSensor` on a link that hangs from a horizontal axis where q = 0, and turns with
-    it.
+    r"""An `InertialSensor` on a link that hangs from a horizontal axis at q = 0, and turns with it.
 
     In the frame of the link, x along its motion and z towards the axis, the vertical is (sin q, 0,
     cos q). The specific force at a distance r from the axis is
@@ -282,9 +277,7 @@ class PendulumImu:
         self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
 
     def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
-        """Draw the errors of an episode; the offset of the angle that is shown is for the caller
-        [rad].
-        """
+        """Draw the errors of an episode; the caller adds the returned offset [rad]."""
         sensor = self._sensor
         gyro, x, z, offset = generator.standard_normal(4)
         force = sensor.accelerometer_bias_m_s2
@@ -301,9 +294,7 @@ class PendulumImu:
             settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
 
     def advance(self, worlds: BoolArray, q: Array, q_dot: Array) -> None:
-        """The links of some worlds have moved to q, (num_worlds,) [rad], with rates q̇ [rad/s],
-        in a control period.
-        """
+        """Advance by a control period to angles q [rad] and rates q̇ [rad/s], (num_worlds,)."""
         drawn = self._noise.next(worlds)
         last = self._last
         sensor = self._sensor

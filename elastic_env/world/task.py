@@ -1,5 +1,4 @@
-"""The rules of a robot of elastic joints, in many worlds: one control step, from the command to the
-observation.
+"""The control step of a robot of elastic joints, from the command to the observation.
 
     command → (physics) → truth → measured → score → observation
 
@@ -21,7 +20,7 @@ import numpy.typing as npt
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
-from elastic_env.core.robot_ranges import RobotDraw
+from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import (
     Array,
     BoolArray,
@@ -42,10 +41,19 @@ from elastic_env.world.further_sensors import (
     specific_force,
 )
 from elastic_env.world.metrics import EpisodeMetrics, Metric
-from elastic_env.world.physics import Simulation, simulate, substeps
+from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import JOINT, JOINT_COLUMNS, Records, Sample, addresses, columns_of
-from elastic_env.world.sensors import NoiseStream
+from elastic_env.world.rows import (
+    JOINT,
+    JOINT_COLUMNS,
+    RULES,
+    Records,
+    Sample,
+    addresses,
+    columns_of,
+)
+from elastic_env.world.scenario import Scenario
+from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo
 
 ACTION_BOUND_RAD = 0.3
@@ -74,7 +82,7 @@ def action_table(joints: Sequence[str]) -> SignalTable:
 
 
 def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
-    """What every robot observes of its joints, `elastic_env.world.rows.JOINT_COLUMNS`.
+    """Columns that every robot observes of its joints, `elastic_env.world.rows.JOINT_COLUMNS`.
 
     Args:
         joints: In order, and what an angle of theirs is in the mirror.
@@ -119,6 +127,7 @@ class Task(ABC):
         reference: What the links are to do in every world.
         table: What is observed, further sensors aside.
         sensors: Further sensors, whose columns stand behind the others.
+        scenarios: Of every world.
         metrics: Figures of an episode.
         rules: Records of `elastic_env.world.rows.RULES`, one for every kind of world.
 
@@ -143,6 +152,7 @@ class Task(ABC):
         reference: PlanTable,
         table: Sequence[Signal],
         sensors: FurtherSensors,
+        scenarios: Sequence[Scenario],
         metrics: Sequence[Metric],
         rules: Records,
     ) -> None:
@@ -167,7 +177,8 @@ class Task(ABC):
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
         self._rules = rules
         self._kind = np.zeros(num_worlds, dtype=np.int64)
-        self._robots: list[RobotDraw | None] = [None] * num_worlds
+        self._scenarios = scenarios
+        self._robots: dict[int, DrawnRobot] = {}
         self._noise = NoiseStream(num_worlds, self.noise_type)
         self._bound = self.action_table.space(np.float32).high.astype(np.float64)
         self._failures = (DIVERGED, *self.failure_names)
@@ -184,8 +195,9 @@ class Task(ABC):
     def attach(
         self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False
     ) -> None:
-        """Take what moves the robots, and compile all that a control step needs: hardware cannot
-        wait for that later.
+        """Attach the physics, and compile all that a control step needs.
+
+        Hardware cannot wait for the compiler later.
 
         Args:
             simulation: What moves instead of MuJoCo, such as hardware.
@@ -200,8 +212,9 @@ class Task(ABC):
         compile_now(self._rehearse)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
-        """Begin new episodes in some worlds, a (num_worlds,) mask: at rest under zero offset, the
-        springs deflected.
+        """Begin new episodes in some worlds, a (num_worlds,) mask.
+
+        The robots rest under zero offset, their springs deflected.
 
         Args:
             worlds: Which.
@@ -272,15 +285,14 @@ class Task(ABC):
         return Sample(self._joints[self._row], self._worlds[self._row])
 
     def signals(self, sample: Sample | None = None) -> Signals:
-        """Truth and scores of samples by name, one value per row; by default of the present
-        step.
-        """
+        """Truth and scores by name, one value per row; by default of the present step."""
         sample = self.sample() if sample is None else sample
         return self._signals(sample.joints["truth"], sample.worlds)
 
     def score(self) -> None:
-        """Take into the metrics the steps that are not yet; when that happens makes no
-        difference to them.
+        """Take into the metrics the steps that are not yet.
+
+        The time of the call makes no difference to them.
         """
         rows = slice(self._unscored, self._row + 1)
         shape = (rows.stop - rows.start, self.num_worlds)
@@ -318,17 +330,13 @@ class Task(ABC):
 
     def robot_record(self, world: int) -> dict[str, float]:
         """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        return self._robot(world).record() if self._has_ranges(world) else {}
+        return self._robots[world].record() if self._scenarios[world].ranges else {}
 
     @abstractmethod
     def truth(self) -> Any:
         """Noise-free state and true parameters, for rewards, metrics and the oracle."""
 
     # what differs from robot to robot
-
-    @abstractmethod
-    def _has_ranges(self, world: int) -> bool:
-        """Whether a world draws its robots from ranges."""
 
     @abstractmethod
     def _draw(self, world: int, random: EpisodeRandom) -> None:
@@ -343,12 +351,21 @@ class Task(ABC):
         """Truth and measurements at the start of an episode in some worlds."""
 
     @abstractmethod
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        """Truth, measurements, ends, scores and observation of a control step; whether an episode
-        ends.
+    def _sense_worlds(
+        self,
+        joints: tuple[Any, ...],
+        noise: tuple[Any, ...],
+        commanded: tuple[Any, ...],
+        steps: tuple[Any, ...],
+        results: tuple[Any, ...],
+    ) -> bool:
+        """Sense, score, end and observe a control step; True if an episode ends.
 
         Args:
+            joints: `kernels.Joints`.
+            noise: `kernels.Noise`.
             commanded: `kernels.Commanded`.
+            steps: `kernels.Steps`.
             results: To be filled, `kernels.Results`.
         """
 
@@ -360,13 +377,7 @@ class Task(ABC):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
-    def _robot(self, world: int) -> RobotDraw:
-        """The robot of a world, from its first episode on."""
-        robot = self._robots[world]
-        assert robot is not None
-        return robot
-
-    def _take_robot(self, world: int, robot: RobotDraw, true_model: RobotModel) -> None:
+    def _take_robot(self, world: int, robot: DrawnRobot, true_model: RobotModel) -> None:
         """Keep the robot of a world, and write what is true of its joints.
 
         Args:
@@ -376,9 +387,9 @@ class Task(ABC):
         """
         self._robots[world] = robot
         truth = self._joints[self._row, world]["truth"]
-        truth["homing"] = robot.encoder_bias_rad
-        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness_factor)
-        truth["damping"] = true_model.damping * robot.damping_factor
+        truth["homing"] = robot.homing_rad
+        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness)
+        truth["damping"] = true_model.damping * robot.damping
         truth["backlash"] = true_model.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
@@ -415,15 +426,15 @@ class Task(ABC):
         return offset, is_clipped
 
     def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
-        """Observation, reward and ends of the control step that has gone by; whether an episode
-        ends.
-        """
+        """Observation, reward and ends of the last control step; True if an episode ends."""
         n = self.num_worlds
         observed = np.empty((n, self._width))
         reward = np.empty(n)
         ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
-        commanded = (offset, is_clipped, self.simulation.diverged(), self._periods)
-        is_over = self._sense_worlds(commanded, (observed, reward, ends))
+        commanded = (offset, is_clipped, self.simulation.divergence(), self._periods)
+        results = (observed, reward, ends)
+        noise = self._noise.ready()
+        is_over = self._sense_worlds(self._constants, noise, commanded, self._steps(), results)
         if self._has_sensors:
             self._sensors.measure(~commanded[2], self._sensor_inputs())
             self._show_sensors(observed)
@@ -439,9 +450,7 @@ class Task(ABC):
             observed[:, -len(self._sensors.signals) :] = self._sensors.columns(is_delayed)
 
     def _sensor_inputs(self) -> SensorInputs:
-        """What further sensors need of the truth; the specific force lags one physics step
-        behind.
-        """
+        """The truth that further sensors need; the specific force lags one physics step behind."""
         truth = self._joints[self._row]["truth"]
         has_force = ACCELEROMETER in self.config.sensors
         sensordata = self.simulation.bind("sensordata") if has_force else None
@@ -452,7 +461,7 @@ class Task(ABC):
         )
 
     def _describe(self, sample: Sample) -> dict[str, Any]:
-        """What a step tells of itself when somebody looks at it."""
+        """Reward terms, signals and clipping of a step, computed when somebody looks at them."""
         clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
         return {
             "reward_terms": self.reward_terms(sample),
@@ -461,8 +470,9 @@ class Task(ABC):
         }
 
     def _take_rows(self, count: int) -> None:
-        """Go on to fresh records, in a fresh block where this one is full: samples may keep the
-        old one.
+        """Go on to fresh records, in a fresh block where this one is full.
+
+        Samples may keep the old one.
         """
         if self._row + count >= len(self._joints):
             self.score()
@@ -520,6 +530,21 @@ class Task(ABC):
             f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in"
             f" world {world}"
         )
+
+
+def joint_rules(control_period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
+    """Records of `RULES`, one for every kind of world.
+
+    Args:
+        control_period_s: Control period [s].
+        kinds: Counts per turn of the encoders, None for none, and whether measurements are delayed.
+    """
+    rules = np.zeros(len(kinds), RULES)
+    rules["control_period_s"] = control_period_s
+    rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
+    rules["is_delayed"] = [is_delayed for _, is_delayed in kinds]
+    rules["highest_rad_s"] = DIVERGED_RAD_S
+    return rules
 
 
 def spring_torque(truth: Records) -> Array:

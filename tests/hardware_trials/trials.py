@@ -35,6 +35,7 @@ from elastic_env.hardware.safety.realtime import (
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
+from tests.emulators import wait_until_rest
 from tests.hardware_trials.wave import PERIOD_S, goal
 from train.commands.options import PATIENT_LIMITS
 
@@ -501,7 +502,7 @@ def _end_once(
     emulator: RunningEmulator, generator: np.random.Generator, end: Callable[[Any, int], None]
 ) -> float | None:
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
-    emulator.wait_until_rest()
+    wait_until_rest(emulator)
     program = subprocess.Popen(
         child_command("tests.hardware_trials.wave", emulator.port, "1"),
         env=child_environment(),

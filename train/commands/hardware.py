@@ -120,7 +120,7 @@ class Check(Model):
             table.add_row(
                 one.what,
                 one.value,
-                escape(one.cure) or "fine",
+                "fine" if one.is_good else escape(one.cure),
                 style="" if one.is_good else "bold yellow",
             )
         console.print(table)

@@ -181,4 +181,4 @@ def name_options() -> Iterator[None]:
     try:
         yield
     except ModelError as error:
-        raise ConfigurationError(error.named(spelt=option_name)) from None
+        raise ConfigurationError(error.describe(spelt=option_name)) from None

@@ -431,7 +431,7 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
                 f" {ENLARGED:g}"
             ),
         ]
-        rows.append(with_text(views.drawn(twice, links), caption))
+        rows.append(with_text(views.draw(twice, links), caption))
     return np.concatenate(rows)
 
 

@@ -56,8 +56,23 @@ class States:
     @staticmethod
     def join(parts: Sequence["States"]) -> "States":
         """The states of several buses; the time is that of the last reply."""
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        values = [vars(part) for part in parts]
+        arrays = {n: np.concatenate([own[n] for own in values]) for n in _ARRAYS}
         return States(**arrays, time_s=max(part.time_s for part in parts))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """State of one servo that decides whether it may get torque."""
+
+    velocity: float
+    """[rad/s]"""
+    temperature: float
+    """[°C]"""
+    temperature_limit: float
+    """Highest temperature by the servo's own setting [°C]."""
+    error: str
+    """The hardware error that it reports, "" if none."""
 
 
 class Bus(Protocol):
@@ -90,20 +105,8 @@ class Bus(Protocol):
         """Present position [rad]."""
         ...
 
-    def read_velocity(self, servo_id: int) -> float:
-        """Present velocity [rad/s]."""
-        ...
-
-    def read_temperature(self, servo_id: int) -> float:
-        """Present temperature [°C]."""
-        ...
-
-    def read_temperature_limit(self, servo_id: int) -> float:
-        """Highest temperature by the servo's own setting [°C]."""
-        ...
-
-    def read_error(self, servo_id: int) -> str:
-        """The hardware error that the servo reports, "" if none."""
+    def read_condition(self, servo_id: int) -> Condition:
+        """Velocity, temperature and hardware error."""
         ...
 
     def write_torque(self, servo_id: int, is_on: bool) -> None:
@@ -132,7 +135,7 @@ class BusGroup:
 
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = tuple(buses)
-        self._readers = [ThreadPoolExecutor(1, thread_name_prefix=bus.name) for bus in buses[1:]]
+        self._readers = [ThreadPoolExecutor(1, bus.name) for bus in buses[1:]]
 
     @property
     def servos(self) -> list[tuple[Bus, int]]:
@@ -154,9 +157,8 @@ class BusGroup:
         """States of all servos; waits for at most a time [s]."""
         if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
             return self.buses[0].read_states(timeout_s)
-        return States.join(
-            self._call_all([partial(bus.read_states, timeout_s) for bus in self.buses])
-        )
+        calls = [partial(bus.read_states, timeout_s) for bus in self.buses]
+        return States.join(self._call_all(calls))
 
     def torque_off(self, when_sent: Callable[[], None] = lambda: None) -> HardwareError | None:
         """Switch all torque off, at every bus before any servo is asked whether it is.
@@ -172,9 +174,11 @@ class BusGroup:
         """
         self._call_all([partial(_call, bus.torque_off) for bus in self.buses])
         when_sent()
-        answers = self._call_all([partial(_call, bus.confirm_torque_off) for bus in self.buses])
+        calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
+        answers = self._call_all(calls)
         errors = [answer for answer in answers if isinstance(answer, HardwareError)]
-        silent = [name for answer in answers if isinstance(answer, list) for name in answer]
+        lists = [answer for answer in answers if isinstance(answer, list)]
+        silent = [name for names in lists for name in names]
         problems = [str(error) for error in errors]
         if silent:
             problems.append(
@@ -183,22 +187,20 @@ class BusGroup:
             )
         if not problems:
             return None
-        off = [bus.name for bus, answer in zip(self.buses, answers, strict=True) if answer == []]
+        pairs = zip(self.buses, answers, strict=True)
+        off = [bus.name for bus, answer in pairs if answer == []]
         if off:
             problems.append(f"torque is off at {', '.join(off)}")
-        kind = (
-            BusGoneError if any(isinstance(error, BusGoneError) for error in errors) else ReplyError
-        )
-        return kind("; ".join(problems))
+        is_gone = any(isinstance(error, BusGoneError) for error in errors)
+        return (BusGoneError if is_gone else ReplyError)("; ".join(problems))
 
     def _call_all(self, calls: Sequence[Callable[[], T]]) -> list[T]:
         """Call one function for each bus, the first in this thread.
 
         All of them are done when an error is raised.
         """
-        others = [
-            reader.submit(call) for reader, call in zip(self._readers, calls[1:], strict=True)
-        ]
+        pairs = zip(self._readers, calls[1:], strict=True)
+        others = [reader.submit(call) for reader, call in pairs]
         try:
             first = calls[0]()
         finally:

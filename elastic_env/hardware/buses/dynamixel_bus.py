@@ -14,7 +14,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.hardware.buses import packets
-from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States, servo_name
+from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States, servo_name
 from elastic_env.hardware.buses.packets import word
 from elastic_env.hardware.buses.port import (
     COMM_SUCCESS,
@@ -98,7 +98,7 @@ class DynamixelBus:
         """All servos that answer a broadcast ping, by id."""
         with bus_gone(self.name):
             answers, _ = self._handler.broadcastPing(self.port)
-        return [ServoInfo(servo_id, *values) for servo_id, values in sorted(answers.items())]
+        return [ServoInfo(i, *values) for i, values in sorted(answers.items())]
 
     def ping(self, servo_id: int) -> ServoInfo:
         """Model number and firmware of one servo.
@@ -118,7 +118,7 @@ class DynamixelBus:
             HardwareError: Its model is not known.
         """
         packets.require_ids(ids)
-        self.attach_known({servo_id: self.ping(servo_id).model_number for servo_id in ids})
+        self.attach_known({i: self.ping(i).model_number for i in ids})
 
     def attach_known(self, numbers: Mapping[int, int]) -> None:
         """Take servos into the cycle without asking them anything.
@@ -129,11 +129,9 @@ class DynamixelBus:
         Raises:
             HardwareError: A model is not known, or they do not go together.
         """
-        self.models = {servo_id: servo_model(number) for servo_id, number in numbers.items()}
+        self.models = {i: servo_model(number) for i, number in numbers.items()}
         if len({model.blocks for model in self.models.values()}) > 1:
-            names = ", ".join(
-                f"{servo_id}: {model.name}" for servo_id, model in self.models.items()
-            )
+            names = ", ".join(f"{i}: {model.name}" for i, model in self.models.items())
             raise HardwareError(
                 f"the servos of one bus must have one control table, at {self.name} are {names}"
             )
@@ -145,9 +143,8 @@ class DynamixelBus:
             ReplyError: No answer in three tries, or a refusal.
         """
         register = self.models[servo_id].table[name]
-        data = self._request(
-            servo_id, packets.READ, word(register.address) + word(register.size), register.size
-        )
+        where = word(register.address) + word(register.size)
+        data = self._request(servo_id, packets.READ, where, register.size)
         return register.decode(data)
 
     def write(self, servo_id: int, name: str, value: int) -> None:
@@ -157,9 +154,8 @@ class DynamixelBus:
             ReplyError: No answer in three tries, or a refusal, with the servo's reason.
         """
         register = self.models[servo_id].table[name]
-        self._request(
-            servo_id, packets.WRITE, word(register.address) + register.encode(value), length=0
-        )
+        data = word(register.address) + register.encode(value)
+        self._request(servo_id, packets.WRITE, data, length=0)
 
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
         """Write a register of several servos, by id [count], in one packet, which nobody confirms.
@@ -171,31 +167,25 @@ class DynamixelBus:
             return
         register = self.models[next(iter(values))].table[name]
         data = word(register.address) + word(register.size)
-        data += b"".join(
-            bytes([servo_id]) + register.encode(value) for servo_id, value in values.items()
-        )
+        for servo_id, value in values.items():
+            data += bytes([servo_id]) + register.encode(value)
         self._send(packets.BROADCAST, packets.SYNC_WRITE, data)
         self.port.release()
 
     def read_position(self, servo_id: int) -> float:
         """Present position of one servo [rad]."""
-        return self.read(servo_id, "present_position") * self.models[servo_id].position_unit
+        count = self.read(servo_id, "present_position")
+        return count * self.models[servo_id].position_unit
 
-    def read_velocity(self, servo_id: int) -> float:
-        """Present velocity of one servo [rad/s]."""
-        return self.read(servo_id, "present_velocity") * self.models[servo_id].velocity_unit
-
-    def read_temperature(self, servo_id: int) -> float:
-        """Present temperature of one servo [°C]."""
-        return float(self.read(servo_id, "present_temperature"))
-
-    def read_temperature_limit(self, servo_id: int) -> float:
-        """Highest temperature by the servo's own setting [°C]."""
-        return float(self.read(servo_id, "temperature_limit"))
-
-    def read_error(self, servo_id: int) -> str:
-        """The hardware error that a servo reports, "" if none."""
-        return explain_errors(self.read(servo_id, "hardware_error_status"))
+    def read_condition(self, servo_id: int) -> Condition:
+        """Velocity, temperature and hardware error of one servo."""
+        speed = self.read(servo_id, "present_velocity")
+        return Condition(
+            velocity=speed * self.models[servo_id].velocity_unit,
+            temperature=float(self.read(servo_id, "present_temperature")),
+            temperature_limit=float(self.read(servo_id, "temperature_limit")),
+            error=explain_errors(self.read(servo_id, "hardware_error_status")),
+        )
 
     def write_goal(self, servo_id: int, angle: float) -> None:
         """Command one servo [rad], which confirms it.
@@ -203,7 +193,8 @@ class DynamixelBus:
         Raises:
             ReplyError: As `write`.
         """
-        self.write(servo_id, "goal_position", round(angle / self.models[servo_id].position_unit))
+        count = round(angle / self.models[servo_id].position_unit)
+        self.write(servo_id, "goal_position", count)
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos at once.
@@ -233,13 +224,14 @@ class DynamixelBus:
         Raises:
             BusGoneError: The port is gone.
         """
-        for _ in range(2):  # nobody confirms a packet to all; a second one costs nothing
+        # nobody confirms a packet to all; a second one costs nothing
+        for _ in range(2):
             self.port.release()
             self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
 
     def confirm_torque_off(self) -> list[str]:
         """Names of the servos that do not say that their torque is off, after some tries each."""
-        return [servo_name(self, servo_id) for servo_id in self.ids if not self._is_off(servo_id)]
+        return [servo_name(self, i) for i in self.ids if not self._is_off(i)]
 
     def _is_off(self, servo_id: int) -> bool:
         try:
@@ -260,11 +252,8 @@ class DynamixelBus:
         """
         block = self._next_block()
         self._awaited.append(block)
-        self._send(
-            packets.BROADCAST,
-            packets.SYNC_READ,
-            word(block.start) + word(len(block)) + bytes(self.ids),
-        )
+        asked = word(block.start) + word(len(block)) + bytes(self.ids)
+        self._send(packets.BROADCAST, packets.SYNC_READ, asked)
         self.port.setPacketTimeoutMillis(1e3 * timeout_s)
         replies: dict[int, bytes] = {}
         alerts: set[int] = set()
@@ -277,7 +266,8 @@ class DynamixelBus:
             servo_id, error, data = reply
             if error & packets.ALERT:
                 alerts.add(servo_id)
-            if len(data) == len(block) and error & ~packets.ALERT == 0 and servo_id in self.models:
+            is_good = error & ~packets.ALERT == 0 and len(data) == len(block)
+            if is_good and servo_id in self.models:
                 replies[servo_id] = data
         if len(replies) == len(self.ids):
             self._awaited[-1] = None
@@ -330,9 +320,8 @@ class DynamixelBus:
                     problem = f"says that {packets.STATUS_ERRORS[error]}"
                     break
                 if error:
-                    reason = packets.STATUS_ERRORS.get(
-                        error, f"error {error}, which the protocol does not have"
-                    )
+                    unknown = f"error {error}, which the protocol does not have"
+                    reason = packets.STATUS_ERRORS.get(error, unknown)
                     raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
                 if len(data) == length:
                     return data
@@ -345,13 +334,14 @@ class DynamixelBus:
         )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
-        length = len(parameters) + 3
-        frame = [0, 0, 0, 0, servo_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
+        length = word(len(parameters) + 3)
+        frame = [0, 0, 0, 0, servo_id, *length, instruction, *parameters, 0, 0]
         self.port.release()
         with bus_gone(self.name):
             result = self._handler.txPacket(self.port, frame)
         if result != COMM_SUCCESS:
-            raise ReplyError(f"cannot send at {self.name}: {self._handler.getTxRxResult(result)}")
+            problem = self._handler.getTxRxResult(result)
+            raise ReplyError(f"cannot send at {self.name}: {problem}")
 
     def _receive(self) -> tuple[int, int, bytes] | None:
         """Id, error and data of the next status; None if it is damaged, or none comes in time."""
@@ -364,8 +354,8 @@ class DynamixelBus:
     def _wait_for_silence(self) -> None:
         with bus_gone(self.name):
             self.port.release()
-            quiet_since = time.monotonic()
-            deadline = quiet_since + 10 * _QUIET_S
-            while time.monotonic() - quiet_since < _QUIET_S and time.monotonic() < deadline:
+            deadline = time.monotonic() + 10 * _QUIET_S
+            end = time.monotonic() + _QUIET_S
+            while time.monotonic() < min(end, deadline):
                 if self.port.readPort(256):
-                    quiet_since = time.monotonic()
+                    end = time.monotonic() + _QUIET_S

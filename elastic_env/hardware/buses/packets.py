@@ -19,16 +19,8 @@ STATUS = 0x55
 PING = 0x01
 READ = 0x02
 WRITE = 0x03
-REG_WRITE = 0x04
-ACTION = 0x05
-FACTORY_RESET = 0x06
-REBOOT = 0x08
 SYNC_READ = 0x82
 SYNC_WRITE = 0x83
-FAST_SYNC_READ = 0x8A
-BULK_READ = 0x92
-BULK_WRITE = 0x93
-FAST_BULK_READ = 0x9A
 
 ALERT = 0x80
 """Bit of a status that says: read `hardware_error_status`."""
@@ -69,7 +61,8 @@ def require_ids(ids: Sequence[int]) -> None:
     Raises:
         ConfigurationError: None are given, one of them twice, or one that no servo can have.
     """
-    if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
+    are_ids = all(0 <= servo_id <= LARGEST_ID for servo_id in ids)
+    if not ids or len(set(ids)) != len(ids) or not are_ids:
         raise ConfigurationError(
             f"ids must be different numbers from 0 to {LARGEST_ID}, got {quote(list(ids))}"
         )
@@ -161,7 +154,7 @@ class Parser:
                 continue
             raw = bytes(self._bytes[: 7 + length])
             is_whole = len(raw) == 7 + length
-            is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
+            is_intact = is_whole and word(crc16(raw[:-2])) == raw[-2:]
             # in what is stuffed no header occurs, with the checksum behind it one may: only where
             # the packet is not intact does a header before its end mean that the rest was lost
             again = self._bytes.find(HEADER, len(HEADER))

@@ -30,7 +30,8 @@ try:
     from dynamixel_sdk import COMM_PORT_BUSY, COMM_SUCCESS, COMM_TX_ERROR, COMM_TX_FAIL, PortHandler
     from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 except ModuleNotFoundError as error:
-    raise missing_extra(str(error.name), "hardware", "the testbed on real hardware") from None
+    purpose = "the testbed on real hardware"
+    raise missing_extra(str(error.name), "hardware", purpose) from None
 
 DEFAULT_BAUDRATE = 3_000_000
 """Bits per second: the fastest that servos, adapter and SDK share without an odd rate."""

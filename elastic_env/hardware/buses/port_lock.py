@@ -32,7 +32,8 @@ def lock_port(name: str) -> int:
         raise cannot_open(name, error.errno, str(error.strerror)) from None
     try:
         if not os.isatty(descriptor):
-            raise PortError(f"cannot open the port {name}: it is no serial port; {_found_ports()}")
+            problem = f"it is no serial port; {_found_ports()}"
+            raise PortError(f"cannot open the port {name}: {problem}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
@@ -66,5 +67,5 @@ def _port_in_use(name: str) -> PortError:
 
 
 def _found_ports() -> str:
-    found = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in Path("/dev").glob(pattern))
-    return f"found: {', '.join(found) or 'no USB serial adapter'}"
+    found = [*Path("/dev").glob("ttyUSB*"), *Path("/dev").glob("ttyACM*")]
+    return f"found: {', '.join(sorted(map(str, found))) or 'no USB serial adapter'}"

@@ -93,7 +93,7 @@ class ControlTable(dict[str, Register]):
 
     @functools.cached_property
     def _by_address(self) -> dict[int, Register]:
-        return {address: one for one in self.values() for address in range(one.address, one.end)}
+        return {at: one for one in self.values() for at in range(one.address, one.end)}
 
     @property
     def size(self) -> int:
@@ -136,8 +136,8 @@ class ServoModel:
         registers = self.table.values()
         first = min(self.table[name].address for name in _MOTION)
         last = max(self.table[name].end for name in _MOTION)
-        starts = [register.address for register in registers if register.address <= first]
-        ends = [register.end for register in registers if register.end >= last]
+        starts = [own.address for own in registers if own.address <= first]
+        ends = [own.end for own in registers if own.end >= last]
         by_length = {end - start: range(start, end) for start in starts for end in ends}
         return tuple(by_length[length] for length in sorted(by_length)[:NUM_BLOCKS])
 
@@ -152,14 +152,12 @@ class ServoModel:
         Nan where it has none.
         """
         units = (self.position_unit, self.velocity_unit, self.current_unit)
-        values = [
-            unit * self._decode(name, block, data)
-            for name, unit in zip(_MOTION, units, strict=True)
-        ]
-        degrees = (
-            self._decode(_TEMPERATURE, block, data) if self.has_temperature(block) else math.nan
-        )
-        return [*values, degrees]
+        counts = [self._decode(name, block, data) for name in _MOTION]
+        degrees = math.nan
+        if self.has_temperature(block):
+            degrees = self._decode(_TEMPERATURE, block, data)
+        motion = [unit * count for unit, count in zip(units, counts, strict=True)]
+        return [*motion, degrees]
 
     def _decode(self, name: str, block: range, data: bytes) -> int:
         register = self.table[name]
@@ -215,24 +213,20 @@ def _read_table(file: str) -> ControlTable:
         )
         for row in _read_rows(file)
     )
-    return ControlTable(
-        {register.name: register for register in sorted(registers, key=lambda r: r.address)}
-    )
+    in_order = sorted(registers, key=lambda register: register.address)
+    return ControlTable({register.name: register for register in in_order})
 
 
 def _read_rows(file: str) -> list[dict[str, str]]:
-    lines = (
-        resources.files("elastic_env.hardware.buses")
-        .joinpath(file)
-        .read_text(encoding="utf-8")
-        .splitlines()
-    )
+    path = resources.files("elastic_env.hardware.buses") / file
+    lines = path.read_text(encoding="utf-8").splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 def explain_errors(status: int) -> str:
     """Words for a hardware error status, "" where there is none."""
-    known = ", ".join(text for bit, text in _HARDWARE_ERRORS.items() if status >> bit & 1)
+    errors = _HARDWARE_ERRORS.items()
+    known = ", ".join(text for bit, text in errors if status >> bit & 1)
     return known or (f"error {status}" if status else "")
 
 
@@ -250,7 +244,8 @@ def torque_of_current(current: npt.ArrayLike) -> Array:
         (...) [N·m].
     """
     amperes = np.asarray(current, dtype=np.float64)
-    return np.sign(amperes) * np.maximum(TORQUE_PER_CURRENT * np.abs(amperes) - LOSS_NM, 0.0)
+    torque = TORQUE_PER_CURRENT * np.abs(amperes) - LOSS_NM
+    return np.sign(amperes) * np.maximum(torque, 0.0)
 
 
 def current_of_torque(torque: float) -> float:

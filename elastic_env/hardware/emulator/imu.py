@@ -48,7 +48,8 @@ class EmulatedImu:
     @property
     def next_s(self) -> float:
         """When it measures or sends next [s]."""
-        return min(self._measured_next_s, self._packets[0][0] if self._packets else math.inf)
+        due_s = self._packets[0][0] if self._packets else math.inf
+        return min(self._measured_next_s, due_s)
 
     def measure(self, q: float, now: float, faults: Faults) -> None:
         """Measure the link angle [rad] if that is due."""
@@ -62,7 +63,8 @@ class EmulatedImu:
         # a real IMU should never send the same three angles twice; the roll is as good as the
         # scenario says
         pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
-        angles = (math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw))
+        turn = math.remainder(float(roll[0]), 2.0 * math.pi)
+        angles = (turn, float(pitch), float(yaw))
         self._angles = distort(faults, angles, self._angles)
         packet = attitude_packet(*self._angles, now - self._start_s)
         if self._generator.random() < faults.imu_corrupted:
@@ -87,9 +89,14 @@ def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
     """
     if faults.imu_frozen:
         return last
-    rolls = {math.nan: faults.imu_nan, math.inf: faults.imu_inf, _NO_ANGLE: faults.imu_out_of_range}
-    roll = next((roll for roll, is_on in rolls.items() if is_on), angles[0])
-    return roll, *angles[1:]
+    roll, pitch, yaw = angles
+    if faults.imu_out_of_range:
+        roll = _NO_ANGLE
+    if faults.imu_inf:
+        roll = math.inf
+    if faults.imu_nan:
+        roll = math.nan
+    return roll, pitch, yaw
 
 
 def checksum(data: bytes) -> bytes:

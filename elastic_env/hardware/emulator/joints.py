@@ -27,8 +27,9 @@ class Joints:
     def __init__(self, config: TestbedConfig, num_joints: int, start_s: float) -> None:
         joint = config.true_joint
         if joint.servo is None:
-            raise ConfigurationError("an emulated servo needs a joint with a servo, got None")
-        model = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s).compile()
+            raise ConfigurationError("an emulated joint needs a servo, got None")
+        spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
+        model = spec.compile()
         self._simulation = simulate(model, num_joints, num_threads=1)
         self._at = JointAddresses.of(model, [JOINT])
         self._force = self._simulation.bind("actuator_force")

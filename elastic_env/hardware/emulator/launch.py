@@ -3,15 +3,13 @@
 import json
 import subprocess
 import termios
-import time
 from contextlib import AbstractContextManager
 from typing import Any, Self
 
-import numpy as np
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.hardware.buses.packets import HIGHEST_RATE, LOWEST_RATE, RATES, require_ids
+from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.errors import HardwareError
@@ -19,10 +17,6 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 from elastic_env.robots.testbed.config import TestbedConfig
 
 _END_S = 10.0
-_LONGEST_SWING_S = 10.0
-_REST_RAD_S = 0.02
-_LOOK_S = 0.05
-_STILL_LOOKS = 3  # where a swing turns back it stands still for one look
 
 
 class EmulatorConfig(Model):
@@ -38,7 +32,7 @@ class EmulatorConfig(Model):
     """The joints behind them, and through its scenario the quality of the IMU."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
     """Packets of the IMU per second [Hz]."""
-    baudrate: int = quantity("bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    baudrate: int = quantity("bit/s", 3_000_000, ge=packets.LOWEST_RATE, le=packets.HIGHEST_RATE)
     """Rate of the bus; no other is heard [bit/s]."""
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0)
@@ -49,9 +43,9 @@ class EmulatorConfig(Model):
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
             raise ValueError(
-                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}"
+                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {packets.RATES}"
             )
-        require_ids(self.ids)
+        packets.require_ids(self.ids)
         return self
 
 
@@ -98,27 +92,6 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
         return self._request({"state": True})
 
-    def wait_until_rest(self) -> None:
-        """Wait until joints that were let go have swung out: torque goes on at rest only.
-
-        Raises:
-            HardwareError: They still move after 10 s.
-        """
-        deadline = time.monotonic() + _LONGEST_SWING_S
-        before = self.state()
-        still_looks = 0
-        while still_looks < _STILL_LOOKS:
-            if time.monotonic() > deadline:
-                raise HardwareError(
-                    f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?"
-                )
-            time.sleep(_LOOK_S)
-            now = self.state()
-            moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
-            is_still = moved < _REST_RAD_S * (now["time_s"] - before["time_s"])
-            still_looks = still_looks + 1 if is_still else 0
-            before = now
-
     def wait(self) -> None:
         """Wait until it ends by itself, or an interrupt comes."""
         self._process.wait()
@@ -140,7 +113,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise HardwareError(f"the emulator ended with exit code {self._process.wait()}")
+            code = self._process.wait()
+            raise HardwareError(f"the emulator ended with exit code {code}")
         return json.loads(line)
 
     def _take_ports(self, ports: dict[str, str]) -> None:

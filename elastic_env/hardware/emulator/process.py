@@ -7,7 +7,6 @@ import math
 import os
 import pty
 import select
-import struct
 import sys
 import termios
 import time
@@ -55,8 +54,8 @@ class Terminal:
 
         They are lost where nobody has read what is there, as on a line to nobody.
         """
-        unread = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, b"\0\0\0\0"))[0]
-        if unread > _UNREAD_BYTES:
+        unread = fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4))
+        if int.from_bytes(unread, sys.byteorder) > _UNREAD_BYTES:
             termios.tcflush(self._slave, termios.TCIFLUSH)
         with contextlib.suppress(OSError):
             os.write(self.master, data)
@@ -72,7 +71,8 @@ class Terminal:
 
         One that the system has no name for passes.
         """
-        return termios.tcgetattr(self._slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
+        speed = termios.tcgetattr(self._slave)[_OUTPUT_SPEED]
+        return speed == getattr(termios, f"B{baudrate}")
 
     def close(self) -> None:
         """Take it away, as an unplugged adapter is."""
@@ -104,10 +104,9 @@ class Emulator:
         self._reply_faults = np.random.default_rng([config.seed, 0])
         self._instruction_faults = np.random.default_rng([config.seed, 2])
         self._joints = Joints(config.testbed, len(config.ids), now)
+        claimed = config.claimed_model_number
         self._servos = [
-            EmulatedServo(
-                servo_id, model, partial(self._note, index), config.claimed_model_number, motor
-            )
+            EmulatedServo(servo_id, model, partial(self._note, index), claimed, motor)
             for index, (servo_id, motor) in enumerate(
                 zip(config.ids, self._joints.motors, strict=True)
             )
@@ -181,7 +180,8 @@ class Emulator:
         """How long nothing is to be done [s], at most a time."""
         now = time.monotonic()
         physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
-        return max(min(now + wait_s, physics_s, self._imu.next_s, self._next_packet_s()) - now, 0.0)
+        at = min(now + wait_s, physics_s, self._imu.next_s, self._next_packet_s())
+        return max(at - now, 0.0)
 
     def _next_packet_s(self) -> float:
         """When the adapter has enough replies to pass on, or has waited long enough."""
@@ -218,10 +218,9 @@ class Emulator:
             for reply in self._bus.answer(packet, now):
                 self._queue(reply, now)
             if packet.instruction == packets.SYNC_READ:
+                name = "present_position"
                 for servo in self._servos:
-                    self.events.append(
-                        (now, servo.servo_id, "present_position", servo["present_position"])
-                    )
+                    self.events.append((now, servo.servo_id, name, servo[name]))
         return now
 
     def _queue(self, reply: bytes, now: float) -> None:

@@ -56,14 +56,10 @@ class EmulatedServo:
     model_number: int | None = None
     motor: Motor = field(default_factory=Motor)
     _memory: bytearray = field(init=False)
-    _registered: tuple[int, bytes] | None = None
     _heard_s: float = 0.0
 
     def __post_init__(self) -> None:
         self._memory = bytearray(self.model.table.size)
-        self._reset()
-
-    def _reset(self) -> None:
         limit = self.model.current_limit
         allowed = int(current_of_torque(LARGEST_TORQUE_NM) / self.model.current_unit)
         for register in self.model.table.values():
@@ -100,9 +96,8 @@ class EmulatedServo:
         """Put what it measures into its registers."""
         self["present_position"] = round(self.motor.position / self.model.position_unit)
         self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        self["present_current"] = round(
-            current_of_torque(self.motor.torque) / self.model.current_unit
-        )
+        current = current_of_torque(self.motor.torque)
+        self["present_current"] = round(current / self.model.current_unit)
 
     def heat(self, is_hot: bool) -> None:
         """Make it hot, which it shows as its temperature alone, or let it cool."""
@@ -135,26 +130,12 @@ class EmulatedServo:
         """Error number and data of the reply to an instruction."""
         match instruction:
             case packets.PING:
-                return self._alert, word(self["model_number"]) + bytes([self["firmware_version"]])
+                number = word(self["model_number"])
+                return self._alert, number + bytes([self["firmware_version"]])
             case packets.READ if len(parameters) == 4:
                 return self.read(*words(parameters))
             case packets.WRITE if len(parameters) > 2:
                 return self.write(words(parameters)[0], parameters[2:]), b""
-            case packets.REG_WRITE if len(parameters) > 2:
-                self._registered = (words(parameters)[0], parameters[2:])
-                self["registered_instruction"] = 1
-                return self._alert, b""
-            case packets.ACTION if self._registered is not None:
-                address, data = self._registered
-                self._registered = None
-                self["registered_instruction"] = 0
-                return self.write(address, data), b""
-            case packets.FACTORY_RESET | packets.REBOOT:
-                self._change("torque_enable", 0)
-                if instruction == packets.FACTORY_RESET:
-                    self._reset()
-                self["hardware_error_status"] = 0
-                return 0, b""
             case _:
                 return packets.INSTRUCTION_ERROR | self._alert, b""
 
@@ -174,9 +155,10 @@ class EmulatedServo:
         end = address + len(data)
         while address < end:
             register = self.model.table.find(address)
-            if register is None or not register.is_writable or register.address != address:
+            if register is None or register.address != address:
                 return packets.ACCESS_ERROR | self._alert
-            if register.memory == "EEPROM" and self.is_on:
+            is_locked = register.memory == "EEPROM" and self.is_on
+            if is_locked or not register.is_writable:
                 return packets.ACCESS_ERROR | self._alert
             if register.end > end:
                 return packets.LENGTH_ERROR | self._alert
@@ -201,14 +183,14 @@ class EmulatedServo:
             return packets.RANGE_ERROR
         match register.name:
             case "goal_position":
-                is_within = self["min_position_limit"] <= value <= self["max_position_limit"]
+                lowest = self["min_position_limit"]
+                is_within = lowest <= value <= self["max_position_limit"]
                 return 0 if is_within else packets.LIMIT_ERROR
             case "torque_enable" if value not in (0, 1):
                 return packets.RANGE_ERROR
             case "torque_enable":
-                return packets.RESULT_FAIL if value and self["hardware_error_status"] else 0
-            case "id":
-                return 0 if 0 <= value <= packets.LARGEST_ID else packets.RANGE_ERROR
+                has_error = self["hardware_error_status"] != 0
+                return packets.RESULT_FAIL if value and has_error else 0
             case _:
                 return 0
 
@@ -219,8 +201,6 @@ class EmulatedServo:
         they do not.
         """
         self[name] = value
-        if name == "id":
-            self.servo_id = value
         if name in _SWITCHES:
             self.notify(self.servo_id, name, value)
 
@@ -244,77 +224,28 @@ class EmulatedBus:
         for servo in self.servos.values():
             servo.hear(now_s)
         if not packet.is_intact:
-            return (
-                [packets.status(packet.servo_id, packets.CRC_ERROR)]
-                if packet.servo_id in self.servos
-                else []
-            )
+            reply = packets.status(packet.servo_id, packets.CRC_ERROR)
+            return [reply] if packet.servo_id in self.servos else []
         parameters = packet.parameters
         match packet.instruction:
-            case packets.STATUS:
-                return []
-            case packets.SYNC_READ | packets.FAST_SYNC_READ:
-                groups = [(servo_id, *words(parameters)) for servo_id in parameters[4:]]
-                return self._read(groups, packet.instruction == packets.FAST_SYNC_READ)
-            case packets.BULK_READ | packets.FAST_BULK_READ:
-                groups = [
-                    (parameters[i], *words(parameters[i + 1 :]))
-                    for i in range(0, len(parameters) - 4, 5)
-                ]
-                return self._read(groups, packet.instruction == packets.FAST_BULK_READ)
+            case packets.SYNC_READ:
+                address, length = words(parameters)
+                asked = [i for i in parameters[4:] if i in self.servos]
+                replies = [(i, *self.servos[i].read(address, length)) for i in asked]
+                return [packets.status(*reply) for reply in replies]
             case packets.SYNC_WRITE:
                 address, length = words(parameters)
                 for at in range(4, len(parameters) - length, length + 1):
-                    self._write(parameters[at], address, parameters[at + 1 : at + 1 + length])
-                return []
-            case packets.BULK_WRITE:
-                while len(parameters) >= 5:
-                    address, length = words(parameters[1:])
-                    self._write(parameters[0], address, parameters[5 : 5 + length])
-                    parameters = parameters[5 + length :]
+                    if servo := self.servos.get(parameters[at]):
+                        servo.write(address, parameters[at + 1 : at + 1 + length])
                 return []
             case packets.PING if packet.servo_id == packets.BROADCAST:
-                return [
-                    reply
-                    for servo_id in sorted(self.servos)
-                    for reply in self._instruct(servo_id, packet)
-                ]
-            case _ if packet.servo_id == packets.BROADCAST:
-                for servo_id in list(self.servos):
-                    self._instruct(servo_id, packet)
-                return []
+                return [self._instruct(i, packet) for i in sorted(self.servos)]
+            case _ if packet.servo_id in self.servos:
+                return [self._instruct(packet.servo_id, packet)]
             case _:
-                return self._instruct(packet.servo_id, packet)
+                return []
 
-    def _instruct(self, servo_id: int, packet: Packet) -> list[bytes]:
-        servo = self.servos.get(servo_id)
-        if servo is None:
-            return []
-        error, data = servo.answer(packet.instruction, packet.parameters)
-        if servo.servo_id != servo_id:
-            self.servos[servo.servo_id] = self.servos.pop(servo_id)
-        return [packets.status(servo_id, error, data)]
-
-    def _read(self, groups: Sequence[tuple[int, int, int]], is_fast: bool) -> list[bytes]:
-        replies = [
-            (i, *self.servos[i].read(address, length))
-            for i, address, length in groups
-            if i in self.servos
-        ]
-        if not is_fast:
-            return [packets.status(servo_id, error, data) for servo_id, error, data in replies]
-        return [_join(replies)] if len(replies) == len(groups) else []
-
-    def _write(self, servo_id: int, address: int, data: bytes) -> None:
-        if servo_id in self.servos:
-            self.servos[servo_id].write(address, data)
-
-
-def _join(replies: Sequence[tuple[int, int, bytes]]) -> bytes:
-    """A fast reply: the parts of all servos in one packet, each with a checksum of all so far."""
-    length = 1 + sum(len(data) + 4 for _, _, data in replies)
-    wire = packets.HEADER + bytes([packets.BROADCAST]) + word(length) + bytes([packets.STATUS])
-    for servo_id, error, data in replies:
-        wire += bytes([error, servo_id]) + data
-        wire += word(packets.crc16(wire))
-    return wire
+    def _instruct(self, servo_id: int, packet: Packet) -> bytes:
+        answer = self.servos[servo_id].answer(packet.instruction, packet.parameters)
+        return packets.status(servo_id, *answer)

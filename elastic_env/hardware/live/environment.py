@@ -37,11 +37,8 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
             f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT"
         )
     of_settings = list(HardwareSettings.model_fields)
-    of_testbed = [
-        name
-        for name in inspect.signature(configure_testbed).parameters
-        if name not in _OF_A_SIMULATION
-    ]
+    parameters = inspect.signature(configure_testbed).parameters
+    of_testbed = [name for name in parameters if name not in _OF_A_SIMULATION]
     require_known(f"argument of {ID}", arguments, [*of_settings, *of_testbed])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
@@ -56,7 +53,8 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
-    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
+    picture = partial(TestbedPicture, task.config.pendulum)
+    return ElasticEnv(task, render_mode, picture, task.plant)
 
 
 def make_vector(

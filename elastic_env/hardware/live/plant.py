@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
@@ -25,13 +25,14 @@ _SHORTEST_MOVE_S = 0.5
 _SETTLE_S = 0.5
 
 
-@dataclass(frozen=True)
-class CycleTiming:
-    """How well the last control period was kept; counts are of the episode."""
+class CycleRecord(NamedTuple):
+    """Torque and timing of the last control period; counts are of the episode."""
 
-    jitter_s: float = 0.0
+    joint_torque: float = np.nan
+    """By the motor current [N·m]."""
+    jitter: float = 0.0
     """How late the reading was, or the command for it [s]."""
-    period_s: float = 0.0
+    period: float = 0.0
     """Time since the reading before [s]."""
     overruns: int = 0
     """Periods that were more than half a period late, see `Pace`."""
@@ -72,8 +73,7 @@ class ServoPlant:
         self.qvel: Array = np.full((1, model.nv), np.nan)
         self.act: Array = np.zeros((1, model.na))
         self.ctrl: Array = np.zeros((1, model.nu))
-        self.motor_torque = np.full(1, np.nan)
-        self.timing = CycleTiming()
+        self.record = CycleRecord()
         self._at = at
         self._period_s = period_s
         self._pendulum_nm = pendulum_nm
@@ -115,12 +115,13 @@ class ServoPlant:
         with self._closing_on_error():
             bus = self._open_bus()
             bus.disable()
-            start = self.settings.joint_angle(float(bus.enable(self.settings.servo_limits)[0]))
+            stands = bus.enable(self.settings.servo_limits)
+            start = self.settings.joint_angle(float(stands[0]))
             self._restart_clock()
             self._move(start, angle)
             for _ in range(round(_SETTLE_S / self._period_s)):
                 self._cycle(angle)
-            self.timing = CycleTiming()
+            self.record = CycleRecord(self.record.joint_torque)
             bus.keep(self._servo_goal(angle))
             self._is_kept = True
 
@@ -176,44 +177,27 @@ class ServoPlant:
     def refresh(self, worlds: BoolArray) -> None:
         """Nothing: hardware has nothing to compute."""
 
-    def diverged(self) -> BoolArray:
+    def divergence(self) -> BoolArray:
         """Hardware does not diverge: where something is wrong, an error says what."""
         return np.zeros(1, dtype=np.bool_)
 
-    def bind(self, field: str) -> Array:
-        """Hardware has no fields of MuJoCo.
+    def bind(self, field: object, *_: object) -> NoReturn:
+        """Hardware has no fields of MuJoCo, and no other model than the one it is.
 
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError(f"hardware has no {field!r} of MuJoCo")
+        raise HardwareError(f"hardware has no {field!r} that could be read or varied")
 
-    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """As `bind`, for several fields."""
-        return tuple(map(self.bind, fields))
-
-    def vary(self, field: str) -> Array:
-        """Hardware cannot be varied.
-
-        Raises:
-            HardwareError: Always.
-        """
-        raise HardwareError(f"{field!r} of hardware cannot be varied")
-
-    def take(self, world: int, model: mujoco.MjModel) -> None:
-        """Hardware has no other model than the one it is.
-
-        Raises:
-            HardwareError: Always.
-        """
-        raise HardwareError(
-            f"world {world} of hardware cannot take a model of {model.nbody} bodies"
-        )
+    views: Any = bind
+    vary: Any = bind
+    take: Any = bind
 
     def _open_bus(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:
-            self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
+            ports = {settings.port: [settings.servo_id]}
+            self._bus = SupervisedBus(ports, settings.baudrate)
             if settings.imu_port is not None:
                 self._imu = AttitudeStream(
                     settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s
@@ -232,10 +216,8 @@ class ServoPlant:
 
     def _move(self, start: float, end: float) -> None:
         """Move slowly from one angle to another [rad]."""
-        duration_s = max(
-            QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S
-        )
-        steps = int(np.ceil(duration_s / self._period_s))
+        way_s = QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s
+        steps = int(np.ceil(max(way_s, _SHORTEST_MOVE_S) / self._period_s))
         for share in minimum_jerk(np.arange(1, steps + 1) / steps):
             self._cycle(start + (end - start) * float(share))
 
@@ -265,12 +247,14 @@ class ServoPlant:
                 break
             missed += 1
         self._read(cycle)
-        self.timing = CycleTiming(
-            jitter_s=late_s,
-            period_s=cycle.states.time_s - self._read_s,
-            overruns=self.timing.overruns + overruns,
-            missed_replies=self.timing.missed_replies + missed,
-            limited=self.timing.limited + is_limited,
+        torque = float(torque_of_current(cycle.states.current[0]))
+        self.record = CycleRecord(
+            joint_torque=self.settings.direction * torque,
+            jitter=late_s,
+            period=cycle.states.time_s - self._read_s,
+            overruns=self.record.overruns + overruns,
+            missed_replies=self.record.missed_replies + missed,
+            limited=self.record.limited + is_limited,
         )
         self._read_s = cycle.states.time_s
 
@@ -279,12 +263,14 @@ class ServoPlant:
         settings = self.settings
         states = cycle.states
         self._goal = settings.joint_angle(float(cycle.goals[0]))
-        self.qpos[0, self._at.theta[0]] = settings.joint_angle(float(states.position[0]))
-        self.qvel[0, self._at.theta_dot[0]] = settings.direction * float(states.velocity[0])
-        self.motor_torque[0] = settings.direction * float(torque_of_current(states.current[0]))
+        theta = settings.joint_angle(float(states.position[0]))
+        self.qpos[0, self._at.theta[0]] = theta
+        theta_dot = settings.direction * float(states.velocity[0])
+        self.qvel[0, self._at.theta_dot[0]] = theta_dot
         if self._imu is not None:
             sample = self._imu.latest()
-            q = sample.link_angle(settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            mounting = (settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            q = sample.link_angle(*mounting)
             self._require_together(q, states.time_s - sample.time_s)
             self.qpos[0, self._at.q[0]] = q
 
@@ -295,7 +281,8 @@ class ServoPlant:
         """
         settings = self.settings
         deflection = q - float(self.qpos[0, self._at.theta[0]])
-        if math.isfinite(deflection):  # of others there is no remainder, and they are too far
+        # of others there is no remainder, and they are too far
+        if math.isfinite(deflection):
             deflection = math.remainder(deflection, 2.0 * math.pi)
         moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
         if exceeds(abs(deflection), settings.largest_deflection_rad + moved):
@@ -335,4 +322,4 @@ def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: flo
     except EOFError:
         answer = ""
     if answer.strip().lower() != "yes":
-        raise HardwareError(f"nobody agreed to the motion at {settings.port}; nothing has moved")
+        raise HardwareError(f"nobody agreed; nothing has moved at {settings.port}")

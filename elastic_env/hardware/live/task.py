@@ -1,5 +1,6 @@
-"""The testbed task on hardware: the rules of `elastic_env/Testbed-v0`, with measurements in the
-place of the truth.
+"""The testbed task on hardware: measurements stand in the place of the truth.
+
+The rules are those of `elastic_env/Testbed-v0`.
 
 What differs, because a real joint does not tell it:
 
@@ -11,16 +12,16 @@ What differs, because a real joint does not tell it:
 | `truth()`, and with it the policy `oracle` | an error |
 
 Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies`
-and `limited`, see `elastic_env.hardware.live.plant.CycleTiming`.
+and `limited`, see `elastic_env.hardware.live.plant.CycleRecord`.
 """  # noqa: E501
 
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
-from elastic_env.core.signals import Array, BoolArray, Signals
+from elastic_env.core.signals import BoolArray, Signals
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.live.plant import ServoPlant
+from elastic_env.hardware.live.plant import CycleRecord, ServoPlant
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
@@ -37,14 +38,8 @@ TIMING_METRICS = (
     Metric("missed_replies", "missed_replies", "max", over="all"),
     Metric("limited", "limited", "max", over="all"),
 )
-_CYCLE = record_type(
-    ("joint_torque", REAL),
-    ("jitter", REAL),
-    ("period", REAL),
-    ("overruns", WHOLE),
-    ("missed_replies", WHOLE),
-    ("limited", WHOLE),
-)
+_KINDS = {float: REAL, int: WHOLE}
+_CYCLE = record_type(*((name, _KINDS[of]) for name, of in get_type_hints(CycleRecord).items()))
 _LINK = JointTask.world_type
 
 
@@ -62,13 +57,14 @@ class HardwareTestbedTask(TestbedTask):
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
-        imu = AttitudeSensor(rate_hz=1.0 / config.control_period_s)
-        super().__init__(config.replace(scenario=config.scenario.replace(imu=imu)), num_worlds=1)
+        period_s = config.control_period_s
+        imu = AttitudeSensor(rate_hz=1.0 / period_s)
+        scenario = config.scenario.replace(imu=imu)
+        super().__init__(config.replace(scenario=scenario), num_worlds=1)
         self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
         at = JointAddresses.of(self.model, self.assumed_model.joint_names)
-        self.plant = ServoPlant(
-            self.model, at, settings, config.control_period_s, config.pendulum.gravity_torque
-        )
+        load_nm = config.pendulum.gravity_torque
+        self.plant = ServoPlant(self.model, at, settings, period_s, load_nm)
         extent = config.reference.extent()
         limits = settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
@@ -85,8 +81,7 @@ class HardwareTestbedTask(TestbedTask):
             HardwareError: Always.
         """
         raise HardwareError(
-            "hardware has no truth: the policy 'oracle' and scores by the true link need a"
-            " simulation"
+            "hardware has no truth: 'oracle' and scores by the true link need a simulation"
         )
 
     def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one
@@ -97,16 +92,16 @@ class HardwareTestbedTask(TestbedTask):
         super()._begin_worlds(worlds)
         self._keep_cycle()
 
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+    def _sense_worlds(self, *arguments: Any, **named: Any) -> bool:
         """Behind the last step the pendulum is brought to rest."""
-        is_over = super()._sense_worlds(commanded, results)
+        is_over = super()._sense_worlds(*arguments, **named)
         self._keep_cycle()  # before the way back to rest, which measures too
         if is_over:
             self.plant.finish()
         return is_over
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
-        """See the table of the module."""
+        """Signals of a step, as in the table of the module."""
         cycle = worlds["cycle"]
         return {
             **super()._signals(joints, worlds),
@@ -116,16 +111,8 @@ class HardwareTestbedTask(TestbedTask):
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Several where a cycle had to be repeated."""
-        return float(np.rint(max(self.plant.timing.period_s / self.config.control_period_s, 1.0)))
+        periods = self.plant.record.period / self.config.control_period_s
+        return float(np.rint(max(periods, 1.0)))
 
     def _keep_cycle(self) -> None:
-        timing = self.plant.timing
-        motor_torque: Array = self.plant.motor_torque
-        self._worlds[self._row]["cycle"] = (
-            motor_torque[0],
-            timing.jitter_s,
-            timing.period_s,
-            timing.overruns,
-            timing.missed_replies,
-            timing.limited,
-        )
+        self._worlds[self._row]["cycle"] = tuple(self.plant.record)

@@ -134,7 +134,8 @@ class Guard:
         motion = np.stack([states.position, states.velocity, states.current])
         unreal = is_fresh & ~np.isfinite(motion).all(axis=0)
         if unreal.any():
-            return f"position, velocity or current of {self._list(unreal)} is not a finite number"
+            servos = self._list(unreal)
+            return f"position, velocity or current of {servos} is not a finite number"
         if states.has_alert.any():
             return "a servo reports a hardware error"
         self._without_reply = np.where(is_fresh, 0, self._without_reply + 1)
@@ -157,9 +158,8 @@ class Guard:
         if fast.any():
             speeds = self._list(fast, states.velocity)
             return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {speeds} rad/s"
-        behind = is_fresh & exceeds(
-            np.abs(states.position - self.goals), limits.following_error_rad
-        )
+        distance = np.abs(states.position - self.goals)
+        behind = is_fresh & exceeds(distance, limits.following_error_rad)
         if behind.any():
             return (
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, "
@@ -170,10 +170,10 @@ class Guard:
 
     def _check_load(self, states: States) -> str:
         torque = np.abs(torque_of_current(states.current))
-        strained = np.where(exceeds(torque, self.limits.torque_nm), self._strained + 1, 0)
-        self._strained = np.where(
-            states.is_fresh, strained, self._strained
-        )  # a missing reply tells neither way
+        is_strained = exceeds(torque, self.limits.torque_nm)
+        strained = np.where(is_strained, self._strained + 1, 0)
+        # a missing reply tells neither way
+        self._strained = np.where(states.is_fresh, strained, self._strained)
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
         if too_long.any():
             torques = self._list(too_long, torque)
@@ -182,15 +182,18 @@ class Guard:
 
     def _check_heat(self, temperature: Array) -> str:
         is_missing = np.isnan(temperature)
-        self._without_temperature = np.where(is_missing, self._without_temperature + 1, 0)
+        missed = self._without_temperature + 1
+        self._without_temperature = np.where(is_missing, missed, 0)
         hot = ~is_missing & exceeds(temperature, self._hottest)
         if hot.any():
             return explain_heat(self._list(hot, temperature), self._hottest[hot])
         unknown = self._without_temperature > _LONGEST_WITHOUT_TEMPERATURE
         if unknown.any():
-            cycles = _LONGEST_WITHOUT_TEMPERATURE
-            names = self._list(unknown)
-            return f"no temperature from {names} in {cycles} cycles: elastic hardware check"
+            servos = self._list(unknown)
+            return (
+                f"no temperature from {servos} in {_LONGEST_WITHOUT_TEMPERATURE} cycles: elastic"
+                " hardware check"
+            )
         return ""
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:

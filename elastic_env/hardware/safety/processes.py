@@ -45,7 +45,8 @@ def child_command(module: str, *arguments: str) -> list[str]:
     """
     names = dict.fromkeys((_PACKAGE, module.partition(".")[0]))
     folders = os.pathsep.join(str(_folder(name)) for name in names)
-    return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
+    this = str(Path(__file__).resolve())
+    return [sys.executable, "-P", this, folders, module, *arguments]
 
 
 def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Popen[str]":
@@ -83,9 +84,8 @@ def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, 
     Args:
         environment: Variables by name, default those of this program.
     """
-    entries = [
-        entry for entry in environment.get(_PATH, "").split(os.pathsep) if not _is_here(entry)
-    ]
+    found = environment.get(_PATH, "").split(os.pathsep)
+    entries = [entry for entry in found if not _is_here(entry)]
     others = {name: value for name, value in environment.items() if name != _PATH}
     return {**others, _PATH: os.pathsep.join(entries)} if entries else others
 
@@ -183,9 +183,8 @@ def is_ending(process_id: int, proc: Path = _PROC) -> bool:
         return (proc / "self").exists()
     except OSError:
         return False
-    pending = [
-        line.split()[1] for line in status.splitlines() if line.startswith(("SigPnd:", "ShdPnd:"))
-    ]
+    lines = [line.split() for line in status.splitlines() if line.strip()]
+    pending = [line[1] for line in lines if line[0] in ("SigPnd:", "ShdPnd:")]
     is_killed = any(int(mask, 16) & _KILLED for mask in pending)
     fields = stat.rpartition(")")[2].split()
     return is_killed or fields[0] in "ZX" or bool(int(fields[_FLAGS]) & _ENDING)

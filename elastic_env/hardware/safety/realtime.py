@@ -38,7 +38,9 @@ def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
     gc.collect()
     gc.freeze()
     with contextlib.suppress(OSError, AttributeError):
-        policy = os.SCHED_FIFO if with_threads else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        policy = os.SCHED_FIFO
+        if not with_threads:
+            policy |= os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(priority))
         return True
     return False
@@ -51,7 +53,8 @@ def schedule_like(thread_id: int) -> None:
         thread_id: Native id of the other.
     """
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.sched_getscheduler(thread_id), os.sched_getparam(thread_id))
+        policy = os.sched_getscheduler(thread_id)
+        os.sched_setscheduler(0, policy, os.sched_getparam(thread_id))
 
 
 def give_up_realtime() -> None:
@@ -59,7 +62,8 @@ def give_up_realtime() -> None:
     gc.unfreeze()
     # the flag may be taken back with special rights only
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+        policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(0))
 
 
 def sleep_until(moment_s: float) -> None:

@@ -4,32 +4,23 @@ import contextlib
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.hardware import errors
 from elastic_env.hardware.buses.bus import BusGroup, States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
-from elastic_env.hardware.errors import (
-    BusGoneError,
-    FaultError,
-    HardwareError,
-    PortError,
-    ReplyError,
-)
+from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
 
-_ERRORS = {
-    error.__name__: error
-    for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)
-}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
 """Longest silence of a supervisor beyond what was asked for [s].
@@ -111,9 +102,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             )
         try:
             self._receive(0, _START_S)
-            self.models = self._request("attach", self._slow_s, ids=list(self._ports.values()))[
-                "models"
-            ]
+            servos = list(self._ports.values())
+            self.models = self._request("attach", self._slow_s, ids=servos)["models"]
         except BaseException:
             self.close()
             raise
@@ -204,7 +194,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan
         # as its second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
+        within_s = wait_s + self._answer_s
+        return self._request("exchange", within_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.
@@ -246,7 +237,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         with self._lock:
             self._number += 1
             try:
-                self._channel.send({"number": self._number, "do": action, "with": arguments})
+                request = {"number": self._number, "do": action, "with": arguments}
+                self._channel.send(request)
             except OSError:
                 raise self._replace_supervisor() from None
             return self._receive(self._number, within_s)
@@ -263,7 +255,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
                 end_s = time.monotonic() + within_s
             elif answer["number"] == number:
                 if "error" in answer:
-                    raise _ERRORS[answer["error"]](answer["message"])
+                    raise getattr(errors, answer["error"])(answer["message"])
                 return answer
         self._process.kill()
         raise self._replace_supervisor(within_s)
@@ -271,7 +263,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     def _replace_supervisor(self, silent_s: float | None = None) -> FaultError:
         """Switch torque off for a supervisor that died, or was silent for a time [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
+            # its end of the channel closes before its port does
+            self._process.wait(timeout=1.0)
         if silent_s is None:
             how = f"ended (exit code {self._process.poll()})"
         else:
@@ -299,44 +292,37 @@ def emergency_stop(
         What came of it, in words.
     """
     problems: list[str] = []
-    buses: list[DynamixelBus] = []
-    with contextlib.ExitStack() as opened:
-        for number, (port, ids) in enumerate(ports.items()):
-            bus = DynamixelBus(port, baudrate)
+    buses = [DynamixelBus(port, baudrate) for port in ports]
+    try:
+        for number, (bus, ids) in enumerate(zip(buses, ports.values(), strict=True)):
             try:
                 bus.open()
-                opened.enter_context(_closing(bus))
-                known = (
-                    dict(zip(ids, models[number], strict=True))
-                    if models
-                    else _ask_models(bus, ids, problems)
-                )
-                bus.attach_known(known)
-                buses.append(bus)
+                known = models[number] if models else _ask_models(bus, ids, problems)
+                numbers = dict(zip(ids, known, strict=True))
+                bus.attach_known({i: number for i, number in numbers.items() if number})
             except HardwareError as error:
                 problems.append(f"torque could not be switched off: {error}")
-        problem = BusGroup(buses).torque_off() if buses else None
+        reached = [bus for bus in buses if bus.models]
+        problem = BusGroup(reached).torque_off() if reached else None
+    finally:
+        for bus in buses:
+            # one that is gone cannot be closed
+            with contextlib.suppress(HardwareError):
+                bus.close()
     if problem is not None:
         problems.append(str(problem))
-    elif any(bus.models for bus in buses):
+    elif reached:
         problems.append("torque of the others is off" if problems else "torque is off")
     return "; ".join(dict.fromkeys(problems))
 
 
-@contextlib.contextmanager
-def _closing(bus: DynamixelBus) -> Iterator[None]:
-    """Close a bus at the end; one that is gone cannot be, which has been said before."""
-    yield
-    with contextlib.suppress(HardwareError):
-        bus.close()
-
-
-def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> dict[int, int]:
-    """Model numbers of the servos that answer, by id; adds those that do not to the problems."""
-    models = {}
+def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> list[int]:
+    """Model numbers of the servos, 0 of those that do not answer, which is a problem more."""
+    models = []
     for servo_id in ids:
         try:
-            models[servo_id] = bus.ping(servo_id).model_number
+            models.append(bus.ping(servo_id).model_number)
         except ReplyError as error:
+            models.append(0)
             problems.append(f"torque could not be switched off: {error}")
     return models

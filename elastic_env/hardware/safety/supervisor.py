@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.buses.bus import Bus, BusGroup, States, servo_name
+from elastic_env.hardware.buses.bus import BusGroup, Condition, States, servo_name
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety.checks import check_bus
@@ -77,7 +77,8 @@ class Supervisor:
         finally:
             try:
                 self._torque_off()
-            except BaseException:  # a signal in this very moment; after it no other comes through
+            except BaseException:
+                # a signal in this very moment; after it no other comes through
                 self._torque_off()
                 raise
 
@@ -125,14 +126,15 @@ class Supervisor:
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, servo_ids in zip(self._buses, ids, strict=True):
             problems = [
-                check for check in check_bus(bus, servo_ids) if check.is_vital and not check.is_good
+                f"{check.what} is {check.value}: {check.cure}"
+                for check in check_bus(bus, servo_ids)
+                if check.is_vital and not check.is_good
             ]
             if problems:
-                words = "; ".join(
-                    f"{check.what} is {check.value}: {check.cure}" for check in problems
-                )
+                words = "; ".join(problems)
                 raise HardwareError(f"nothing can move at {bus.name} yet: {words}")
-        return {"models": [[model.number for model in bus.models.values()] for bus in self._buses]}
+        models = [list(bus.models.values()) for bus in self._buses]
+        return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
         """Torque on, with every servo's goal where it stands."""
@@ -142,14 +144,13 @@ class Supervisor:
         self._disable()
         safety_limits = SafetyLimits(**limits)
         servos = self._servos.servos
-        for bus, servo_id in servos:
-            require_healthy(bus, servo_id)
-            require_rest(bus, servo_id)
-        hottest = [
-            require_cool(bus, servo_id, safety_limits.temperature_c) for bus, servo_id in servos
-        ]
+        names = self._servos.names
+        conditions = [bus.read_condition(servo_id) for bus, servo_id in servos]
+        for name, condition in zip(names, conditions, strict=True):
+            require_ready(name, condition, safety_limits.temperature_c)
+        hottest = [condition.temperature_limit for condition in conditions]
         positions = np.array([bus.read_position(servo_id) for bus, servo_id in servos])
-        guard = Guard(safety_limits, positions, self._servos.names, hottest)
+        guard = Guard(safety_limits, positions, names, hottest)
         self._fault = None
         try:
             for bus, servo_id in servos:
@@ -182,9 +183,8 @@ class Supervisor:
         if exceeds(at - now, LONGEST_WAIT_S):
             raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
         is_held = guard.is_holding
-        allowed, is_limited = guard.command(
-            np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S)
-        )
+        elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
+        allowed, is_limited = guard.command(np.array(goals), elapsed_s)
         self._servos.write_goals(allowed)
         self._commanded_s = now
         sleep_until(at)
@@ -205,7 +205,8 @@ class Supervisor:
 
     def _read(self) -> dict[str, Any]:
         """States without any command; while torque is on this counts as none."""
-        return self._servos.read_states(max(bus.reply_timeout_s for bus in self._buses)).dump()
+        timeout_s = max(bus.reply_timeout_s for bus in self._buses)
+        return self._servos.read_states(timeout_s).dump()
 
     def _disable(self) -> dict[str, Any]:
         """Torque off, confirmed."""
@@ -227,7 +228,8 @@ class Supervisor:
         for number in np.flatnonzero(states.has_alert):
             bus, servo_id = self._servos.servos[number]
             try:
-                errors.append(f"{servo_name(bus, servo_id)}: {bus.read_error(servo_id)}")
+                error = bus.read_condition(servo_id).error
+                errors.append(f"{servo_name(bus, servo_id)}: {error}")
             except HardwareError as error:
                 errors.append(str(error))
         return f" ({'; '.join(errors)})" if errors else ""
@@ -256,48 +258,30 @@ class Supervisor:
             self._channel.send({"number": self._number, "busy": True})
 
 
-def require_healthy(bus: Bus, servo_id: int) -> None:
-    """Refuse a servo that reports a hardware error.
+def require_ready(name: str, condition: Condition, limit_c: float) -> None:
+    """Refuse torque to a servo that reports a hardware error, moves, or is too hot.
+
+    Args:
+        name: Of the servo in messages.
+        condition: Its condition.
+        limit_c: Highest temperature; its own setting holds where that is lower [°C].
 
     Raises:
-        FaultError: It does.
+        FaultError: It may not get torque, or its speed or temperature is not known.
     """
-    error = bus.read_error(servo_id)
-    if error:
+    if condition.error:
         cure = "remove the cause, then switch its power off and on"
-        raise FaultError(f"{servo_name(bus, servo_id)} reports {error}; {cure}")
-
-
-def require_rest(bus: Bus, servo_id: int) -> None:
-    """Refuse a servo that moves.
-
-    Raises:
-        FaultError: It does, or its speed is not known.
-    """
-    speed = abs(bus.read_velocity(servo_id))
+        raise FaultError(f"{name} reports {condition.error}; {cure}")
+    speed = abs(condition.velocity)
     if exceeds(speed, _REST_RAD_S):
         raise FaultError(
-            f"{servo_name(bus, servo_id)} moves at {speed:.2f} rad/s; torque goes on at rest, "
-            f"below {_REST_RAD_S:g} rad/s: wait until it hangs still, then try again"
+            f"{name} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g}"
+            " rad/s: wait until it hangs still, then try again"
         )
-
-
-def require_cool(bus: Bus, servo_id: int, limit_c: float) -> float:
-    """Refuse a servo that is hotter than a limit and its own setting allow.
-
-    Returns:
-        The lower one of the two [°C].
-
-    Raises:
-        FaultError: It is hotter.
-    """
-    hottest = min(limit_c, bus.read_temperature_limit(servo_id))
-    degrees = bus.read_temperature(servo_id)
-    if exceeds(degrees, hottest):
-        raise FaultError(
-            explain_heat(f"{servo_name(bus, servo_id)}: {degrees:g}", np.array(hottest))
-        )
-    return hottest
+    hottest = min(limit_c, condition.temperature_limit)
+    if exceeds(condition.temperature, hottest):
+        which = f"{name}: {condition.temperature:g}"
+        raise FaultError(explain_heat(which, np.array(hottest)))
 
 
 def _end(signal_number: int, _: Any) -> None:
@@ -316,7 +300,8 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     program = os.getppid()
     for number in _SIGNALS:
         signal.signal(number, _end)
-    prefer_realtime(Priority.SUPERVISOR, with_threads=True)  # one for each of several buses
+    # a thread for each of several buses
+    prefer_realtime(Priority.SUPERVISOR, with_threads=True)
     buses = [DynamixelBus(port, baudrate) for port in ports]
     try:
         for bus in buses:
@@ -331,4 +316,5 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[3:], int(sys.argv[2]), Channel(socket.socket(fileno=int(sys.argv[1]))))
+    end = socket.socket(fileno=int(sys.argv[1]))
+    main(sys.argv[3:], int(sys.argv[2]), Channel(end))

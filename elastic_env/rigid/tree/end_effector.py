@@ -1,4 +1,4 @@
-"""Where the end effector of a tree of hinges is, for a batch of poses at once."""
+"""Pose of the end effector of a tree of hinges, for a batch of postures at once."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,10 +7,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.compiled import compile_now, compiled
+from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.rigid.tree.kernels import LINK
+from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Tree
 
 
@@ -35,7 +35,7 @@ class EndEffector:
         held: Mapping[str, float] | None = None,
     ) -> None:
         self.body, self.place, R = _found(model, name)
-        tree = Tree.of(model, joints, held or {}, gravcomp=False)
+        tree = Tree.of(model, joints, held or {})
         self._chain = _chain(tree, self.body)
         if len(self._chain) < 2:
             raise ConfigurationError(
@@ -52,9 +52,7 @@ class EndEffector:
         return position.reshape(*q.shape[:-1], 3), R.reshape(*q.shape[:-1], 3, 3)
 
     def jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Derivative of the position and of the turn, (..., 3, n) each [m/rad], [1], in the
-        world's axes.
-        """
+        """Derivative of position and turn in the world's axes, (..., 3, n) each [m/rad], [1]."""
         position, _, axes, anchors = self._walked(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
@@ -72,8 +70,7 @@ class EndEffector:
         return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
 
     def parts(self, q_ref: Array, q: Array) -> Array:
-        r"""Where the error of the position comes from: what the deviation of each joint alone
-        moves, to first order.
+        r"""Error of the position that the deviation of each joint makes alone, to first order.
 
         .. math:: p(q) - p(q_{ref}) \approx \sum_j J_j(q_{ref}) (q_j - q_{ref,j})
 
@@ -87,20 +84,17 @@ class EndEffector:
         return self.jacobian(q_ref)[0] * (q - q_ref)[..., None, :]
 
     def _walked(self, q: Array) -> tuple[Array, ...]:
-        """Position and orientation of the end effector; axis and anchor of each hinge before it,
-        a row per pose.
-        """
+        """Pose of the end effector; axis and anchor of each hinge before it, a row per posture."""
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
         count = len(rows)
         hinges = len(self._chain) - 1
         made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
-        walk(self._chain, rows, *made)
+        kernels.poses(self._chain, rows, *made)
         return tuple(made)
 
 
 def outermost_body(model: mujoco.MjModel) -> str:
-    """The body with a name that has the most bodies between it and the base, the last one of
-    several.
+    """The named body that has the most bodies between it and the base; the last of several.
 
     Raises:
         ConfigurationError: No body has a name.
@@ -139,56 +133,4 @@ def _chain(tree: Tree, body: int) -> Any:
     while link > 0:
         path.insert(0, link)
         link = int(tree.links[link]["parent"])
-    return np.concatenate([tree.links[path], np.zeros(1, LINK)])
-
-
-@compiled
-def walk(
-    chain: Any, q: Array, position: Array, orientation: Array, axes: Array, anchors: Array
-) -> None:
-    """Poses of a chain of hinges, a row after the other.
-
-    Args:
-        chain: Rows of `LINK`, each in the frame of the one before it; the last is fixed to its
-            parent.
-        q: Joint angles, (rows, n) [rad].
-        position: Of the last row, into (rows, 3) [m].
-        orientation: Of the last row, into (rows, 3, 3).
-        axes: Of the hinges in the world, into (rows, len(chain) - 1, 3).
-        anchors: Points on these axes, into (rows, len(chain) - 1, 3) [m].
-    """
-    hinges = len(chain) - 1
-    R = np.empty((3, 3))
-    moved = np.empty((3, 3))
-    p = np.empty(3)
-    for row in range(len(q)):
-        for i in range(3):
-            p[i] = 0.0
-            for k in range(3):
-                R[i, k] = 1.0 if i == k else 0.0
-        for at in range(hinges + 1):
-            link = chain[at]
-            frame = link["R"]
-            anchor = link["anchor"]
-            for i in range(3):
-                p[i] += R[i, 0] * anchor[0] + R[i, 1] * anchor[1] + R[i, 2] * anchor[2]
-            for i in range(3):
-                for k in range(3):
-                    moved[i, k] = (
-                        R[i, 0] * frame[0, k] + R[i, 1] * frame[1, k] + R[i, 2] * frame[2, k]
-                    )
-            R[:] = moved
-            if at == hinges:
-                break
-            angle = q[row, link["column"]] - link["zero"]
-            c = math.cos(angle)
-            s = math.sin(angle)
-            for i in range(3):
-                R[i, 0] = c * moved[i, 0] + s * moved[i, 1]
-                R[i, 1] = c * moved[i, 1] - s * moved[i, 0]
-                axes[row, at, i] = R[i, 2]
-                anchors[row, at, i] = p[i]
-        for i in range(3):
-            position[row, i] = p[i]
-            for k in range(3):
-                orientation[row, i, k] = R[i, k]
+    return np.concatenate([tree.links[path], np.zeros(1, kernels.LINK)])

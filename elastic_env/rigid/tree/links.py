@@ -1,6 +1,4 @@
-"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of
-`elastic_env.rigid.tree.kernels`.
-"""
+"""A compiled MuJoCo model as the links of a tree of hinges."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class Tree:
         model: mujoco.MjModel,
         joints: Sequence[str],
         held: Mapping[str, float] | Mapping[int, float],
-        gravcomp: bool,
+        root: int = 0,
     ) -> Self:
         """Of a model whose other joints are held.
 
@@ -42,7 +40,7 @@ class Tree:
             model: Compiled rigid model.
             joints: Hinges that move, in the order of the last axis of arrays.
             held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
-            gravcomp: Whether `gravcomp` of the bodies takes from their weight.
+            root: Body that is the base, 0 for the world.
         """
         data = mujoco.MjData(model)
         for name, position in held.items():
@@ -50,8 +48,10 @@ class Tree:
         mujoco.mj_kinematics(model, data)  # all that moves is where it is drawn
         moving = sorted(model.joint(name).id for name in joints)
         carrier = _carriers(model, moving)
-        R_wl = np.stack([np.eye(3), *(_frame_about(data.xaxis[j]) for j in moving)])
-        p_wl = np.stack([np.zeros(3), *(data.xanchor[j] for j in moving)])
+        R_wl = np.stack(
+            [data.xmat[root].reshape(3, 3), *(_frame_about(data.xaxis[j]) for j in moving)]
+        )
+        p_wl = np.stack([data.xpos[root], *(data.xanchor[j] for j in moving)])
         R_lw = R_wl[carrier].transpose(0, 2, 1)
         links = _jointed(model, joints, moving, carrier)
         for i in range(1, len(links)):
@@ -62,12 +62,12 @@ class Tree:
         R_li = R_lw @ data.ximat.reshape(-1, 3, 3)
         for b in range(1, model.nbody):
             inertia = R_li[b] @ np.diag(model.body_inertia[b]) @ R_li[b].T
-            share = 1.0 - float(model.body_gravcomp[b]) if gravcomp else 1.0
+            share = 1.0 - float(model.body_gravcomp[b])
             _add(links[carrier[b]], float(model.body_mass[b]), com[b], inertia, share)
         place = _turned(R_lw, data.xpos - p_wl[carrier])
         return cls(links, carrier, place, R_lw @ data.xmat.reshape(-1, 3, 3))
 
-    def loaded(self, body: int, mass: float, place: Array) -> Any:
+    def add_load(self, body: int, mass: float, place: Array) -> Any:
         """The links with one point mass more, in the frame of a body [kg], [m]."""
         links = self.links.copy()
         carrier = self.carrier[body]
@@ -89,6 +89,7 @@ def _jointed(
 ) -> Any:
     """Links that know their parents and their joints, without frames and masses."""
     links = np.zeros(1 + len(moving), LINK)
+    links["tip"] = -1
     for i, j in enumerate(moving, start=1):
         body = int(model.jnt_bodyid[j])
         is_first = i == 1 or model.jnt_bodyid[moving[i - 2]] != body
@@ -101,11 +102,9 @@ def _jointed(
 def _add(
     link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0
 ) -> None:
-    """Give a link a further mass, with its inertia about its center of mass, and a share of its
-    weight.
-    """
+    """Give a link a further mass, with its own inertia, and a share of its weight."""
     link["mass"] += mass
-    link["moment"] += mass * com
+    link["mass_moment"] += mass * com
     link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))
     link["weight"] += weight_share * mass
     link["weight_moment"] += weight_share * mass * com

@@ -1,5 +1,4 @@
-"""`elastic_env/Robot-v0`: any robot on a fixed base, from a file of its rigid model and one of its
-elastic joints.
+"""`elastic_env/Robot-v0`: any robot on a fixed base, from files of its model and its joints.
 
 env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml",
 end_effector="tool")
@@ -14,7 +13,7 @@ import mujoco
 
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.joint.frozen import frozen
+from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
 from elastic_env.joint.known_torque import (
     has_nameless_hinge,
@@ -32,8 +31,9 @@ from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotC
 from elastic_env.robots.robot import ID, NAME
 from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
 from elastic_env.robots.robot.model import RigidModel, read_robot
+from elastic_env.world.drawn_robot import stiffest_plant
 from elastic_env.world.joint_config import RewardWeights
-from elastic_env.world.joint_task import JointTask, stiffest
+from elastic_env.world.joint_task import JointTask
 from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
 
@@ -111,7 +111,7 @@ def configure_robot(
     )
     settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
     if timestep_s is None:
-        played = stiffest(
+        played = stiffest_plant(
             compiled_spec(robot.elastic(settings), "the model with elastic joints"),
             settings.scenario,
         )
@@ -137,15 +137,13 @@ def _require_step(timestep_s: float, control_period_s: float) -> None:
 def joint_robot(
     model: GivenModel, joints: GivenJoints, end_effector: str | None = None
 ) -> JointRobot:
-    """A robot from the file of its rigid model and that of its joints; arguments and errors as
-    `configure_robot`.
-    """
+    """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
     require_robot(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
-    moving = frozen(spec, settings)
+    moving = hold_other_joints(spec, settings)
     rigid = compiled_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
     elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)

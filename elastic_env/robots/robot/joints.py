@@ -1,6 +1,4 @@
-"""The elastic joints of a robot: what is given by name or pattern, what the model says, and
-defaults for the rest.
-"""
+"""Elastic joints of a robot: given by name or pattern, read from the model, or by default."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,7 +10,6 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.frozen import home_of
 from elastic_env.joint.joint_settings import (
     CURE,
     GivenJoints,
@@ -20,9 +17,11 @@ from elastic_env.joint.joint_settings import (
     ServoSettings,
     read_joints,
 )
+from elastic_env.joint.known_torque import home_of
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body
-from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.world.robot_model import joint_ranges
 
 ROTOR_FREQUENCY_RAD_S = 100.0
 """An assumption for rotors that nobody knows: with the link blocked they swing on their spring
@@ -117,7 +116,7 @@ def elastic_joints(
     model = spec.copy().compile()
     names = list(settings)
     poses = drawn_poses(model, names)
-    links = TreeTorque(model, names)
+    links = RigidBody(model, names)
     links.set_load(model.body(outermost_body(model)).id, load_kg, np.zeros(3))
     torque = np.abs(links.gravity_torque(poses)).max(axis=0)
     inertias = _inertias(model, names, poses)
@@ -136,7 +135,7 @@ def elastic_joints(
 
 @dataclass(frozen=True)
 class _Links:
-    """What a joint moves, over poses; inertias are without rotors.
+    """The links that a joint moves, over poses; inertias are without rotors.
 
     Attributes:
         torque: Largest torque at rest [N·m].
@@ -176,8 +175,7 @@ def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Ar
 
 
 class _Assumed:
-    """One elastic joint from what is given, what the model says, and assumptions within the scale
-    of the model.
+    """One elastic joint: given, read from the model, or assumed within the scale of the model.
 
     Attributes:
         said: Assumptions that the default would not lead one to expect, with their values.
@@ -221,8 +219,7 @@ class _Assumed:
         )
 
     def _rotor_inertia(self, velocity_gain: float) -> float:
-        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its
-        links have.
+        """B of a rotor that nobody knows: by its frequency, at most that of its links.
 
         A servo of a known velocity gain needs a rotor that is not too light for it.
         """
@@ -309,22 +306,8 @@ def drawn_poses(
     return generator.uniform(lowest, highest, (count, len(joints)))
 
 
-def joint_ranges(model: mujoco.MjModel, joints: list[str]) -> tuple[Array, Array]:
-    """Lowest and highest angle of every joint, infinite where there is no limit, (n,) each
-    [rad].
-    """
-    at = [model.joint(name).id for name in joints]
-    limited = model.jnt_limited[at].astype(bool)
-    return (
-        np.where(limited, model.jnt_range[at, end], bound)
-        for end, bound in ((0, -np.inf), (1, np.inf))
-    )  # pyright: ignore[reportReturnType]
-
-
 def home_of_joints(model: mujoco.MjModel, joints: list[str]) -> Array:
-    """The first keyframe, or the model's reference, moved inside the joint ranges by a tenth of
-    them, (n,) [rad].
-    """
+    """The first keyframe or the model's reference, a tenth inside the joint ranges, (n,) [rad]."""
     lowest, highest = joint_ranges(model, joints)
     home = home_of(model)[[model.jnt_qposadr[model.joint(name).id] for name in joints]]
     with np.errstate(invalid="ignore"):

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import quote
-from elastic_env.joint.frozen import frozen
+from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.model_file import GivenModel, compiled_spec, read_model
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 
@@ -62,27 +62,23 @@ class RigidModel:
         if self._spec is None:
             with warnings.catch_warnings():  # they were said when it was read for the first time
                 warnings.simplefilter("ignore", UserWarning)
-                self._spec = _bare(frozen(read_robot(self._model), self._joints), self._joints)
+                self._spec = _bare(
+                    hold_other_joints(read_robot(self._model), self._joints), self._joints
+                )
         return self._spec.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         """Files by name, specifications as text."""
         given: Any = self._model
         if isinstance(given, mujoco.MjSpec):
-            given = _copied(given)
+            given = given.copy()
             compiled_spec(given, "the specification")
             given = given.to_xml()
         return {"_model": given, "_joints": self._joints, "_spec": None}
 
 
-def _copied(spec: Any) -> mujoco.MjSpec:
-    return spec.copy()
-
-
 def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
-    """A model without actuators and contacts, whose hinges have nothing of what an
-    `ElasticJoint` says.
-    """
+    """A model without actuators, contacts, and what an `ElasticJoint` has of its hinges."""
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name in joints:

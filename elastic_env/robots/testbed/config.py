@@ -26,7 +26,7 @@ class TestbedConfig(JointConfig):
     """The joint as it is known; the scenario says in what the true one differs."""
     pendulum: Pendulum = Pendulum()
     observe_link: bool = False
-    """Whether the link's IMU is part of the observation."""
+    """True if the link's IMU is part of the observation."""
 
     @property
     def true_joint(self) -> ElasticJoint:
@@ -95,8 +95,9 @@ def _rest_angle(
     true: RobotModel,
     pendulum: Pendulum,
 ) -> Array:
-    """Link angle at rest without friction; within the dead band the pendulum hangs straight
-    down.
+    """Link angle at rest without friction.
+
+    Within the dead band the pendulum hangs straight down.
     """
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():

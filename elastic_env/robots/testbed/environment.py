@@ -7,7 +7,7 @@ from typing import Any, Literal
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import AnyReference, make_reference
-from elastic_env.registration import Robot, require_models
+from elastic_env.registration import Robot, as_model
 from elastic_env.robots.testbed import ID, NAME
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
@@ -30,8 +30,7 @@ def configure_testbed(
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
 ) -> TestbedConfig:
-    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0",
-    ...)`.
+    """The testbed's configuration from the arguments of `gymnasium.make`.
 
     Args:
         reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a
@@ -54,21 +53,18 @@ def configure_testbed(
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    require_models(
-        joint=(joint, ElasticJoint), pendulum=(pendulum, Pendulum), reward=(reward, RewardWeights)
-    )
-    chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
+    chosen = as_model("joint", joint, H54_200_S500_R)
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
     return TestbedConfig(
         reference=make_reference(reference),
         scenario=make_scenario(scenario, walks=False),
         joint=chosen,
-        pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
+        pendulum=as_model("pendulum", pendulum, Pendulum()),
         form=form,
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         observe_link=observe_link,
-        reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
+        reward=as_model("reward", reward, RewardWeights()),
         **({} if timestep_s is None else {"timestep_s": timestep_s}),
     )
 

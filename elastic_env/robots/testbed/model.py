@@ -1,5 +1,4 @@
-r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a pendulum, an IMU on
-the link.
+r"""The paper's single-joint testbed (Fig. 4): a servo, a linkage with a pendulum, an IMU.
 
 The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that
 holds it is τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length:
@@ -17,7 +16,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.make_elastic import Form, transformed
+from elastic_env.joint.make_elastic import Form, transform_hinges
 
 JOINT = "joint"
 GRAVITY_M_S2 = 9.81
@@ -108,6 +107,6 @@ def elastic_spec(
     gravity: float = GRAVITY_M_S2,
 ) -> mujoco.MjSpec:
     """The testbed with its elastic joint and servo, integrated by RK4."""
-    spec = transformed(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
+    spec = transform_hinges(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
     spec.option.timestep = timestep_s
     return spec

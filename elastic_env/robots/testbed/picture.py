@@ -10,32 +10,25 @@ import numpy as np
 
 from elastic_env.rendering.picture import CAMERA, ModelPicture, Rgba, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.robots.deviations import (
+    HEIGHT,
+    REFERENCE_RGBA,
+    REFERENCE_WORD_RGBA,
+    WIDTH,
+    deviation_caption,
+    enlarge_deviation,
+)
 from elastic_env.robots.testbed.model import Pendulum
 
-EXAGGERATION = 8.0
-"""Factor by which deviations from the reference are enlarged."""
-
-_WIDTH = 640
-_HEIGHT = 480
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
-_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
-_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 _LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
 _STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
 _HOUSING_RGBA = (0.2, 0.22, 0.26, 1.0)
 _ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
-_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", (0.27, 0.55, 0.37, 1.0)))
-
-
-def exaggerated(angle: float, reference: float, factor: float = EXAGGERATION) -> float:
-    """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
-    return reference + factor * (angle - reference)
+_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", REFERENCE_WORD_RGBA))
 
 
 class TestbedPicture(ModelPicture):
-    """The testbed of Fig. 4: housing, rotor pointer, pendulum, and the reference as a
-    translucent pendulum.
-    """
+    """The testbed of Fig. 4: housing, rotor pointer, pendulum, and a translucent reference."""
 
     __test__ = False
 
@@ -44,7 +37,7 @@ class TestbedPicture(ModelPicture):
         self._pendulum = pendulum
 
     def alone(self) -> Alone:
-        """See `HasSides`."""
+        """The robot of a side-by-side picture."""
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
         _add_mount(spec.worldbody)
@@ -56,7 +49,7 @@ class TestbedPicture(ModelPicture):
         )
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
-        """See `HasSides`."""
+        """Reference, motor side and link side of a world."""
         link = now["link_angle"]
         reference = now["reference_angle"]
         return Sides(*(np.array([angle]) for angle in (reference, link + now["deflection"], link)))
@@ -66,26 +59,17 @@ class TestbedPicture(ModelPicture):
         link = now["link_angle"]
         rotor = link + now["deflection"]
         self._data.joint("reference").qpos = reference
-        self._data.joint("link").qpos = exaggerated(link, reference)
-        self._data.joint("rotor").qpos = exaggerated(rotor, reference)
+        self._data.joint("link").qpos = enlarge_deviation(link, reference)
+        self._data.joint("rotor").qpos = enlarge_deviation(rotor, reference)
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return [
-            (
-                f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x"
-                f" {EXAGGERATION:g}"
-            ),
-            (
-                f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error"
-                f" {1e3 * now['link_error']:+7.2f} mrad"
-            ),
-        ]
+        return deviation_caption(now)
 
 
 def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     """A model for drawing only: three independent hinges, no dynamics."""
     spec = mujoco.MjSpec()
-    set_stage(spec, _WIDTH, _HEIGHT)
+    set_stage(spec, WIDTH, HEIGHT)
     reach = pendulum.com_distance
     world = spec.worldbody
     _add_light(spec)
@@ -93,27 +77,12 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
         name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50
     )
     _add_mount(world)
-    for name, y, rod, bob in (
-        ("reference", 0.03, _REFERENCE_RGBA, _REFERENCE_RGBA),
-        ("link", 0.0, _STEEL_RGBA, _LINK_RGBA),
-    ):
-        _add_pendulum(world, name, y, reach, rod, bob)
-    rotor = _hinged(world, "rotor")
-    rotor.add_geom(
-        name="rotor_disc",
-        type=_CYLINDER,
-        size=[0.055, 0.01, 0],
-        pos=[0, -0.03, 0],
-        zaxis=[0, 1, 0],
-        rgba=_ROTOR_RGBA,
-    )
-    rotor.add_geom(
-        name="rotor_pointer",
-        type=_BOX,
-        size=[0.005, 0.004, 0.36 * reach],
-        pos=[0, -0.03, -0.36 * reach],
-        rgba=_ROTOR_RGBA,
-    )
+    _add_pendulum(world, "reference", 0.03, reach, REFERENCE_RGBA, REFERENCE_RGBA)
+    _add_pendulum(world, "link", 0.0, reach, _STEEL_RGBA, _LINK_RGBA)
+    rotor = _add_hinge(world, "rotor")
+    _add_disc(rotor, "rotor_disc", [0.055, 0.01, 0], [0, -0.03, 0], _ROTOR_RGBA)
+    half = 0.36 * reach
+    _add_box(rotor, "rotor_pointer", [0.005, 0.004, half], [0, -0.03, -half], _ROTOR_RGBA)
     return spec
 
 
@@ -128,40 +97,33 @@ def _add_light(spec: mujoco.MjSpec) -> None:
 
 
 def _add_mount(world: mujoco.MjsBody) -> None:
-    world.add_geom(
-        name="housing", type=_BOX, size=[0.07, 0.06, 0.09], pos=[0, 0.12, 0.02], rgba=_HOUSING_RGBA
-    )
-    world.add_geom(
-        name="stand",
-        type=_BOX,
-        size=[0.03, 0.03, 0.6],
-        pos=[0, 0.2, -0.5],
-        rgba=(0.72, 0.74, 0.77, 1),
-    )
+    _add_box(world, "housing", [0.07, 0.06, 0.09], [0, 0.12, 0.02], _HOUSING_RGBA)
+    _add_box(world, "stand", [0.03, 0.03, 0.6], [0, 0.2, -0.5], (0.72, 0.74, 0.77, 1))
 
 
 def _add_pendulum(
     world: mujoco.MjsBody, name: str, y: float, reach: float, rod: Rgba, bob: Rgba
 ) -> None:
-    body = _hinged(world, name)
-    body.add_geom(
-        name=f"{name}_rod",
-        type=_BOX,
-        size=[0.014, 0.008, reach / 2],
-        pos=[0, y, -reach / 2],
-        rgba=rod,
-    )
-    body.add_geom(
-        name=f"{name}_bob",
-        type=_CYLINDER,
-        size=[0.09, 0.025, 0],
-        pos=[0, y, -reach],
-        zaxis=[0, 1, 0],
-        rgba=bob,
-    )
+    body = _add_hinge(world, name)
+    _add_box(body, f"{name}_rod", [0.014, 0.008, reach / 2], [0, y, -reach / 2], rod)
+    _add_disc(body, f"{name}_bob", [0.09, 0.025, 0], [0, y, -reach], bob)
 
 
-def _hinged(world: mujoco.MjsBody, name: str) -> mujoco.MjsBody:
+def _add_hinge(world: mujoco.MjsBody, name: str) -> mujoco.MjsBody:
     body = world.add_body(name=name, mass=1.0, inertia=[1.0] * 3, explicitinertial=True)
     body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
     return body
+
+
+def _add_box(
+    body: mujoco.MjsBody, name: str, size: list[float], place: list[float], rgba: Rgba
+) -> None:
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, rgba=rgba)
+
+
+def _add_disc(
+    body: mujoco.MjsBody, name: str, size: list[float], place: list[float], rgba: Rgba
+) -> None:
+    """A cylinder across the plane of the motion."""
+    disc = mujoco.mjtGeom.mjGEOM_CYLINDER
+    body.add_geom(name=name, type=disc, size=size, pos=place, zaxis=[0, 1, 0], rgba=rgba)

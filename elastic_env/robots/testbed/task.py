@@ -38,9 +38,7 @@ from elastic_env.world.joint_task import JointTask
 
 
 class TestbedTask(JointTask):
-    """Rules of `elastic_env/Testbed-v0`: those of elastic joints, for one joint that carries a
-    pendulum and an IMU.
-    """
+    """Rules of `elastic_env/Testbed-v0`: one elastic joint that carries a pendulum and an IMU."""
 
     __test__ = False
 

@@ -1,9 +1,8 @@
 """Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
 
 import copy
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Literal, Self
+from functools import lru_cache, partial
+from typing import Literal, Self
 
 import mujoco
 import numpy as np
@@ -11,10 +10,10 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
-from elastic_env.core.robot_ranges import RobotDraw, RobotRanges, draw_robots
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.robot_ranges import DrawnRobot, draw_robots
+from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.joint_names import spring_name
+from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
@@ -28,6 +27,7 @@ from elastic_env.robots.thormang.model import (
     place_load,
 )
 from elastic_env.robots.thormang.standing import Equilibrium, settle
+from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.scenario import Scenario, make_scenario
 
@@ -72,7 +72,7 @@ class WalkConfig(Model):
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
+    """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
     timestep_s: float = quantity("s", 1e-3, gt=0)
@@ -100,9 +100,7 @@ class WalkConfig(Model):
         return self
 
     def of_each_scenario(self) -> "list[WalkConfig]":
-        """The configuration of the worlds of each scenario, in the order in which these first
-        occur.
-        """
+        """Configurations of the scenarios, in the order in which these first occur."""
         if not self.scenarios:
             return [self]
         alone = [
@@ -119,9 +117,7 @@ class WalkConfig(Model):
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as a policy may know them: the ground's friction is known, from an
-        identification.
-        """
+        """The joints as a policy may know them, with the ground's friction."""
         return {
             name: joint.replace(
                 coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
@@ -170,82 +166,48 @@ _SETTLED = 2048
 
 @lru_cache(maxsize=64)
 def require_stable_walker(config: WalkConfig) -> None:
-    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked
-    at once.
-
-    Of ranges the robot with the stiffest springs, and with the strongest dampers.
-    """
-    for ranges in config.scenario.ranges or (RobotRanges(),):
-        factor = ranges.stiffness[1] * ranges.joint_stiffness[1]
-        joints = {
-            name: joint.replace(
-                stiffness=joint.stiffness * factor, damping=joint.damping * ranges.damping[1]
-            )
-            for name, joint in config.true_joints.items()
-        }
-        spec = elastic_spec(config.true_robot, joints, config.form, config.timestep_s)
-        require_stable(spec.compile(), config.control_period_s)
-
-
-@dataclass(frozen=True)
-class PlacedRobot:
-    """A robot of the bank at rest.
-
-    Attributes:
-        model: Its plant.
-        rest: Where it stands under zero offset.
-    """
-
-    model: mujoco.MjModel
-    rest: Equilibrium
+    """Refuse joints that explode with the physics step; looked at once."""
+    model = stiffest_plant(undrawn_model(config), config.scenario)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+    require_stable(model, config.control_period_s)
 
 
 @lru_cache(maxsize=_SETTLED)
-def placed_robot(config: WalkConfig, draw: RobotDraw) -> PlacedRobot:
-    """A robot of the bank at rest under zero offset, found once.
+def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel, Equilibrium]:
+    """The plant of a robot of the bank, and where it rests under zero offset; found once.
 
     Raises:
         ElasticError: It does not stand.
     """
     plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
-    model = drawn_model(config, draw)
-    q = plan.q[0] - np.array(draw.encoder_bias_rad)
+    model = drawn_model(config, robot)
+    q = plan.q[0] - np.array(robot.homing_rad)
     try:
-        rest = settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+        return model, settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
     except ElasticError as error:
         if not config.scenario.ranges:
             raise
         raise ConfigurationError(
-            f"the drawn robot {draw} cannot walk: {error}; narrow the ranges"
+            f"the drawn robot {robot} cannot walk: {error}; narrow the ranges"
         ) from None
-    return PlacedRobot(model, rest)
 
 
-def drawn_model(config: WalkConfig, draw: RobotDraw) -> mujoco.MjModel:
+def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
     """The plant of a robot of the bank."""
-    model = copy.copy(_undrawn_model(config))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    if config.form == "tendon":
-        springs = spring_ids(model)
-        model.tendon_stiffness[springs] *= np.array(draw.stiffness_factor)
-        model.tendon_damping[springs] *= draw.damping_factor
-        model.tendon_lengthspring[springs] += draw.backlash_rad * np.array([-0.5, 0.5])
-    links = [model.joint(name).dofadr[0] for name in LEG_JOINTS]
-    model.dof_frictionloss[links] *= draw.friction_factor
-    model.dof_damping[links] *= draw.friction_factor
-    model.body("floor").quat[:] = floor_tilt(draw.slope_rad, draw.slope_direction_rad)
+    undrawn = undrawn_model(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+    springs = spring_ids(undrawn, LEG_JOINTS, config.form)
+    links = JointAddresses.of(undrawn, LEG_JOINTS).q_dot
+    model = copy.copy(undrawn)
+    set_joints(partial(getattr, model), undrawn, springs, links, robot)
+    model.body("floor").quat[:] = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
     if config.scenario.ranges:
-        place_load(model, draw.load_kg, np.array(draw.load_place_m))
+        place_load(model, robot.load_kg, np.array([robot.load_x_m, robot.load_y_m, robot.load_z_m]))
     return model
 
 
 @lru_cache(maxsize=64)
-def _undrawn_model(config: WalkConfig) -> mujoco.MjModel:
+def undrawn_model(config: WalkConfig) -> mujoco.MjModel:
+    """The plant, what is drawn aside, compiled once."""
     return config.true_model()
-
-
-def spring_ids(model: mujoco.MjModel) -> IntArray:
-    """The springs of the leg joints among the tendons of an elastic model, (12,)."""
-    return np.array([model.tendon(spring_name(joint)).id for joint in LEG_JOINTS])
 
 
 def floor_tilt(angle: float, direction: float) -> Array:
@@ -256,32 +218,24 @@ def floor_tilt(angle: float, direction: float) -> Array:
     )
 
 
-def robot_bank(scenario: Scenario, number: int = 0) -> list[RobotDraw]:
-    """The robots of a scenario: one, or a bank, the same in every process; banks of other
-    numbers have other robots.
+def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:
+    """The robots of a scenario: one, or a bank, the same in every process.
+
+    Banks of other numbers have other robots.
     """
     n = len(LEG_JOINTS)
     if scenario.ranges:
         return draw_robots(scenario.ranges, RANGES_BANK_SIZE, n, (_BANK_SEED, number))
-    conditions: dict[str, Any] = {
-        "push_n": scenario.push_n,
-        "slope_rad": scenario.slope_rad,
-        "is_delayed": scenario.delay_steps > 0,
-        "is_inertial": scenario.inertial is not None,
-    }
-    if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
-        return [RobotDraw(stiffness_factor=(1.0,) * n, encoder_bias_rad=(0.0,) * n, **conditions)]
-    generator = np.random.default_rng(_BANK_SEED + number)
+    spread = scenario.stiffness_spread
+    width_rad = scenario.encoder_bias_rad
+    if spread == width_rad == scenario.slope_rad == 0.0:
+        return [scenario.make_robot(np.ones(n), np.zeros(n))]
+    uniform = np.random.default_rng(_BANK_SEED + number).uniform
     return [
-        RobotDraw(
-            stiffness_factor=tuple(
-                (1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()
-            ),
-            encoder_bias_rad=tuple(
-                (scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()
-            ),
-            slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
-            **conditions,
+        scenario.make_robot(
+            stiffness=1.0 + spread * uniform(-1.0, 1.0, n),
+            homing_rad=width_rad * uniform(-1.0, 1.0, n),
+            slope_direction_rad=float(uniform(0.0, 2.0 * np.pi)),
         )
         for _ in range(BANK_SIZE)
     ]

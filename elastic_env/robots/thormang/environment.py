@@ -7,7 +7,7 @@ from typing import Any, Literal
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
-from elastic_env.registration import Robot, require_models
+from elastic_env.registration import Robot, as_model
 from elastic_env.robots.thormang import ID, NAME
 from elastic_env.robots.thormang.config import WalkConfig, WalkRewardWeights
 from elastic_env.robots.thormang.model import Thormang
@@ -33,8 +33,7 @@ def configure_walk(
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
 ) -> WalkConfig:
-    """The walker's configuration from the arguments of
-    `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
+    """The walker's configuration from the arguments of `gymnasium.make`.
 
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support
@@ -59,19 +58,13 @@ def configure_walk(
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    require_models(
-        joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights)
-    )
     if not isinstance(gait, dict | None):
         raise ConfigurationError(
             f"gait must be a mapping of {', '.join(_GAIT)}, got {quote(gait)}; see also step_period"
         )
     require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT)
-    chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
-    if isinstance(joint, ElasticJoint):
-        joints = dict.fromkeys(chosen.joints, joint)
-    else:
-        joints = {name: own.replace(**(joint or {})) for name, own in chosen.joints.items()}
+    chosen = as_model("robot", robot, Thormang())
+    joints = {name: as_model("joint", joint, own) for name, own in chosen.joints.items()}
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}
@@ -89,9 +82,7 @@ def configure_walk(
         joints=tuple(joints.values()),
         form=form,
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
-        reward=(
-            reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {}))
-        ),
+        reward=as_model("reward", reward, WalkRewardWeights()),
         bank=bank,
         **({} if timestep_s is None else dict[str, Any](timestep_s=timestep_s)),
     )

@@ -1,7 +1,7 @@
-"""The walker as it is drawn: simple shapes on the links of the robot, once solid and once as the
-translucent plan.
-"""
+"""The walker as it is drawn: shapes on its links, solid, and translucent for the plan."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -40,13 +40,11 @@ follows it.
 
 
 def display_spec(robot: Thormang) -> mujoco.MjSpec:
-    """A model for drawing only: the robot, its plan with the prefix `PLAN`, floor, markers,
-    light and camera.
-    """
-    spec = _dressed(robot, is_plan=False)
+    """A model for drawing only: robot, plan with the prefix `PLAN`, floor, markers."""
+    spec = _dress(robot, is_plan=False)
     set_stage(spec, _SIZE, _SIZE)
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    spec.attach(_dressed(robot, is_plan=True), prefix=PLAN, frame=spec.worldbody.add_frame())
+    spec.attach(_dress(robot, is_plan=True), prefix=PLAN, frame=spec.worldbody.add_frame())
     _add_floor(spec)
     _add_marker(spec, ZMP_REFERENCE, radius=0.05, height=0.022, rgba=ZMP_REFERENCE_RGBA)
     _add_marker(spec, ZMP, radius=0.03, height=0.0245, rgba=ZMP_RGBA)
@@ -57,7 +55,7 @@ def display_spec(robot: Thormang) -> mujoco.MjSpec:
 
 def solid_spec(robot: Thormang) -> mujoco.MjSpec:
     """The robot alone, without floor and light."""
-    spec = _dressed(robot, is_plan=False)
+    spec = _dress(robot, is_plan=False)
     spec.delete(spec.body("floor"))
     return spec
 
@@ -71,76 +69,52 @@ def set_floor_and_light(spec: mujoco.MjSpec) -> None:
     _add_light(spec)
 
 
+@dataclass(frozen=True)
 class _Shapes:
-    """Adds shapes to the links of a robot: solid ones, or smaller and translucent ones of the
-    plan.
-    """
+    """Adds shapes to a robot's links: solid ones, or smaller translucent ones of the plan."""
 
-    def __init__(self, spec: mujoco.MjSpec, is_plan: bool) -> None:
-        self._spec = spec
-        self._is_plan = is_plan
+    spec: mujoco.MjSpec
+    is_plan: bool
 
     def block(
-        self,
-        link: str,
-        half_size: tuple[float, float, float],
-        at: Any,
-        rgba: Rgba,
-        roundness: float,
+        self, link: str, size: Sequence[float], at: Any, rgba: Rgba, roundness: float
     ) -> None:
         """Box whose edges are rounder the larger `roundness`, 0 to 1."""
-        name = f"block_{len(self._spec.meshes)}"
-        mesh = self._spec.add_mesh(name=name, scale=self._inset(*half_size))
+        name = f"block_{len(self.spec.meshes)}"
+        mesh = self.spec.add_mesh(name=name, scale=self._inset(size))
         mesh.make_supersphere(24, roundness, roundness)
-        self._add(link, rgba, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=at)
-
-    def ball(self, link: str, radius: float, at: Any) -> None:
-        """Sphere of the dark frame."""
-        self._add(
-            link,
-            _FRAME_RGBA,
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[*self._inset(radius), 0, 0],
-            pos=at,
+        geom = self.spec.body(link).add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=at, mass=0.0
         )
+        geom.rgba = self._colour(rgba)
 
-    def drum(self, link: str, radius: float, half_length: float, at: Any, axis: Any) -> None:
-        """Cylinder of the dark frame."""
-        size = [*self._inset(radius, half_length), 0]
-        self._add(
-            link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=at, zaxis=axis
+    def add(
+        self, kind: str, link: str, size: Sequence[float], rgba: Rgba = _FRAME_RGBA, **place: Any
+    ) -> None:
+        """Sphere, cylinder, capsule or box, by default of the dark frame; place as of a geom."""
+        geom = self.spec.body(link).add_geom(
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+            size=[*self._inset(size), 0, 0][:3],
+            mass=0.0,
+            **place,
         )
-
-    def limb(self, link: str, radius: float, begin: Any, end: Any, rgba: Rgba) -> None:
-        """Capsule between two points."""
-        size = [*self._inset(radius), 0, 0]
-        self._add(link, rgba, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=size, fromto=[*begin, *end])
-
-    def plate(self, link: str, half_size: tuple[float, float, float], at: Any) -> None:
-        """Box of the dark frame."""
-        self._add(
-            link, _FRAME_RGBA, type=mujoco.mjtGeom.mjGEOM_BOX, size=self._inset(*half_size), pos=at
-        )
+        geom.rgba = self._colour(rgba)
 
     def paint(self, geom: mujoco.MjsGeom, rgba: Rgba) -> None:
         """Give a box that the robot has already its colour, and its size in the plan."""
         geom.rgba = self._colour(rgba)
-        geom.size = self._inset(*geom.size)
-
-    def _add(self, link: str, rgba: Rgba, **geom: Any) -> None:
-        self._spec.body(link).add_geom(rgba=self._colour(rgba), mass=0.0, **geom)
+        geom.size = self._inset(geom.size)
 
     def _colour(self, rgba: Rgba) -> Rgba:
-        return PLAN_RGBA if self._is_plan else rgba
+        return PLAN_RGBA if self.is_plan else rgba
 
-    def _inset(self, *lengths: float) -> list[float]:
-        return [
-            max(length - _PLAN_INSET_M, length / 2) if self._is_plan else length
-            for length in lengths
-        ]
+    def _inset(self, lengths: Any) -> list[float]:
+        if not self.is_plan:
+            return list(lengths)
+        return [max(length - _PLAN_INSET_M, length / 2) for length in lengths]
 
 
-def _dressed(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
+def _dress(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
     """The robot's links and joints with shapes; the solid one brings the floor."""
     spec = rigid_spec(robot)
     for site in list(spec.sites):
@@ -158,44 +132,39 @@ def _dressed(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
 
 def _add_trunk(shapes: _Shapes, robot: Thormang) -> None:
     torso = "upper_body"
-    shapes.block(
-        "pelvis",
-        (0.075, robot.hip_half_spacing + 0.03, 0.05),
-        (0, 0, 0.075),
-        _FRAME_RGBA,
-        roundness=0.25,
-    )
-    shapes.drum("pelvis", 0.055, 0.05, (0, 0, 0.15), axis=(0, 0, 1))
-    shapes.block(torso, (0.095, 0.155, 0.15), (0, 0, 0.165), _SHELL_RGBA, roundness=0.35)
-    shapes.block(torso, (0.02, 0.09, 0.05), (0.085, 0, 0.2), _FRAME_RGBA, roundness=0.3)
-    shapes.drum(torso, 0.035, 0.03, (0, 0, 0.325), axis=(0, 0, 1))
-    shapes.block(torso, (0.07, 0.07, 0.075), (0.01, 0, 0.41), _SHELL_RGBA, roundness=0.4)
-    shapes.block(torso, (0.02, 0.052, 0.022), (0.068, 0, 0.42), _FRAME_RGBA, roundness=0.3)
+    width = robot.hip_half_spacing + 0.03
+    shapes.block("pelvis", (0.075, width, 0.05), (0, 0, 0.075), _FRAME_RGBA, 0.25)
+    shapes.add("cylinder", "pelvis", (0.055, 0.05), pos=(0, 0, 0.15))
+    shapes.block(torso, (0.095, 0.155, 0.15), (0, 0, 0.165), _SHELL_RGBA, 0.35)
+    shapes.block(torso, (0.02, 0.09, 0.05), (0.085, 0, 0.2), _FRAME_RGBA, 0.3)
+    shapes.add("cylinder", torso, (0.035, 0.03), pos=(0, 0, 0.325))
+    shapes.block(torso, (0.07, 0.07, 0.075), (0.01, 0, 0.41), _SHELL_RGBA, 0.4)
+    shapes.block(torso, (0.02, 0.052, 0.022), (0.068, 0, 0.42), _FRAME_RGBA, 0.3)
 
 
 def _add_arm(shapes: _Shapes, mirror: float, rgba: Rgba) -> None:
     """A bent arm, which does not move."""
     torso = "upper_body"
-    shapes.ball(torso, 0.055, (0.0, 0.195 * mirror, 0.255))
-    shapes.limb(torso, 0.040, (0.0, 0.215 * mirror, 0.2), (-0.02, 0.235 * mirror, 0.04), rgba)
-    shapes.ball(torso, 0.042, (-0.02, 0.237 * mirror, 0.0))
-    shapes.limb(torso, 0.034, (0.03, 0.235 * mirror, -0.02), (0.15, 0.21 * mirror, -0.06), rgba)
-    shapes.ball(torso, 0.035, (0.19, 0.205 * mirror, -0.073))
+    upper = (0.0, 0.215 * mirror, 0.2, -0.02, 0.235 * mirror, 0.04)
+    lower = (0.03, 0.235 * mirror, -0.02, 0.15, 0.21 * mirror, -0.06)
+    shapes.add("sphere", torso, (0.055,), pos=(0.0, 0.195 * mirror, 0.255))
+    shapes.add("capsule", torso, (0.040,), rgba, fromto=upper)
+    shapes.add("sphere", torso, (0.042,), pos=(-0.02, 0.237 * mirror, 0.0))
+    shapes.add("capsule", torso, (0.034,), rgba, fromto=lower)
+    shapes.add("sphere", torso, (0.035,), pos=(0.19, 0.205 * mirror, -0.073))
 
 
 def _add_leg(shapes: _Shapes, side: str, rgba: Rgba) -> None:
     """Thigh, shank, and a fork between ankle and sole, through which one sees the markers."""
-    shapes.ball(f"{side}_hip_roll_link", 0.062, (0, 0, 0))
-    shapes.block(
-        f"{side}_thigh", (0.058, 0.052, 0.115), (0.004, 0, -LEG.thigh / 2), rgba, roundness=0.45
-    )
-    shapes.drum(f"{side}_thigh", 0.05, 0.058, (0, 0, -LEG.thigh), axis=(0, 1, 0))
-    shapes.block(
-        f"{side}_shank", (0.05, 0.046, 0.115), (0.004, 0, -LEG.shank / 2), rgba, roundness=0.45
-    )
-    shapes.drum(f"{side}_shank", 0.036, 0.05, (0, 0, -LEG.shank), axis=(0, 1, 0))
+    thigh = f"{side}_thigh"
+    shank = f"{side}_shank"
+    shapes.add("sphere", f"{side}_hip_roll_link", (0.062,), pos=(0, 0, 0))
+    shapes.block(thigh, (0.058, 0.052, 0.115), (0.004, 0, -LEG.thigh / 2), rgba, 0.45)
+    shapes.add("cylinder", thigh, (0.05, 0.058), pos=(0, 0, -LEG.thigh), zaxis=(0, 1, 0))
+    shapes.block(shank, (0.05, 0.046, 0.115), (0.004, 0, -LEG.shank / 2), rgba, 0.45)
+    shapes.add("cylinder", shank, (0.036, 0.05), pos=(0, 0, -LEG.shank), zaxis=(0, 1, 0))
     for y in (-0.048, 0.048):
-        shapes.plate(f"{side}_foot", (0.022, 0.008, 0.05), (0, y, -0.045))
+        shapes.add("box", f"{side}_foot", (0.022, 0.008, 0.05), pos=(0, y, -0.045))
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
@@ -220,9 +189,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
-    """A disc on the floor, higher than the soles are thick, so that one sees it where a foot
-    stands on it.
-    """
+    """A disc on the floor, higher than the soles, so that one sees it under a foot."""
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
     spec.worldbody.add_body(name=name, mocap=True).add_geom(
         name=name,

@@ -1,5 +1,4 @@
-"""The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from the link table
-`thormang_legs.csv`.
+"""The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from `legs.csv`.
 
 All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between
 the hip axes. x forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs.
@@ -16,7 +15,6 @@ Sources (public GitHub repositories):
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
@@ -27,7 +25,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.make_elastic import Form, transformed
+from elastic_env.joint.make_elastic import Form, transform_hinges
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry
 
@@ -53,7 +51,7 @@ class Thormang(Model):
     hip_half_spacing: float = quantity("m", 0.105, gt=0)
     """Half the distance of the hips; 0.072 in mk1 [m]."""
     twin_knee: bool = False
-    """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction
+    """True if two servos share each knee: twice its stiffness, damping, rotor inertia, friction
     and torque.
     """
     friction: float = quantity("1", 1.0, gt=0)
@@ -79,32 +77,17 @@ def biped(robot: Thormang) -> Biped:
     )
 
 
-@dataclass(frozen=True)
-class Link:
-    """A row of the link table, in the link frame and SI units; joint is "fixed", "floating" or
-    the name of a hinge.
+def _link_table() -> list[dict[str, str]]:
+    """Rows of the link table, parents before children, in the link frame and SI units.
+
+    The column `joint` is "fixed", "floating" or the name of a hinge.
     """
-
-    name: str
-    parent: str
-    joint: str
-    axis: Array
-    position: Array
-    limits: Array | None
-    mass: float
-    com: Array
-    inertia: Array
-    """ixx, iyy, izz, ixy, ixz, iyz about the COM [kg·m²]."""
+    file = resources.files("elastic_env.robots.thormang").joinpath("legs.csv")
+    return list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
 
 
-def read_links() -> list[Link]:
-    """The link table, parents before children."""
-    text = (
-        resources.files("elastic_env.robots.thormang")
-        .joinpath("legs.csv")
-        .read_text(encoding="utf-8")
-    )
-    return [_link(row) for row in csv.DictReader(text.splitlines())]
+def _numbers(row: dict[str, str], *columns: str) -> Array:
+    return np.array([float(row[column]) for column in columns])
 
 
 def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
@@ -122,39 +105,33 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     spec.option.impratio = 10.0  # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
-    for link in read_links():
-        body = bodies[link.parent].add_body(
-            name=link.name,
-            pos=_position(link, robot),
-            mass=link.mass,
-            ipos=link.com,
-            fullinertia=link.inertia,
+    for row in _link_table():
+        joint = row["joint"]
+        position = _numbers(row, "x_m", "y_m", "z_m")
+        if joint.endswith("hip_yaw"):
+            position[1] = np.sign(position[1]) * robot.hip_half_spacing
+        body = bodies[row["parent"]].add_body(
+            name=row["name"],
+            pos=position,
+            mass=float(row["mass_kg"]),
+            ipos=_numbers(row, "com_x", "com_y", "com_z"),
+            fullinertia=_numbers(row, "ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
             explicitinertial=True,
         )
-        bodies[link.name] = body
-        if link.joint == "floating" and floating:
+        bodies[row["name"]] = body
+        if joint == "floating" and floating:
             body.add_freejoint(name="pelvis")
-        elif link.limits is not None:
+        elif row["lower_rad"]:
             body.add_joint(
-                name=link.joint,
+                name=joint,
                 type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=link.axis,
-                range=link.limits,
+                axis=_numbers(row, "axis_x", "axis_y", "axis_z"),
+                range=_numbers(row, "lower_rad", "upper_rad"),
                 limited=mujoco.mjtLimited.mjLIMITED_TRUE,
             )
     if robot.torso_load_kg > 0.0:
-        torso = bodies[_TORSO]
-        load = robot.torso_load_kg
-        inertia = [load * _LOAD_GYRATION_M**2] * 3
         # 0.16 m above the center of mass of the torso, which is itself 0.16 m above its frame
-        torso.add_body(
-            name="load",
-            pos=torso.ipos,
-            ipos=torso.ipos,
-            mass=load,
-            inertia=inertia,
-            explicitinertial=True,
-        )
+        add_load(spec, "load", robot.torso_load_kg, np.zeros(3)).ipos = bodies[_TORSO].ipos
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
@@ -177,16 +154,13 @@ def elastic_spec(
         form: "tendon", or "rigid" for what an inelastic robot would do.
         timestep_s: Physics step [s].
     """
-    spec = transformed(rigid_spec(robot), joints, form, actuators="replace")
+    spec = transform_hinges(rigid_spec(robot), joints, form, actuators="replace")
     spec.option.timestep = timestep_s
     for side in SIDES:
-        for kind, name in (
-            (mujoco.mjtSensor.mjSENS_FORCE, "force"),
-            (mujoco.mjtSensor.mjSENS_TORQUE, "torque"),
-        ):
+        for name in ("FORCE", "TORQUE"):
             spec.add_sensor(
-                name=f"{side}_{name}",
-                type=kind,
+                name=f"{side}_{name.lower()}",
+                type=getattr(mujoco.mjtSensor, f"mjSENS_{name}"),
                 objtype=mujoco.mjtObj.mjOBJ_SITE,
                 objname=f"{side}_ft",
             )
@@ -197,8 +171,8 @@ DRAWN_LOAD = "drawn_load"
 """Body of the load that a scenario draws."""
 
 
-def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> None:
-    """Fix a load to the upper body.
+def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoco.MjsBody:
+    """Fix a load to the upper body; its body.
 
     Args:
         spec: The robot.
@@ -210,6 +184,7 @@ def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> None:
     load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass, explicitinertial=True)
     load.ipos = np.zeros(3)
     load.inertia = np.full(3, mass * _LOAD_GYRATION_M**2)
+    return load
 
 
 def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
@@ -238,36 +213,11 @@ def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
     foot.add_site(name=f"{side}_ft")
 
 
-def _position(link: Link, robot: Thormang) -> Array:
-    """Position in the parent; the hips stand where the option says."""
-    if link.joint.endswith("hip_yaw"):
-        return np.array(
-            [link.position[0], np.sign(link.position[1]) * robot.hip_half_spacing, link.position[2]]
-        )
-    return link.position
-
-
 def _twin(joint: ElasticJoint) -> ElasticJoint:
+    """The joint of two servos side by side."""
     servo = joint.servo
     doubled = {name: factor * getattr(joint, name) for name, factor in _TWIN_KNEE.items()}
     if servo is not None:
         gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit")
         doubled["servo"] = servo.replace(**{gain: 2.0 * getattr(servo, gain) for gain in gains})
     return joint.replace(**doubled)
-
-
-def _link(row: dict[str, str]) -> Link:
-    def numbers(*names: str) -> Array:
-        return np.array([float(row[name]) for name in names])
-
-    return Link(
-        name=row["name"],
-        parent=row["parent"],
-        joint=row["joint"],
-        axis=numbers("axis_x", "axis_y", "axis_z"),
-        position=numbers("x_m", "y_m", "z_m"),
-        limits=numbers("lower_rad", "upper_rad") if row["lower_rad"] else None,
-        mass=float(row["mass_kg"]),
-        com=numbers("com_x", "com_y", "com_z"),
-        inertia=numbers("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
-    )

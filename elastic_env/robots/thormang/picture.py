@@ -1,5 +1,4 @@
-"""The walker's picture: the tilt and the position error of the pelvis are drawn enlarged, the feet
-where they are.
+"""The walker's picture: tilt and shift of the pelvis are enlarged, the feet stay to scale.
 
 Relative to the feet the pelvis stands at planned + factor · (true − planned), in position and
 attitude; the feet, the ZMP and its reference are drawn to scale, so that the robot stands on the
@@ -60,7 +59,7 @@ _LEGEND = (
 
 @dataclass(frozen=True)
 class Posture:
-    """Where pelvis and feet are, in the world frame.
+    """Places of pelvis and feet in the world frame.
 
     Attributes:
         pelvis, R: Position [m] and orientation of the pelvis, (3,), (3, 3).
@@ -74,22 +73,20 @@ class Posture:
     feet_R: Array
 
     @classmethod
-    def true(cls, truth: WalkTruth, world: int = 0) -> "Posture":
+    def of_truth(cls, truth: WalkTruth, world: int = 0) -> "Posture":
         """That of a world."""
         R = truth.pelvis_R[world]
         feet_R = R @ foot_pose(truth.model.biped.leg, truth.q[world].reshape(2, -1))[1]
         return cls(truth.pelvis[world], R, truth.ankles[world], feet_R)
 
     @classmethod
-    def planned(cls, plan: WalkPlan, row: int) -> "Posture":
+    def of_plan(cls, plan: WalkPlan, row: int) -> "Posture":
         """That of the plan, with pelvis and feet level."""
         level = np.eye(3)
         return cls(plan.pelvis[row], level, plan.ankles[row], np.stack([level, level]))
 
     def joint_angles(self, robot: Biped) -> Array:
-        """The joint angles that go with it, of a straight leg where a foot is out of reach,
-        (12,) [rad].
-        """
+        """Its joint angles, (12,) [rad]; of a straight leg where a foot is out of reach."""
         legs = hip_to_ankle(robot, self.pelvis, self.R, self.ankles)
         stretch = np.linalg.norm(legs, axis=-1, keepdims=True) / (_ALMOST * robot.leg.reach)
         return leg_angles(
@@ -98,13 +95,14 @@ class Posture:
 
 
 def hip_to_ankle(robot: Biped, pelvis: Array, R: Array, ankles: Array) -> Array:
-    """Ankles as seen from the hips, in the frame of the pelvis, for pelvis poses (..., 3), (...,
-    3, 3); (..., 2, 3).
+    """Ankles as seen from the hips, in the frame of the pelvis, (..., 2, 3).
+
+    The pelvis poses are (..., 3) and (..., 3, 3).
     """
     return (ankles - pelvis[..., None, :]) @ R - robot.hips
 
 
-def enlarged(
+def enlarge_posture(
     true: Posture,
     planned: Posture,
     share: Array | float,
@@ -150,7 +148,7 @@ class WalkerPicture(ModelPicture):
         self._factor = LARGEST_FACTOR
 
     def alone(self) -> Alone:
-        """See `HasSides`."""
+        """The robot of a side-by-side picture."""
         return Alone(
             solid_spec(self._task.config.robot),
             LEG_JOINTS,
@@ -160,10 +158,10 @@ class WalkerPicture(ModelPicture):
         )
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
-        """See `HasSides`."""
+        """Reference, motor side and link side of a world."""
         truth = self._task.truth()
         row = self._row(now)
-        planned = Posture.planned(self._task.plan, row)
+        planned = Posture.of_plan(self._task.plan, row)
         q_ref = planned.joint_angles(truth.model.biped)
         return Sides(
             q_ref,
@@ -182,10 +180,10 @@ class WalkerPicture(ModelPicture):
         plan = self._task.plan
         row = self._row(now)
         truth = self._task.truth()
-        true = Posture.true(truth, world)
-        planned = Posture.planned(plan, row)
+        true = Posture.of_truth(truth, world)
+        planned = Posture.of_plan(plan, row)
         robot = truth.model.biped
-        drawn, self._factor = enlarged(true, planned, plan.share[row], robot)
+        drawn, self._factor = enlarge_posture(true, planned, plan.share[row], robot)
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)
         for marker in (ZMP, ZMP_REFERENCE):

@@ -1,6 +1,4 @@
-"""The walker's truth, measurements and scores beside its joints: one record per world, fields by
-name.
-"""
+"""The walker's records beside its joints: truth, measurements, scores, plan, constants."""
 
 from dataclasses import dataclass
 
@@ -33,7 +31,7 @@ TRUTH = record_type(
         WHOLE,
     ),  # step of the first touch in the second half of the swing, -1 before it
 )
-"""What the physics did in a control step."""
+"""True state after a control step."""
 
 MEASURED = record_type(
     ("imu_attitude", REAL, 2),
@@ -43,7 +41,7 @@ MEASURED = record_type(
     ("imu_up", REAL, 3),
     ("imu_gyro", REAL, 3),
 )
-"""What the sensors show, and what one of them keeps."""
+"""Measurements, and the state of an inertial IMU."""
 
 NOISE = record_type(
     *((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None)
@@ -76,7 +74,7 @@ ROW_OF_PLAN = record_type(
     ("imu_is_due", np.bool_),
     ("weight", REAL),  # factor of tilt and zmp in the reward
 )
-"""What a control step needs of the plan."""
+"""The plan as a control step needs it."""
 
 INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
 """An inertial IMU, one row beside every row of `CONSTANTS`.
@@ -107,7 +105,7 @@ CONSTANTS = record_type(
     ("quality", QUALITY),
     ("rules", WALK_RULES),
 )
-"""What does not change."""
+"""Constants of a kind of world."""
 
 COLUMNS = ("imu_attitude", "imu_rate", "wrench", "clock", "load_share", "zmp_reference")
 """Groups of the observation that are not of the joints."""

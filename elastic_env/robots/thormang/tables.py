@@ -1,6 +1,4 @@
-"""What the walking task observes, commands and scores, by name;
-`elastic_env.robots.thormang.task` shows the table.
-"""
+"""Signals and metrics of the walking task, by name."""
 
 from collections.abc import Mapping
 
@@ -9,6 +7,7 @@ import numpy as np
 from elastic_env.core.signals import Mirrored, Signal, SignalGroup, SignalTable
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES
 from elastic_env.world.metrics import Metric
+from elastic_env.world.scenario import Scenario
 from elastic_env.world.task import joint_groups
 
 JOINTS: Mapping[str, Mirrored] = {
@@ -48,6 +47,17 @@ def _clock() -> tuple[Signal, ...]:
     )
 
 
+def _attitude_noise_rad(scenario: Scenario) -> float:
+    """Of roll and pitch, in an inertial IMU before its filter."""
+    imu = scenario.inertial
+    return scenario.pelvis_imu.noise_rad if imu is None else imu.accelerometer_noise_rad
+
+
+def _gyro_noise_rad_s(scenario: Scenario) -> float:
+    imu = scenario.inertial
+    return scenario.gyro_noise_rad_s if imu is None else imu.gyro_noise_rad_s
+
+
 _TURNS: dict[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
 _RATES: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
 _of = SignalGroup.of
@@ -63,7 +73,7 @@ GROUPS = (
         "{part} of the pelvis by its IMU",
         _TURNS,
         "measured",
-        noise=lambda scenario: scenario.pelvis_noise_rad,
+        noise=_attitude_noise_rad,
     ),
     _of(
         "imu_rate",
@@ -71,7 +81,7 @@ GROUPS = (
         "gyroscope of the pelvis about its {part}",
         _RATES,
         "measured",
-        noise=lambda scenario: scenario.pelvis_gyro_noise_rad_s,
+        noise=_gyro_noise_rad_s,
     ),
     SignalGroup(
         "wrench",

@@ -1,5 +1,4 @@
-"""The walking task: a humanoid on elastic legs walks in place, its pelvis level, its ZMP where the
-plan has it.
+"""The walking task: walk in place on elastic legs, the pelvis level, the ZMP as planned.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
 l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one
@@ -63,10 +62,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotDraw
+from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import Plan, PlanTable
@@ -75,7 +75,6 @@ from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
-    PlacedRobot,
     WalkConfig,
     placed_robot,
     require_stable_walker,
@@ -99,12 +98,11 @@ from elastic_env.robots.thormang.tables import FELL, GROUPS, JOINTS, METRICS, OB
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.further_sensors import FurtherSensors
 from elastic_env.world.ground_contact import FootSensors
-from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import RULES, Records, Sample, columns_of, one
+from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.sensors import InertialSensor, angle_of_count, is_due
-from elastic_env.world.task import Task, spring_torque
+from elastic_env.world.sensors import InertialSensor, is_due
+from elastic_env.world.task import Task, joint_rules, spring_torque
 
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
@@ -122,7 +120,7 @@ class _Kind:
     """
 
     config: WalkConfig
-    bank: Sequence[RobotDraw]
+    bank: Sequence[DrawnRobot]
     model: mujoco.MjModel
     true_model: WalkerModel
 
@@ -131,20 +129,33 @@ class _Kind:
         """Those of a configuration, a planned motion, and what is observed."""
         require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         bank = robot_bank(config.scenario, config.bank)
-        return _Kind(config, bank, config.true_model(), _true_model(config, plan, table))
+        body = biped(config.true_robot)  # pyright: ignore[reportArgumentType]
+        period_s = config.control_period_s
+        if config.true_robot != config.robot:
+            plan = with_torque(plan, body, period_s)
+        joints = config.true_joints
+        true_model = WalkerModel(joints, body.rigid, period_s, table, biped=body, plan=plan)
+        return _Kind(config, bank, config.true_model(), true_model)
+
+    @property
+    def inertial(self) -> InertialSensor:
+        """The inertial IMU of robots that have one, by default that of the data sheet."""
+        return self.config.scenario.inertial or InertialSensor()
+
+    @property
+    def encoder_counts(self) -> int | None:
+        """Counts per turn of the encoders; None for continuous ones."""
+        has_counts = self.config.scenario.encoder_counts
+        return self.true_model.encoder_counts_per_turn if has_counts else None
 
     @property
     def fits(self) -> list[tuple[bool, bool]]:
-        """Whether measurements are delayed, and whether the IMU is inertial, as far as robots of
-        the bank have it.
-        """
+        """Pairs (measurements are delayed, IMU is inertial) that robots of the bank have."""
         return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
 
 
 class WalkTask(Task):
-    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP on top of the
-    joints.
-    """
+    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP beside the joints."""
 
     config: WalkConfig
     assumed_model: WalkerModel
@@ -161,7 +172,7 @@ class WalkTask(Task):
                 f" {len(scenarios)}"
             )
         sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
-        table = OBSERVATION.extended(sensors.signals)
+        table = SignalTable((*OBSERVATION, *sensors.signals))
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         assumed = WalkerModel(
@@ -183,11 +194,15 @@ class WalkTask(Task):
             reference=PlanTable(_Walk(self.plan), config.control_period_s, num_worlds),
             table=OBSERVATION.signals,
             sensors=sensors,
+            scenarios=scenarios,
             metrics=METRICS,
-            rules=np.concatenate([_joint_rules(*fit) for fit in self._fits]),
+            rules=joint_rules(
+                config.control_period_s,
+                [(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._fits],
+            ),
         )
-        number = {kind.config.scenario: index for index, kind in enumerate(self._kinds)}
-        self._kind_of_world = [self._kinds[number[scenario]] for scenario in scenarios]
+        kinds = {kind.config.scenario: kind for kind in self._kinds}
+        self._kind_of_world = [kinds[scenario] for scenario in scenarios]
         self._torso = self.model.body("upper_body").id
         self._phases = _phase_rows(self.plan)
         self._bias = np.zeros(num_worlds, BIAS)
@@ -196,12 +211,8 @@ class WalkTask(Task):
         self._plan_rows = _plan_rows(self.plan, config)
         self._walk_columns = columns_of(OBSERVATION, COLUMNS)
         self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
-        self._push_steps = np.array(
-            [
-                round(kind.config.scenario.push_s / config.control_period_s)
-                for kind in self._kind_of_world
-            ]
-        )
+        push_s = np.array([scenario.push_s for scenario in scenarios])
+        self._push_steps = (push_s / config.control_period_s).round()
         self._push_force = np.zeros((num_worlds, 3))
         self._push_begin = np.full(num_worlds, -1, dtype=np.int64)
         self._phases.flags.writeable = False
@@ -229,9 +240,6 @@ class WalkTask(Task):
             models=tuple(kind.true_model for kind in self._kinds),
         )
 
-    def _has_ranges(self, world: int) -> bool:
-        return bool(self._kind_of_world[world].config.scenario.ranges)
-
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         generator = random.robot
         kind = self._kind_of_world[world]
@@ -239,7 +247,7 @@ class WalkTask(Task):
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot, kind.true_model)
         mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
-        bias["imu_attitude"][world] = mounting + np.array(robot.imu_bias_rad)
+        bias["imu_attitude"][world] = mounting + np.array(robot.mounting_rad)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
         self._kind[world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
@@ -251,42 +259,37 @@ class WalkTask(Task):
         begin = random.draw_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
         direction = random.draw_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
         self._push_begin[world] = begin
-        self._push_force[world] = self._robot(world).push_n * np.array(
+        self._push_force[world] = self._robots[world].push_n * np.array(
             [np.cos(direction), np.sin(direction), 0.0]
         )
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
-        scenario = self._kind_of_world[world].config.scenario
         bias = self._bias
-        sensor = _fitted(scenario, self._robot(world).is_inertial).inertial
+        sensor = self._kind_of_world[world].inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
-        if sensor is not None:
+        if self._robots[world].is_inertial:
             bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
             bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
             bias["specific_force"][world] = (
                 sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
             )
 
-    def _placed(self, world: int) -> PlacedRobot:
-        """The robot of a world, at rest."""
-        config = self._kind_of_world[world].config
-        return placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-
     def _place(self, worlds: BoolArray) -> None:
         simulation = self.simulation
         simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
         for world in np.flatnonzero(worlds).tolist():
-            placed = self._placed(world)
-            simulation.take(world, placed.model)
-            simulation.qpos[world] = placed.rest.qpos
+            config = self._kind_of_world[world].config
+            model, rest = placed_robot(config, self._robots[world])  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+            simulation.take(world, model)
+            simulation.qpos[world] = rest.qpos
             simulation.qvel[world] = 0.0
-            simulation.act[world] = placed.rest.act
+            simulation.act[world] = rest.act
             simulation.ctrl[world] = (
                 self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
             )
-            simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
+            simulation.bind("qacc_warmstart")[world] = rest.warmstart
         simulation.refresh(worlds)
 
     def _disturb(self) -> None:
@@ -304,10 +307,15 @@ class WalkTask(Task):
         )
         self._worlds[self._row]["scores"][worlds] = np.zeros((), SCORES)
 
-    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
-        noise = self._noise.ready()
-        joints = self._constants
-        steps = self._steps()
+    @override
+    def _sense_worlds(
+        self,
+        joints: tuple[Any, ...],
+        noise: tuple[Any, ...],
+        commanded: tuple[Any, ...],
+        steps: tuple[Any, ...],
+        results: tuple[Any, ...],
+    ) -> bool:
         return kernels.sense_walk(
             self._physics, joints, self._walker, noise, commanded, steps, results
         )
@@ -364,9 +372,7 @@ class WalkTask(Task):
         }
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """The walk (standing before and after it does not count), its phases, and where there is
-        a ZMP.
-        """
+        """Masks of the walk, without standing, of its phases, and where there is a ZMP."""
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
@@ -395,14 +401,14 @@ class _Walk:
     is_random = False
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
-        """See `Planned`."""
+        """The walk as a plan of the joints."""
         scored = self.walk.timing.walking
         nowhere = np.full(len(scored), -1, dtype=np.int64)
         return Plan(self.walk.q, self.walk.q_dot, self.walk.q_ddot, scored, nowhere)
 
 
 def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
-    """What a control step needs of the plan, one row per step."""
+    """The plan as a control step needs it, one row per step."""
     timing = plan.timing
     steps = np.arange(plan.num_steps + 1)
     rows = np.zeros(len(steps), ROW_OF_PLAN)
@@ -418,9 +424,7 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
 
 
 def _phase_rows(plan: WalkPlan) -> BoolArray:
-    """The walk, its phases in the order of `PHASES`, and when a foot should touch down, by
-    control step.
-    """
+    """The walk, its phases as in `PHASES`, and the planned touch-downs, by control step."""
     timing = plan.timing
     touchdown = np.zeros_like(plan.timing.single)
     touchdown[1:] = timing.single[:-1] & ~timing.single[1:]
@@ -437,29 +441,18 @@ def _halves_of_swing(plan: WalkPlan) -> IntArray:
     )
 
 
-def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
-    """One record of `RULES`; arguments as `_constants`."""
-    counts = (
-        kind.true_model.encoder_counts_per_turn if kind.config.scenario.encoder_counts else None
-    )
-    return one(
-        RULES,
-        control_period_s=kind.config.control_period_s,
-        is_delayed=is_delayed,
-        count_rad=angle_of_count(counts),
-        highest_rad_s=DIVERGED_RAD_S,
-    )
-
-
 def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
-    """What does not change of a robot, one record of `CONSTANTS`.
+    """Constants of a robot, one record of `CONSTANTS`.
 
     Args:
         kind: Robots of its scenario.
-        is_delayed: Whether its measurements are shown a step late.
-        is_inertial: Whether its IMU computes its attitude.
+        is_delayed: True if its measurements are shown a step late.
+        is_inertial: True if its IMU computes its attitude.
     """
     config = kind.config
+    scenario = config.scenario
+    if is_inertial:
+        scenario = scenario.replace(ranges=(), inertial=kind.inertial)
     model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
@@ -479,38 +472,20 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # 
         at=one(CONSTANTS["at"], ankles=[model.site(f"{side}_ft").id for side in SIDES]),
         foot_com=sensors.com,
         foot_weight=sensors.weight,
-        quality=_quality(_fitted(config.scenario, is_inertial)),
+        quality=_quality(scenario),
         rules=rules,
     )
 
 
-def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
-    """The scenario of a robot with an inertial IMU, its own or where robots are drawn that of
-    the data sheet.
-    """
-    if not is_inertial:
-        return scenario
-    return scenario.replace(ranges=(), inertial=scenario.inertial or InertialSensor())
-
-
 def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> Records | None:
-    """The inertial IMUs of robots as `WalkTask` lists them, rows of `INERTIAL`; None where no
-    robot has one.
-    """
+    """Rows of `INERTIAL`, one for every kind of world; None where no robot has such an IMU."""
     if not any(is_inertial for _, _, is_inertial in fits):
         return None
-    sensors = [kind.config.scenario.inertial or InertialSensor() for kind, _, _ in fits]
-    return np.concatenate(
-        [
-            one(
-                INERTIAL,
-                is_fitted=fit[2],
-                time_constant_s=sensor.time_constant_s,
-                gravity_m_s2=gravity_m_s2,
-            )
-            for fit, sensor in zip(fits, sensors, strict=True)
-        ]
-    )
+    rows = np.zeros(len(fits), INERTIAL)
+    rows["is_fitted"] = [is_inertial for _, _, is_inertial in fits]
+    rows["time_constant_s"] = [kind.inertial.time_constant_s for kind, _, _ in fits]
+    rows["gravity_m_s2"] = gravity_m_s2
+    return rows
 
 
 def _quality(scenario: Scenario) -> Records:
@@ -522,19 +497,6 @@ def _quality(scenario: Scenario) -> Records:
             noise[group.name] = group.noise(scenario)
     return one(
         QUALITY, noise=noise, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad
-    )
-
-
-def _true_model(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> WalkerModel:
-    """The true joints and masses, and the torques that the planned motion needs of them."""
-    true = biped(config.true_robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    plan = (
-        plan
-        if config.true_robot == config.robot
-        else with_torque(plan, true, config.control_period_s)
-    )
-    return WalkerModel(
-        config.true_joints, true.rigid, config.control_period_s, table, biped=true, plan=plan
     )
 
 

@@ -1,6 +1,4 @@
-"""A model of the joints that matter: all other joints are held in place, so that only named
-hinges move.
-"""
+"""Models in which only named hinges move: all other joints are held in place."""
 
 from collections.abc import Collection
 
@@ -15,9 +13,8 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
-def frozen(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
-    """A copy of a specification in which all joints but the named hinges are held where the first
-    keyframe has them.
+def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
+    """A copy in which all joints but the named hinges are held at the first keyframe.
 
     Held joints are taken out and their bodies put in place. Actuators, sensors, tendons and
     constraints of held joints go with them, and so do all keyframes and all sensors.
@@ -32,12 +29,11 @@ def frozen(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
     model = compiled_spec(spec.copy(), "the model")
     require_known_torque(model, list(joints))
     held = copy_without_keys(spec)
-    of_joints = [*held.sensors, *held.equalities, *held.tendons, *held.tuples]
-    for element in [
-        *of_joints,
-        *(a for a in held.actuators if a.trntype not in _ON_JOINT or a.target not in joints),
-    ]:
+    for element in [*held.sensors, *held.equalities, *held.tendons, *held.tuples]:
         held.delete(element)
+    for actuator in list(held.actuators):
+        if actuator.trntype not in _ON_JOINT or actuator.target not in joints:
+            held.delete(actuator)
     _put_bodies_in_place(held, model, joints, home_of(model))
     return held
 

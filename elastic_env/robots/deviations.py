@@ -1,0 +1,27 @@
+"""Deviations of joints from their reference, as pictures of fixed robots draw them: enlarged."""
+
+from collections.abc import Mapping
+
+WIDTH = 640
+HEIGHT = 480
+"""Size of a picture [pixels]."""
+ENLARGEMENT = 8.0
+"""Factor by which deviations from the reference are enlarged."""
+REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
+REFERENCE_WORD_RGBA = (0.27, 0.55, 0.37, 1.0)
+"""Colour of the translucent reference, and of its word in the legend."""
+
+
+def enlarge_deviation(angle: float, reference: float, factor: float = ENLARGEMENT) -> float:
+    """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
+    return reference + factor * (angle - reference)
+
+
+def deviation_caption(now: Mapping[str, float]) -> list[str]:
+    """Lines of text over the picture of a robot with these signals."""
+    deflection = 1e3 * now["deflection"]
+    link_error = 1e3 * now["link_error"]
+    return [
+        f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {ENLARGEMENT:g}",
+        f"deflection {deflection:+7.2f} mrad     link error {link_error:+7.2f} mrad",
+    ]

@@ -1,0 +1,227 @@
+"""Thirty formulas, each broken once: the tests must notice.
+
+    python -m tests.broken_formulas            the tests that every commit runs
+    python -m tests.broken_formulas --all      all tests, also the slow ones
+    python -m tests.broken_formulas 3 17       some of the formulas
+
+Each formula is changed in a copy of the source, and the tests that concern it are played there
+until one fails. The program prints the first test that fails for each formula, and ends with
+the number of formulas that no test caught.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+_COPIED = ("elastic_env", "baselines", "train", "tests", "configs", "docs", "examples")
+_FILES = ("pyproject.toml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "Makefile")
+
+JOINT = "elastic_joint elasticity model_file time_step simulation"
+COMPENSATION = "compensators contact_torque gravity_torque policies position_compensator"
+WALKING = "walking_controller posture zmp_offset published_controllers walk_policies"
+PLAN = "preview_control gait walk_plan sway thormang"
+STATISTICS = "comparison leaderboard bench robot_scores"
+
+
+@dataclass(frozen=True)
+class BrokenFormula:
+    """A change of one formula that makes it wrong.
+
+    Attributes:
+        file: Source file.
+        right: Text of the formula, which stands there once.
+        wrong: What it is replaced by.
+        tests: Files of tests that concern it, without `test_` and `.py`.
+    """
+
+    file: str
+    right: str
+    wrong: str
+    tests: str
+
+
+_ELASTICITY = "elastic_env/joint/elasticity.py"
+_COMPENSATORS = "baselines/compensation/compensators.py"
+_CONTACT = "baselines/compensation/contact_torque.py"
+_GRAVITY = "baselines/compensation/gravity_torque.py"
+_CONTROLLER = "baselines/walking/controller.py"
+_SHARE = "shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing"
+_PREVIEW = "elastic_env/motion/preview_control.py"
+_PLAN = "elastic_env/motion/walk_plan.py"
+_STATISTICS = "train/evaluate/statistics.py"
+
+BROKEN = (
+    BrokenFormula(_ELASTICITY, "np.asarray(backlash) / 2.0", "np.asarray(backlash)", JOINT),
+    BrokenFormula(
+        _ELASTICITY, "deflection + damping * deflection_rate", "deflection + damping", JOINT
+    ),
+    BrokenFormula(
+        _ELASTICITY, "np.sign(torque) * backlash / 2.0", "np.sign(torque) * backlash", JOINT
+    ),
+    BrokenFormula(
+        _ELASTICITY,
+        "self.velocity_gain * self.speed_limit) / self.integral_gain",
+        "self.velocity_gain) / self.integral_gain",
+        f"{JOINT} sensors testbed",
+    ),
+    BrokenFormula(
+        _ELASTICITY, "matrix = relative_gradient + np.eye(n)", "matrix = np.eye(n)", JOINT
+    ),
+    BrokenFormula(
+        _ELASTICITY,
+        "K * (q - theta) + torque(q)",
+        "K * (q - theta) - torque(q)",
+        f"{JOINT} {COMPENSATION}",
+    ),
+    BrokenFormula(
+        "elastic_env/joint/load_path.py",
+        "q - self.theta + C * self.torque(q)",
+        "q - self.theta - C * self.torque(q)",
+        f"{JOINT} {COMPENSATION}",
+    ),
+    BrokenFormula(_COMPENSATORS, "+ servo_compliance * torque", "", COMPENSATION),
+    BrokenFormula(
+        _COMPENSATORS,
+        "return theta - _solve(gravity, theta",
+        "return theta + _solve(gravity, theta",
+        COMPENSATION,
+    ),
+    BrokenFormula(_COMPENSATORS, "- 0.5 * self._dt * theta_dot", "", COMPENSATION),
+    BrokenFormula(
+        _COMPENSATORS,
+        "drive.rotor_inertia * theta_ddot[world, i] + torque[world, i]",
+        "torque[world, i]",
+        COMPENSATION,
+    ),
+    BrokenFormula(
+        _COMPENSATORS,
+        "target + math.exp(-period_s / time_constant_s)",
+        "target + (1.0 - period_s / time_constant_s)",
+        COMPENSATION,
+    ),
+    BrokenFormula(
+        _COMPENSATORS,
+        "full = coulomb * np.sign(displacement)",
+        "full = -coulomb * np.sign(displacement)",
+        COMPENSATION,
+    ),
+    BrokenFormula(
+        _COMPENSATORS,
+        "self.stiffness, self.stiffness * theta_dot",
+        "self.stiffness, theta_dot",
+        COMPENSATION,
+    ),
+    BrokenFormula(
+        _GRAVITY,
+        "self._b * np.cos(q) - self._a * np.sin(q)",
+        "self._b * np.cos(q) + self._a * np.sin(q)",
+        f"{COMPENSATION} testbed",
+    ),
+    BrokenFormula(
+        _CONTACT, "gravity * math.sin(pitch),", "-gravity * math.sin(pitch),", COMPENSATION
+    ),
+    BrokenFormula(
+        _CONTACT,
+        "-gravity * (cosine * math.sin(roll))",
+        "gravity * (cosine * math.sin(roll))",
+        COMPENSATION,
+    ),
+    BrokenFormula(_CONTACT, _SHARE, _SHARE.replace("4.0", "1.0"), f"{COMPENSATION} {WALKING}"),
+    BrokenFormula(_CONTROLLER, "(1.0 - 2.0 * share) * own.weight", "share * own.weight", WALKING),
+    BrokenFormula(
+        _CONTROLLER,
+        "own.velocity[i] / controller.omega",
+        "own.velocity[i] * controller.omega",
+        WALKING,
+    ),
+    BrokenFormula(
+        _CONTROLLER,
+        "roll = -carried * own.shift[1]",
+        "roll = carried * own.shift[1]",
+        WALKING,
+    ),
+    BrokenFormula(
+        _CONTROLLER,
+        "share = shown.load_share if leg == 1 else 1.0 - shown.load_share",
+        "share = shown.load_share if leg == 0 else 1.0 - shown.load_share",
+        WALKING,
+    ),
+    BrokenFormula(
+        "baselines/walking/zmp_shift.py",
+        "np.exp(-omega * period_s)",
+        "np.exp(-2.0 * omega * period_s)",
+        WALKING,
+    ),
+    BrokenFormula(_PREVIEW, "-config.com_height_m / config.gravity", "config.com_height_m", PLAN),
+    BrokenFormula(_PREVIEW, "np.array([T**3 / 6.0", "np.array([T**3 / 3.0", PLAN),
+    BrokenFormula(_PLAN, "np.sqrt(self.gravity / self.com_height)", "np.sqrt(self.gravity)", PLAN),
+    BrokenFormula(_PLAN, "samples[2:] - 2.0 * samples[1:-1]", "samples[2:] - samples[1:-1]", PLAN),
+    BrokenFormula(_STATISTICS, "np.mean(mine, axis=-1)", "np.median(mine, axis=-1)", STATISTICS),
+    BrokenFormula(_STATISTICS, "0.5 * np.sum(mine == base)", "np.sum(mine == base)", STATISTICS),
+    BrokenFormula(_STATISTICS, "[::-1] / counted", "/ counted", STATISTICS),
+)
+
+
+def main() -> int:
+    """Break the formulas one after another; the number of those that no test caught."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("numbers", nargs="*", type=int, help="formulas, from 1; default: all")
+    parser.add_argument("--all", action="store_true", help="also the slow tests")
+    options = parser.parse_args()
+    numbers = options.numbers or range(1, len(BROKEN) + 1)
+    missed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        for name in _COPIED:
+            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in _FILES:
+            shutil.copy(ROOT / name, copy / name)
+        for number in numbers:
+            formula = BROKEN[number - 1]
+            catcher = first_failure(copy, formula, with_slow=options.all)
+            missed += catcher is None
+            where = Path(formula.file).name
+            print(
+                f"{number:3} {where:22} {formula.right[:45]!r:48} {catcher or 'MISSED'}", flush=True
+            )
+    print(f"{len(numbers) - missed} of {len(numbers)} broken formulas were caught")
+    return missed
+
+
+def first_failure(copy: Path, formula: BrokenFormula, with_slow: bool) -> str | None:
+    """Name of the first test that fails with the broken formula; None where all pass."""
+    file = copy / formula.file
+    text = file.read_text()
+    if text.count(formula.right) != 1:
+        raise SystemExit(f"{formula.file} must have {formula.right!r} once")
+    file.write_text(text.replace(formula.right, formula.wrong))
+    try:
+        selected = ["tests/test_fingerprints.py"] if with_slow else []
+        tests = [f"tests/test_{name}.py" for name in dict.fromkeys(formula.tests.split())]
+        # a marker in addopts leaves the slow tests out; an empty one takes them all
+        marker = ["-m", ""] if with_slow else []
+        played = subprocess.run(
+            [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *marker]
+            + [name for name in (*tests, *selected) if (copy / name).exists()],
+            cwd=copy,
+            env={**os.environ, "PYTHONPATH": str(copy)},
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        file.write_text(text)
+    found = re.search(r"^(?:FAILED|ERROR) (?:tests/)?(\S+)", played.stdout, flags=re.MULTILINE)
+    if found is None and played.returncode not in (0, 5):
+        raise SystemExit(f"pytest ended with {played.returncode}: {played.stdout[-2000:]}")
+    return None if found is None else found[1]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
