@@ -1,5 +1,4 @@
-"""The named policies: how each is built, which options it has, and what it needs beyond the
-standard sensors.
+"""The named policies: how each is built, its options, and the sensors that it needs.
 
 Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the
 command of a policy and shows it compensated encoder readings. The named policies are such
@@ -13,12 +12,12 @@ from functools import partial
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
-from baselines.adaptation.estimators import EncoderEstimator, LegEstimator, LinkEncoderEstimator
+from baselines.adaptation.estimators import LegEstimator, make_estimator
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
-from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import (
+    Compensated,
     Compensator,
     DynamicCompensator,
     GravityCompensator,
@@ -76,7 +75,7 @@ class NamedPolicy:
 
 
 def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return Zero(model.observation_table)
+    return Zero(model)
 
 
 def _around(
@@ -93,14 +92,14 @@ _friction = _around(_zero, partial(DynamicCompensator, friction=True))
 
 
 def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    build = _friction if options.observer.friction else _around(_zero, DynamicCompensator)
-    return DisturbanceObserver(build(env, model, options), model, options.observer, options.ramp_s)
+    gains = options.observer
+    build = _friction if gains.friction else _around(_zero, DynamicCompensator)
+    inner = build(env, model, options)
+    return DisturbanceObserver(inner, model, gains, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return WalkingController(
-        model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s
-    )
+    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
 
 
 def _without_feedback(build: Builder) -> Builder:
@@ -138,21 +137,19 @@ def _weighing(build: Builder) -> Builder:
 
 
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    return OnlineStiffness(
-        _base(env, model, options), model, LegEstimator(model), options.adaptation
-    )
+    base = _base(env, model, options)
+    return OnlineStiffness(base, model, LegEstimator(model), options.adaptation)
 
 
 def _with_posture(build: Builder) -> Builder:
-    """With posture feedback, and with the planned ZMP shifted against its mean error where that
-    is asked for.
-    """
+    """With posture feedback, and the planned ZMP shifted against its mean error if asked for."""
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
-        return (
-            policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
-        )
+        inner = build(env, model, options)
+        policy = PostureFeedback(inner, model, options.posture, options.ramp_s)
+        if options.zmp_offset is None:
+            return policy
+        return ZmpOffset(policy, model, options.zmp_offset)
 
     return built
 
@@ -160,58 +157,38 @@ def _with_posture(build: Builder) -> Builder:
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
     """Name of the policy whose offsets `iterative` learns."""
     name = options.learned_base or ("adaptive_posture" if is_walker else "input")
-    known = ON_THE_WALKER if is_walker else ON_JOINTS
-    bases = [
-        base
-        for base, policy in known.items()
-        if base != "iterative" and policy.track is Track.STANDARD
-    ]
+    known = policies_of(is_walker).items()
+    bases = [base for base, policy in known if policy.track is Track.STANDARD]
     require_known("base of iterative", [name], bases)
     return name
 
 
 def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     is_walker = isinstance(model, WalkerModel)
-    known = ON_THE_WALKER if is_walker else ON_JOINTS
     # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift
     # away over the walks
     if "swing_s" not in options.posture.model_fields_set:
         options = options.replace(posture=options.posture.replace(swing_s=0.0))
-    base = known[learned_base(options, is_walker)].build(env, model, options)
+    base = policies_of(is_walker)[learned_base(options, is_walker)].build(env, model, options)
     signals = learned_signals(model, options.learning)
     return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
 
 
 def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
-    """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by
-    them.
-    """
+    """`dynamic` with the deflections of some joints by sensors, which also adapt the stiffness."""
 
-    def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+        is_walker = isinstance(model, WalkerModel)
+        core: Any = _controller if is_walker else _zero
         sensors = DeflectionSensors(model, sensor, joints)
-        modelled = DynamicCompensator(model, options.output or "wrench", options.gravity)
-        controller = _controller(env, model, options)
-        policy = Compensated(
-            controller, MeasuredCompensator(modelled, sensors), options.ramp_s, corrects_policy=True
-        )
-        estimator = (
-            LegEstimator(model, sensors)
-            if sensor == TORQUE_SENSOR
-            else EncoderEstimator(model, sensors)
-        )
+        output = options.output or ("wrench" if is_walker else "taylor")
+        compensator = MeasuredCompensator(model, sensors, output, options.gravity)
+        inner = core(env, model, options)
+        policy = Compensated(inner, compensator, options.ramp_s, corrects_policy=True)
+        estimator = make_estimator(model, sensors)
         return OnlineStiffness(policy, model, estimator, options.adaptation)
 
     return build
-
-
-def _link_encoder(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
-    """`dynamic`, with links by their encoders and the stiffness of every joint adapted by them."""
-    sensors = DeflectionSensors(model, LINK_ENCODER)
-    modelled = DynamicCompensator(model, options.output or "taylor", options.gravity)
-    policy = Compensated(
-        _zero(env, model, options), MeasuredCompensator(modelled, sensors), options.ramp_s
-    )
-    return OnlineStiffness(policy, model, LinkEncoderEstimator(model, sensors), options.adaptation)
 
 
 def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -252,7 +229,10 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
         _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
     ),
     "link_encoder": NamedPolicy(
-        _link_encoder, (*_COMPENSATOR, "adaptation"), Track.LINK_ENCODERS, (LINK_ENCODER,)
+        _with_sensors(LINK_ENCODER),
+        (*_COMPENSATOR, "adaptation"),
+        Track.LINK_ENCODERS,
+        (LINK_ENCODER,),
     ),
     "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
@@ -303,6 +283,12 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
 
 The controller alone assumes K too, for the ankles' offsets and the friction.
 """
+
+
+def policies_of(is_walker: bool) -> Mapping[str, NamedPolicy]:
+    """Policies of the walker, or of robots on a fixed base."""
+    return ON_THE_WALKER if is_walker else ON_JOINTS
+
 
 BEST_ON_THE_WALKER: str | None = "adaptive_posture"
 """Best policy of the walker that needs no training and reads the standard sensors; residuals are

@@ -15,10 +15,13 @@ from baselines.catalogue import (
     ON_THE_WALKER,
     NamedPolicy,
     Track,
+    policies_of,
 )
 from baselines.compensation.policy import Policy
 from baselines.options import PolicyOptions
-from baselines.residual.residual import RESIDUAL, read_description, residual_policy
+from baselines.residual.correction import Corrected
+from baselines.residual.residual_policy import ResidualPolicy, load_residual
+from baselines.residual.settings import RESIDUAL
 from elastic_env.core.errors import ConfigurationError, shorten, unknown_name
 from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
@@ -37,10 +40,11 @@ def policy_names() -> list[str]:
 
 
 def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """A baseline by its name, on a walker or on another robot; None for a policy that is no
-    baseline.
+    """A baseline by its name, on a walker or on another robot.
+
+    None for a policy that is no baseline.
     """
-    return (ON_THE_WALKER if is_walker else ON_JOINTS).get(name)
+    return policies_of(is_walker).get(name)
 
 
 def track(name: str, is_walker: bool = True) -> Track:
@@ -54,16 +58,15 @@ def track(name: str, is_walker: bool = True) -> Track:
 
 
 def best_analytic(is_walker: bool = True) -> str | None:
-    """The best policy without learning that reads the standard sensors, by its name; None where
-    none is named.
+    """The best policy without learning that reads the standard sensors, by its name.
+
+    None where none is named.
     """
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 
 def sensors_needed(name: str) -> tuple[str, ...]:
-    """Sensors beyond the standard set that a policy reads, for `gymnasium.make(...,
-    sensors=[...])`.
-    """
+    """Sensors beyond the standard set that a policy reads, for the argument `sensors`."""
     known = named_policy(name, is_walker=True) or named_policy(name, is_walker=False)
     return () if known is None else known.sensors
 
@@ -129,31 +132,30 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
     known = named_policy(name, is_walker)
     if known is None:
-        names = ON_THE_WALKER if is_walker else ON_JOINTS
-        raise unknown_name(
-            f"policy of the {env.unwrapped.task.name}", name, [*names, f"{RESIDUAL}PATH"]
-        )
+        names = [*policies_of(is_walker), f"{RESIDUAL}PATH"]
+        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, names)
     _require_effect(name, env, given, known.options)
     return known.build(env, _assumed(env, chosen), chosen)
 
 
 def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     """A trained residual around its base, whose options may be given anew."""
-    description = read_description(folder)
+    description, network = load_residual(folder)
     task = env.unwrapped.task.name
     if description.robot != task:
         raise ConfigurationError(
             f"{shorten(folder)} is a residual for the {description.robot}, the environment is the"
             f" {task}"
         )
-    joints = env.unwrapped.assumed_model.joint_names
+    model: RobotModel = env.unwrapped.assumed_model
+    joints = model.joint_names
     if description.joints not in ([], joints):
         raise ConfigurationError(
             f"{shorten(folder)} was trained on a robot with the joints"
             f" {', '.join(description.joints)}; the environment's has {', '.join(joints)}"
         )
     base = make(description.base, env, **{**description.base_options, **options})
-    return residual_policy(folder, base, env.unwrapped.assumed_model)
+    return ResidualPolicy(Corrected(base, model, description.settings), network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
@@ -161,9 +163,8 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     description, table = load_table(folder, env)
     model: RobotModel = env.unwrapped.assumed_model
     base = make(description.base, env, **options)
-    played = LearnedOffsets(
-        base, model, learned_signals(model, description.learning), PolicyOptions().ramp_s
-    )
+    signals = learned_signals(model, description.learning)
+    played = LearnedOffsets(base, model, signals, PolicyOptions().ramp_s)
     played.play(table[None])
     return played
 
@@ -184,8 +185,6 @@ def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
     if options.stiffness is not None:
         model = model.with_stiffness(read_stiffness(options.stiffness))
-    return (
-        model
-        if options.stiffness_scale == 1.0
-        else model.with_stiffness(options.stiffness_scale * model.stiffness)
-    )
+    if options.stiffness_scale == 1.0:
+        return model
+    return model.with_stiffness(options.stiffness_scale * model.stiffness)

@@ -6,8 +6,7 @@ decision. A world that ends inside a decision takes no further part in it: its o
 reward are those up to its end.
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -20,7 +19,7 @@ from baselines.compensation.policy import Policy, put_rows, select_rows
 from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
-from baselines.residual.settings import Bound, ResidualSettings
+from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.envs import final_of, reset_mask
@@ -31,16 +30,22 @@ class _Deciding:
     """Base policy, correction and features of some worlds, and their memories."""
 
     def __init__(
-        self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int
+        self, env: Any, base: Policy | str, settings: Mapping[str, Any], num_worlds: int
     ) -> None:
+        self.settings = ResidualSettings(**settings)
         if not hasattr(env.unwrapped, "assumed_model"):
             raise ConfigurationError(
                 f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}"
             )
         policy = make(base, env) if isinstance(base, str) else base
-        self.settings = settings
-        self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
+        self.corrected = Corrected(policy, env.unwrapped.assumed_model, self.settings)
         self.features = Features(self.corrected)
+        self.observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (self.features.width,), np.float64
+        )
+        self.action_space = gymnasium.spaces.Box(
+            -1.0, 1.0, (self.corrected.num_residuals,), np.float32
+        )
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
         self._past: FeaturesMemory | None = None
@@ -53,8 +58,9 @@ class _Deciding:
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
-        """Features of the coming decision; the measurements count for some worlds only, or for
-        all.
+        """Features of the coming decision.
+
+        The measurements count for some worlds only, or for all.
         """
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
         if worlds is not None and self._past is not None:
@@ -70,9 +76,7 @@ class _Deciding:
         return action
 
     def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
-        """A residual for the observations of its decision as numbers within [−1, 1], out of the
-        mirror.
-        """
+        """A residual for the observations of its decision, clipped and out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(
@@ -83,55 +87,29 @@ class _Deciding:
         return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 
 
-ActsOn = Mapping[str, Bound | None]
-"""Inputs, and the value of each at a residual of 1."""
-
-
-def _settings(
-    acts_on: ActsOn | None, decision_period: int, further: dict[str, Any]
-) -> ResidualSettings:
-    chosen = {} if acts_on is None else {"acts_on": dict(acts_on)}
-    return ResidualSettings(**chosen, decision_period=decision_period, **further)
-
-
 class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """One world whose action is the residual of a base policy, [−1, 1]^k.
 
     Args:
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
-        acts_on: Inputs of the base that the residual acts on, each with its bound, see
-            `ResidualSettings`; None for the deflection that the base compensates.
-        decision_period: Control steps per decision.
-        **settings: Further parameters of `ResidualSettings`.
+        **settings: Parameters of `ResidualSettings`, such as `acts_on`, the inputs of the base that
+            the residual acts on with their bounds, and `decision_period`, the control steps of a
+            decision.
 
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
     """
 
     def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        base_policy: Policy | str,
-        acts_on: ActsOn | None = None,
-        decision_period: int = 25,
-        **settings: Any,
+        self, env: gymnasium.Env[Any, Any], base_policy: Policy | str, **settings: Any
     ) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(
-            self,
-            base_policy=base_policy,
-            acts_on=acts_on,
-            decision_period=decision_period,
-            **settings,
-        )
+        arguments = {"base_policy": base_policy, **settings}
+        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
         gymnasium.Wrapper.__init__(self, env)
-        self._deciding = _Deciding(
-            env, base_policy, _settings(acts_on, decision_period, settings), 1
-        )
-        self.observation_space = _box(self._deciding.features.width)
-        self.action_space = gymnasium.spaces.Box(
-            -1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32
-        )
+        self._deciding = _Deciding(env, base_policy, settings, num_worlds=1)
+        self.observation_space = self._deciding.observation_space
+        self.action_space = self._deciding.action_space
         self._last = np.zeros(0)
 
     @property
@@ -151,9 +129,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.read_residual(
-            self._last[None], action, self.action_space.shape or ()
-        )[None]
+        shape = self.action_space.shape or ()
+        residual = self._deciding.read_residual(self._last[None], action, shape)[None]
         total = 0.0
         terminated = False
         truncated = False
@@ -164,7 +141,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
             total += float(reward)
             if terminated or truncated:
                 break
-        return self._deciding.observe(self._last[None])[0], total, terminated, truncated, info
+        features = self._deciding.observe(self._last[None])[0]
+        return features, total, terminated, truncated, info
 
 
 class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
@@ -175,11 +153,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        acts_on: Inputs of the base that the residual acts on, each with its bound, see
-            `ResidualSettings`; None for the deflection that the base compensates.
-        decision_period: Control steps per decision.
-        autoreset_mode: When; None as the environment would.
-        **settings: Further parameters of `ResidualSettings`.
+        autoreset_mode: When it restarts them; None as the environment would.
+        **settings: As of `ResidualWrapper`.
 
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
@@ -189,20 +164,15 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self,
         env: gymnasium.vector.VectorEnv[Any, Any, Any],
         base_policy: Policy | str,
-        acts_on: ActsOn | None = None,
-        decision_period: int = 25,
         autoreset_mode: AutoresetMode | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(env)
-        chosen = _settings(acts_on, decision_period, settings)
-        self._deciding = _Deciding(env, base_policy, chosen, env.num_envs)
+        self._deciding = _Deciding(env, base_policy, settings, env.num_envs)
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
-        self.single_observation_space = _box(self._deciding.features.width)
-        self.single_action_space = gymnasium.spaces.Box(
-            -1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32
-        )
+        self.single_observation_space = self._deciding.observation_space
+        self.single_action_space = self._deciding.action_space
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._rows = np.zeros((env.num_envs, 0))
@@ -230,14 +200,13 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._deciding.begin(mask)
         self._done = self._done & ~mask
         features = self._deciding.observe(self._rows, mask)
-        self._last = (
-            features if self._last is None else np.where(mask[:, None], features, self._last)
-        )
+        if self._last is not None:
+            features = np.where(mask[:, None], features, self._last)
+        self._last = features
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their length, in an order drawn
-        from a generator.
+        """Cut the first episodes at decisions spread evenly over their length, in random order.
 
         Call it after `reset`. From the end of the first whole episode on the worlds are all over
         it; learning that saw all worlds in the same phase would see one phase at a time. What is
@@ -253,12 +222,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.read_residual(self._rows, actions, self.action_space.shape or ())
-        waiting = (
-            self._done
-            if self.autoreset_mode is AutoresetMode.NEXT_STEP
-            else np.zeros_like(self._done)
-        )
+        shape = self.action_space.shape or ()
+        residual = self._deciding.read_residual(self._rows, actions, shape)
+        waiting = self._done & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
         truncated |= (self._cut_at == self._decisions) & ~terminated & ~waiting
@@ -280,8 +246,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
-        """Hold a residual for a decision period in the worlds that are alive; the observation is
-        of features.
+        """Hold a residual for a decision period in the worlds that are alive.
+
+        The observation is of features.
         """
         n = self.num_envs
         reward = np.zeros(n)
@@ -291,11 +258,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
         for _ in range(self.settings.decision_period):
-            command = np.where(
-                alive[:, None], self._deciding.act(self._rows, residual), np.float32(0.0)
-            )
-            with _no_restarts(self.env.unwrapped):
-                self._rows, gained, fell, finished, info = self.env.step(command)
+            action = self._deciding.act(self._rows, residual)
+            command = np.where(alive[:, None], action, np.float32(0.0))
+            self._rows, gained, fell, finished, info = self._step(command)
             reward += np.where(alive, gained, 0.0)
             ended = alive & (fell | finished)
             if ended.any():
@@ -320,19 +285,15 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
             features = np.where((terminated | truncated)[:, None], final, features)
         return Transition(features, reward, terminated, truncated, info)
 
+    def _step(self, command: Array) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """A control step after which worlds that end stay as they are.
 
-@contextmanager
-def _no_restarts(env: Any) -> Iterator[None]:
-    """Have worlds that end stay as they are for a step; whoever steps the environment itself
-    finds it unchanged.
-    """
-    mode = env.autoreset_mode
-    env.autoreset_mode = AutoresetMode.DISABLED
-    try:
-        yield
-    finally:
-        env.autoreset_mode = mode
-
-
-def _box(width: int) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-np.inf, np.inf, (width,), np.float64)
+        Whoever steps the environment itself finds it unchanged.
+        """
+        env: Any = self.env.unwrapped
+        mode = env.autoreset_mode
+        env.autoreset_mode = AutoresetMode.DISABLED
+        try:
+            return self.env.step(command)
+        finally:
+            env.autoreset_mode = mode

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm
-from baselines.identification.arm_result import described
+from baselines.identification.arm_result import describe_fit
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.yaml_text import parse_yaml
 from tests.test_arm_identification import (
@@ -91,7 +91,7 @@ def trial(seed: int, friction: float, theta: Array | None) -> Trial:
         "end_effector", FIRST_SEED + seed, POSES, friction, sides=friction > 0.0, **options
     )
     fit = fit_arm(model_of(log))
-    result = described(fit, WITHIN, assumed=None)
+    result = describe_fit(fit, WITHIN, assumed=None)
     found = np.array([joint.stiffness_nm_per_rad for joint in result.joints])
     compliance, half = fit.estimate("compliance")
     before_m, after_m = _errors(fit, seed)
@@ -108,7 +108,7 @@ def trial(seed: int, friction: float, theta: Array | None) -> Trial:
 def _errors(fit: ArmFit, seed: int) -> tuple[float, float]:
     """RMS error of the end effector without and with compensation [m]."""
     with tempfile.TemporaryDirectory() as folder:
-        described(fit, WITHIN, assumed=None).save(Path(folder))
+        describe_fit(fit, WITHIN, assumed=None).save(Path(folder))
         stiffness = parse_yaml((Path(folder) / "joints.yaml").read_text())
     compensator = PositionCompensator.from_model(ARM, stiffness)
     wanted = 0.8 * poses(UNUSED, np.random.default_rng(5000 + seed))

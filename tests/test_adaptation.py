@@ -18,7 +18,8 @@ from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.estimation.joint_stiffness import StiffnessPrior, regress
 from baselines.policies import sensors_needed
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, SignalTable
+from elastic_env.core.signals import Array
+from elastic_env.world.robot_model import RobotModel
 from tests.test_walk_policies import PERIOD_S, first, recording, scalar
 
 PRIOR = StiffnessPrior(common=0.4, own=0.15, offset_rad=0.003, noise_rad=0.004)
@@ -94,8 +95,8 @@ class Fixed:
 class Recorded(Zero):
     """A policy that keeps the corrections it gets."""
 
-    def __init__(self, table: SignalTable) -> None:
-        super().__init__(table)
+    def __init__(self, model: RobotModel) -> None:
+        super().__init__(model)
         self.corrections: list[Array] = []
 
     def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
@@ -108,7 +109,7 @@ def test_the_correction_is_filtered_and_joined_with_another() -> None:
     """First order in time, and (1 + r)(1 + r') − 1; an estimate is made once a period."""
     model = scalar().unwrapped.assumed_model
     gains = AdaptationGains(period_s=0.1, filter_s=0.2, limit=0.4)
-    inner = Recorded(model.observation_table)
+    inner = Recorded(model)
     policy = OnlineStiffness(inner, model, Fixed(), gains)
     state = None
     for step, observation in enumerate(recording()[:50]):

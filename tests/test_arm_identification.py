@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
-from baselines.identification.arm_result import JointStiffness, bounded_compliance, described
-from baselines.identification.log_signs import turned
+from baselines.identification.arm_result import JointStiffness, bounded_compliance, describe_fit
+from baselines.identification.log_signs import turn_joint
 from baselines.identification.pose_log import Kind, PoseLog, read_log
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
@@ -183,9 +183,9 @@ def test_derivatives_are_those_of_finite_differences(kind: Kind, frame: str) -> 
     unknowns[turn] = 0.0  # its derivative is that of a first turn
     steps = np.diag(1e-5 * model.scale)
     numeric = [
-        (model.predicted(unknowns + s)[0] - model.predicted(unknowns - s)[0]) / 2e-5 for s in steps
+        (model.predict(unknowns + s)[0] - model.predict(unknowns - s)[0]) / 2e-5 for s in steps
     ]
-    gradient = model.predicted(unknowns)[1] * model.scale
+    gradient = model.predict(unknowns)[1] * model.scale
     np.testing.assert_allclose(
         gradient, np.stack(numeric, axis=-1), atol=2e-6 * np.abs(gradient).max()
     )
@@ -257,7 +257,7 @@ def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(
     """Catches K beyond 3 % of a joint that is told apart, and a correction that leaves a fifth
     of the sag."""
     fit = fit_arm(model_of(log_of("end_effector", 6)))
-    result = described(fit, within=0.03, assumed=None)
+    result = describe_fit(fit, within=0.03, assumed=None)
     told = np.array([not joint.reason for joint in result.joints])
     assert told.tolist() == [False, True, True, True, False, True, False]
     found = np.array([joint.stiffness_nm_per_rad for joint in result.joints])
@@ -282,7 +282,7 @@ def test_joints_that_poses_do_not_tell_apart_are_named_with_the_reason() -> None
     has a twin."""
     why = {
         joint.joint: joint
-        for joint in described(fit_arm(model_of(log_of("end_effector", 8))), 0.03, 700.0).joints
+        for joint in describe_fit(fit_arm(model_of(log_of("end_effector", 8))), 0.03, 700.0).joints
     }
     assert why["base_yaw"].reason == "gravity does not load it in these poses"
     assert (why["base_yaw"].source, why["base_yaw"].stiffness_nm_per_rad) == ("assumed", 700.0)
@@ -291,7 +291,7 @@ def test_joints_that_poses_do_not_tell_apart_are_named_with_the_reason() -> None
     log = log_of("link_encoders", 8)
     half = replace(log, columns=JOINTS[:-1], measured=log.measured[:, :-1])
     assert (
-        described(fit_arm(model_of(half)), 0.03, None).joints[-1].reason
+        describe_fit(fit_arm(model_of(half)), 0.03, None).joints[-1].reason
         == "the measurement does not show its angle"
     )
 
@@ -314,7 +314,7 @@ def test_joints_that_move_alike_are_named_together() -> None:
     )
     log = PoseLog(("a", "b"), theta, "end_effector", ("x", "y", "z"), measured)
     fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, ("a", "b"), "known", payload=False)))
-    reasons = [joint.reason for joint in described(fit, 0.03, 1000.0).joints]
+    reasons = [joint.reason for joint in describe_fit(fit, 0.03, 1000.0).joints]
     assert reasons == [
         "these poses do not separate it from b",
         "these poses do not separate it from a",
@@ -357,14 +357,16 @@ def test_plan_says_in_advance_what_its_poses_then_tell(kind: Kind) -> None:
     fit = fit_arm(model_of(log))
     candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(13))
     plan = plan_further(fit, candidates, 40)
-    expected = [j.planned_half_width for j in described(fit, 0.03, None, plan.information).joints]
+    expected = [
+        j.planned_half_width for j in describe_fit(fit, 0.03, None, plan.information).joints
+    ]
     further = log_of(kind, 14, theta=plan.theta)
     both = replace(
         log,
         theta=np.concatenate([log.theta, further.theta]),
         measured=np.concatenate([log.measured, further.measured]),
     )
-    then = [joint.half_width for joint in described(fit_arm(model_of(both)), 0.03, None).joints]
+    then = [joint.half_width for joint in describe_fit(fit_arm(model_of(both)), 0.03, None).joints]
     np.testing.assert_allclose(then[1:], np.array(expected, dtype=float)[1:], rtol=0.35)
 
 
@@ -387,7 +389,7 @@ def test_figure_shows_the_deflections_of_the_springs(kind: Kind) -> None:
 # From here on the command, its files, and what it refuses.
 
 EXAMPLE = FOLDER / "poses.csv"
-RESULT = described(fit_arm(model_of(log_of("link_encoders", 8))), 0.03, None)
+RESULT = describe_fit(fit_arm(model_of(log_of("link_encoders", 8))), 0.03, None)
 
 
 @pytest.fixture(autouse=True)
@@ -494,7 +496,9 @@ def of_elbow(compliance: float, half_width: float) -> JointStiffness:
     covariance = fit.covariance.copy()
     unknowns[own.start + 3] = compliance
     covariance[own.start + 3, own.start + 3] = (half_width / fit.quantile) ** 2
-    return described(replace(fit, unknowns=unknowns, covariance=covariance), 0.03, None).joints[3]
+    return describe_fit(replace(fit, unknowns=unknowns, covariance=covariance), 0.03, None).joints[
+        3
+    ]
 
 
 def test_an_estimate_is_written_as_it_is_and_a_negative_one_as_rigid() -> None:
@@ -521,7 +525,7 @@ def test_a_negative_estimate_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     measured[:, 3] = (
         rigid + 0.01 * (rigid - measured[:, 3]) + noise
     )  # it hardly bends, and to the wrong side
-    joints = described(fit_arm(model_of(replace(log, measured=measured))), 0.03, None)
+    joints = describe_fit(fit_arm(model_of(replace(log, measured=measured))), 0.03, None)
     assert [joint.joint for joint in joints.joints if joint.is_negative] == ["elbow"]
     file = joints.save(tmp_path)[1].read_text()
     assert (
@@ -587,10 +591,10 @@ def test_a_joint_that_turns_the_other_way_is_named(joint: str) -> None:
     arm, log = encoders(TWO, [300.0, 150.0], count=20)
     np.testing.assert_allclose(fit_of(arm, log), [300.0, 150.0], rtol=2e-3)
     with pytest.raises(ConfigurationError, match=rf"a sign is wrong \(joint .*{joint}.*\)"):
-        fit_of(arm, turned(log, joint))
+        fit_of(arm, turn_joint(log, joint))
     markers = log_of("end_effector", 8)
     with pytest.raises(ConfigurationError, match=r"a sign is wrong \(joint elbow\)"):
-        fit_arm(model_of(turned(markers, "elbow")))
+        fit_arm(model_of(turn_joint(markers, "elbow")))
 
 
 def test_soft_springs_are_identified() -> None:
@@ -622,7 +626,7 @@ def test_offsets_that_the_poses_do_not_tell_are_not_shown(
     """Catches hundreds of milliradians that are the prior's, in table and file."""
     log = log_of("link_encoders", 8)
     without_base = replace(log, columns=JOINTS[1:], measured=log.measured[:, 1:])
-    result = described(fit_arm(model_of(without_base)), 0.03, None)
+    result = describe_fit(fit_arm(model_of(without_base)), 0.03, None)
     assert result.joints[0].offset_rad is None
     assert result.joints[1].offset_rad == pytest.approx(OFFSET[1], abs=1e-3)
     Console(file=sys.stdout, width=200).print(result_table(result))
@@ -834,7 +838,7 @@ def test_a_log_that_no_springs_explain_is_refused() -> None:
     with pytest.raises(
         (ElasticError, ConfigurationError), match=r"signs|rigid|springs|tell no stiffness"
     ):
-        described(
+        describe_fit(
             fit_arm(model_of(replace(log, measured=2.0 * log.theta - log.measured))), 0.03, None
         )
 

@@ -6,7 +6,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from rich.console import Console
 
 import train.commands.compare
 from baselines.catalogue import BEST_ON_THE_WALKER
-from baselines.residual.residual import read_description
+from baselines.residual.residual_policy import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from tests.cells import METRIC, cell, describe, episode_rows, family, records
@@ -49,10 +49,11 @@ from train.evaluate.statistics import (
 )
 from train.evaluate.table import EpisodeTable, score
 from train.figures.comparison_figures import has_swept_references
-from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
-from train.report.render import render
+from train.report.render import to_terminal
+from train.report.report_text import Results
+from train.report.write import require_libraries, require_plotly, write_report
 from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
@@ -746,18 +747,16 @@ def test_learning_curves_are_shares_of_the_base_and_gaps_where_a_scenario_failed
     np.testing.assert_array_equal(found.ratios["pelvis_error_rms_rad"], [[1.0, 0.375, np.nan]])
 
 
-@pytest.mark.parametrize(
-    ("module", "require"), [("plotly.offline", require_plotly), ("jinja2", require_jinja2)]
-)
+@pytest.mark.parametrize("module", ["plotly.offline", "jinja2"])
 def test_without_its_packages_the_comparison_says_what_to_install(
-    module: str, require: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+    module: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches minutes of work that end in an import error."""
     monkeypatch.setitem(__import__("sys").modules, module, None)
     with pytest.raises(
         MissingExtraError, match=rf"report needs the package {module[:6]}; .*'\.\[report\]'"
     ):
-        require()
+        require_libraries()
 
 
 # elastic compare with residuals.
@@ -907,7 +906,7 @@ def test_tables_tell_falls_and_intervals_that_include_zero() -> None:
     for seeds, expected in ((few, "? "), ([*few, [1.0, 1.0], [3.0, 3.0]], "* ")):
         rows = changes([base, *family(seeds)])
         console = Console(width=160, record=True, file=StringIO())
-        console.print(render(cells_table([row for row in rows if row.is_family]), "terminal"))
+        console.print(to_terminal(cells_table([row for row in rows if row.is_family])))
         text = console.export_text()
         assert f"! 1/{2 * len(seeds)} (0/2)" in text
         row = next(row for row in rows if row.is_family and row.is_judged)

@@ -14,8 +14,9 @@ from baselines.compensation.policy import put_rows, select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
 from baselines.residual.features import Features
-from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
-from baselines.residual.settings import ResidualSettings
+from baselines.residual.network import Network
+from baselines.residual.residual_policy import ResidualPolicy
+from baselines.residual.settings import ResidualDescription, ResidualSettings
 from baselines.residual_env import ResidualWrapper
 from elastic_env.core.errors import ConfigurationError
 

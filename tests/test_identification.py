@@ -62,7 +62,7 @@ def synthetic(
         parts.append(
             StaticPoints(theta, imu, direction, position, np.zeros(2 * positions, dtype=np.int64))
         )
-    return StaticPoints.joined(parts)
+    return StaticPoints.join(parts)
 
 
 def parameters(result: Identification) -> list[float]:

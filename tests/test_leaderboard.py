@@ -26,7 +26,6 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.standings import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
-from train.report import Results, write_report
 from train.report.leaderboard import (
     board,
     claims_table,
@@ -38,6 +37,8 @@ from train.report.leaderboard import (
     write_leaderboard,
 )
 from train.report.render import Cell, Table, plain_text
+from train.report.report_text import Results
+from train.report.write import write_report
 from train.runs.folders import run_folder
 from train.speed.step_times import step_times
 

@@ -18,15 +18,16 @@ from elastic_env.world.scenario import make_scenario
 from tests.cells import METRIC, cell, family
 from train.commands.compare import CompareConfig
 from train.evaluate.changes import changes
-from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
+from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, vary_scenario
 from train.evaluate.episodes import Evaluation
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blend, panels
-from train.report import Results, write_report
 from train.report.change_tables import write_maps
+from train.report.report_text import Results
+from train.report.write import write_report
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -77,7 +78,7 @@ def test_a_map_plays_every_pair_of_values_in_the_environment() -> None:
 def test_a_field_within_a_sensor_is_varied_and_the_others_stay() -> None:
     """Catches an axis that sets a sensor back to its defaults."""
     nominal = make_scenario("nominal")
-    found = varied(nominal, {OFFSET: 0.002})
+    found = vary_scenario(nominal, {OFFSET: 0.002})
     assert found == nominal.replace(pelvis_imu=nominal.pelvis_imu.replace(bias_spread_rad=0.002))
     assert scenario_fields()[OFFSET] == ("half-width of a further offset, drawn per episode", "rad")
     assert (

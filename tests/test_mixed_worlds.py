@@ -215,7 +215,7 @@ def failing(env: Any) -> Any:
                 raise ValueError("too heavy")
             return super().predict(observation, *rest, **named)
 
-    return Failing(env.unwrapped.task.observation_table)
+    return Failing(env.unwrapped.assumed_model)
 
 
 def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(

@@ -20,7 +20,11 @@ from baselines.policies import sensors_needed
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.mirror import Mirror
-from baselines.residual.residual import ResidualPolicy, read_description, shipped
+from baselines.residual.residual_policy import (
+    ResidualPolicy,
+    read_description,
+    shipped_names,
+)
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import follow_zmp
@@ -414,7 +418,7 @@ def test_folders_of_before_read_as_what_they_meant() -> None:
     assert ResidualSettings(space="joint", scale=0.04).acts_on == {"command": 0.04}
     assert ResidualSettings(space="model").bounds == {"deflection": 0.6}
     assert ResidualSettings(scale={"knee": 0.2}).acts_on == {"deflection": {"knee": 0.2}}
-    for name in shipped():
+    for name in shipped_names():
         description = read_description(Path(name))
         raw = json.loads((ROOT / "baselines" / "trained" / name / "residual.json").read_text())[
             "settings"

@@ -24,7 +24,7 @@ def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = G
     model = env.unwrapped.assumed_model
     table = model.observation_table
     observation = first(env)
-    policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
+    policy = PostureFeedback(Zero(model), model, gains, ramp_s=PERIOD_S)
     observation[table.group("imu_attitude")] = attitude
     observation[table.columns("imu_rate.x", "imu_rate.y")] = rate
     state = None
@@ -85,7 +85,7 @@ def test_a_leg_in_the_air_keeps_its_pitch_and_follows_slowly() -> None:
     model = env.unwrapped.assumed_model
     table = model.observation_table
     observation = first(env)
-    policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
+    policy = PostureFeedback(Zero(model), model, gains, ramp_s=PERIOD_S)
     attitude = table.group("imu_attitude")
     share = table.group("load_share")
     observation[table.columns("imu_rate.x", "imu_rate.y")] = 0.0

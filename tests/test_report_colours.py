@@ -20,7 +20,8 @@ from train.figures.colours import (
     STRONG,
     VERDICTS,
 )
-from train.report import Results, write_report
+from train.report.report_text import Results
+from train.report.write import write_report
 from train.runs.folders import run_folder
 
 PAPER = NIGHT["white"]

@@ -28,16 +28,15 @@ from baselines.compensation.inputs import input_signals
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Channels, Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual import (
-    Network,
-    ResidualDescription,
+from baselines.residual.network import Network
+from baselines.residual.residual_policy import (
     ResidualPolicy,
     load_residual,
     read_description,
     save_residual,
-    shipped,
+    shipped_names,
 )
-from baselines.residual.settings import ResidualSettings
+from baselines.residual.settings import ResidualDescription, ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
@@ -575,7 +574,7 @@ def test_features_that_do_not_exist_are_refused(
         Features(around(vector(robot, 2), base, observe=observe))
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", shipped_names())
 def test_residuals_that_come_with_the_package_are_found_by_name(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -721,7 +720,7 @@ def test_a_residual_may_lie_behind_a_link(tmp_path: Path) -> None:
     assert load_residual(tmp_path / "latest")[0] == load_residual(path)[0]
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", shipped_names())
 def test_residuals_of_the_package_are_those_that_a_commit_of_the_history_trained(name: str) -> None:
     """Catches weights that were changed after training, or that code trained which nobody can
     look up."""

@@ -26,8 +26,9 @@ from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, worst_share_mean
 from train.learn.train_config import TrainConfig, training_worlds
-from train.report import Results, write_report
+from train.report.report_text import Results
 from train.report.score_tables import print_robots, robots_table, write_robots
+from train.report.write import write_report
 from train.runs.folders import run_folder
 
 OWN = {"load_kg": [0.0, 2.0]}

@@ -24,7 +24,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
-from baselines.residual.residual import load_residual
+from baselines.residual.residual_policy import load_residual
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -39,7 +39,7 @@ from train.learn.mixed_env import MixedVectorEnv, threads_of_each
 from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.scores import played_together
+from train.learn.scores import play_together
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
 from train.runs.folders import lock_run
@@ -316,7 +316,7 @@ def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: 
     assert row["decisions"] == 0
     metric = "link_error_rms_rad"
     begun = config.condition("nominal", f"residual:{tmp_path / 'best'}")
-    ((found, failed),) = played_together([begun], [metric])
+    ((found, failed),) = play_together([begun], [metric])
     assert not failed.any()
     assert row[metric] == row[f"base_{metric}"] == pytest.approx(found.mean(), rel=2e-5)
     assert found.mean() != row[metric]
@@ -496,7 +496,7 @@ def test_episodes_played_together_score_as_alone(env: str) -> None:
         for scenario, n in zip(config.scenarios, (2, 1, 3), strict=True)
     ]
     for (values, failed), condition in zip(
-        played_together(conditions, [metric]), conditions, strict=True
+        play_together(conditions, [metric]), conditions, strict=True
     ):
         alone = evaluate(condition, num_threads=1)
         assert values.shape == (condition.episodes, 1)

@@ -142,7 +142,7 @@ def composition(name: str, model: Any) -> Any:
     blind = WalkingController(model, com_feedback=False)
     compensated = baselines.Compensated
     return {
-        "zero": lambda: Zero(model.observation_table),
+        "zero": lambda: Zero(model),
         "uncompensated_open": lambda: blind,
         "uncompensated": lambda: plain,
         "input_open": lambda: compensated(blind, GravityCompensator(model, "none")),

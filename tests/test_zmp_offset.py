@@ -11,8 +11,9 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, SignalTable
+from elastic_env.core.signals import Array
 from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.robot_model import RobotModel
 
 OFFSET_M = np.array([0.011, -0.004])
 STEPS = 500
@@ -32,8 +33,8 @@ def vector(scenario: str = "nominal") -> Any:
 class Recorder(Zero):
     """A policy that notes how far it is asked to shift the ZMP."""
 
-    def __init__(self, table: SignalTable) -> None:
-        super().__init__(table)
+    def __init__(self, model: RobotModel) -> None:
+        super().__init__(model)
         self.shifts: list[Array] = []
 
     def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
@@ -70,7 +71,7 @@ def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
     and no limit."""
     env = vector()
     model = env.unwrapped.task.assumed_model
-    recorder = Recorder(model.observation_table)
+    recorder = Recorder(model)
     policy = ZmpOffset(recorder, model, ZmpOffsetGains(time_constant_s=2.0, limit_m=0.008))
     rows = standing(env)
     state = None

@@ -1,5 +1,6 @@
-r"""Disturbance observer of a joint with an IMU on its link: what torque the model lacks, led by as
-a deflection.
+r"""Disturbance observer of a joint with an IMU on its link.
+
+It finds the torque that the model lacks; the command leads by the deflection under it.
 
 The link obeys :math:`I \ddot q + \tau_g(q) + d = \tau_J`. Encoder and IMU show the deflection δ, so
 the model says how much torque reaches the link and how much its motion needs. What is missing is
@@ -103,8 +104,10 @@ class JointObservation(NamedTuple):
 
 
 class ObserverMemory(NamedTuple):
-    """Control steps since the start of the episode, (num_worlds, 1), what is kept of the joints,
-    and of the policy.
+    """Memory of the policy.
+
+    Control steps since the start of the episode, (num_worlds, 1), what is kept of the joints, and
+    the memory of the policy inside it.
     """
 
     steps: IntArray
@@ -129,14 +132,13 @@ class DisturbanceObserver(PolicyAround):
         self,
         policy: Policy,
         model: RobotModel,
-        gains: ObserverGains | None = None,
+        gains: ObserverGains,
         ramp_s: float = STAND_S,
     ) -> None:
+        super().__init__(policy, model)
         table = model.observation_table
-        super().__init__(policy, table, model.control_period_s)
         require_sensor(table, LINK_IMU, _LINK_ANGLE)
-        self._model = model
-        self._gains = gains or ObserverGains()
+        self._gains = gains
         self._dt = model.control_period_s
         self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
@@ -168,9 +170,8 @@ class DisturbanceObserver(PolicyAround):
             rate=zero,
             disturbance=zero,
         )
-        return ObserverMemory(
-            np.zeros((len(rows), 1), dtype=np.int64), joints, self.policy.begin(rows)
-        )
+        steps = np.zeros((len(rows), 1), dtype=np.int64)
+        return ObserverMemory(steps, joints, self.policy.begin(rows))
 
     @override
     def act(
@@ -179,7 +180,8 @@ class DisturbanceObserver(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
-        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self._model.stiffness
+        share = self._ramp.take(steps, mode="clip")
+        lead = share * joints.disturbance / self.model.stiffness
         return (action + lead).astype(np.float32), ObserverMemory(steps, joints, inner)
 
     @override
@@ -190,12 +192,13 @@ class DisturbanceObserver(PolicyAround):
     def _observe(self, rows: Array, steps: IntArray, was: JointObservation) -> JointObservation:
         """Memory of the joints after a control step."""
         gains = self._gains
-        model = self._model
+        model = self.model
         theta = self.view.theta(rows)
         imu = rows[:, self._imu].copy()
         q_ref_dot = self.view.motion(rows).q_dot
         is_zeroing = steps <= self._zero_steps
-        offset = was.offset + is_zeroing * (self._disagreement(theta, imu) - was.offset) / steps
+        missing = self._disagreement(theta, imu) - was.offset
+        offset = was.offset + is_zeroing * missing / steps
         # between two samples of the IMU the encoder goes on: the deflection is known where both are
         # new
         is_new = (imu != was.imu) | is_zeroing
@@ -215,7 +218,8 @@ class DisturbanceObserver(PolicyAround):
         needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was.rate) / self._dt)
         # at rest dry friction takes any value up to F: only what is beyond is a disturbance
         left = passed - needed - was.disturbance
-        rubs = np.where(q_ref_dot == 0.0, np.clip(left, -self._coulomb, self._coulomb), known)
+        stuck = np.clip(left, -self._coulomb, self._coulomb)
+        rubs = np.where(q_ref_dot == 0.0, stuck, known)
         missing = np.where(is_zeroing, 0.0, passed - needed - rubs)
         disturbance = was.disturbance + self._follow_share * (missing - was.disturbance)
         disturbance = np.clip(disturbance, -gains.limit_nm, gains.limit_nm)
@@ -224,8 +228,6 @@ class DisturbanceObserver(PolicyAround):
         )
 
     def _disagreement(self, theta: Array, imu: Array) -> Array:
-        """By how much the IMU shows too little, where there is no load that bends the joint,
-        else 0 [rad].
-        """
+        """By how much the IMU shows too little in a joint without load, else 0 [rad]."""
         q = self._static.link_angle(theta)
         return np.where(np.abs(theta - q) < _UNLOADED_RAD, q - imu, 0.0)

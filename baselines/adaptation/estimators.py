@@ -62,17 +62,14 @@ class Estimator(Protocol):
 
 
 class EstimatorMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the
-    observer.
-    """
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the observer's memory."""
 
     loads: Array
     observer: Any
 
 
 class LegEstimator(Estimator):
-    """r of each leg by motors, foot sensors and IMU, and joint torques where there are any; see the
-    module.
+    """r of each leg by motors, foot sensors and IMU, and by joint torques where there are any.
 
     Args:
         model: Assumed walker.
@@ -94,8 +91,8 @@ class LegEstimator(Estimator):
         seen, observer = self._observer.observe(rows, memory.observer, bending)
         load, loads = mean_load(memory.loads, seen[:, [_LOAD]])
         error = seen[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
-        joints = (((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS).reshape(len(rows), -1)
-        return joints, EstimatorMemory(loads, observer)
+        joints = ((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS
+        return joints.reshape(len(rows), -1), EstimatorMemory(loads, observer)
 
 
 class EncoderEstimator(Estimator):
@@ -128,14 +125,14 @@ class EncoderEstimator(Estimator):
         theta = rows[:, self._theta]
         q = theta - deflection
         friction = self._regression.friction(q, memory.observer)
-        h = theta - self._compensator.at(rows).link_angle(theta) + friction / self._stiffness
+        modelled = theta - self._compensator.at(rows).link_angle(theta)
+        h = modelled + friction / self._stiffness
         error, observer = self._regression.add(
             h, deflection, friction, q, memory.observer, measured=has
         )
         force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
-        load, loads = mean_load(
-            memory.loads, force.sum(axis=1, keepdims=True) / self._carried - 1.0
-        )
+        excess = force.sum(axis=1, keepdims=True) / self._carried - 1.0
+        load, loads = mean_load(memory.loads, excess)
         return (1.0 + has * error) * (1.0 + load) - 1.0, EstimatorMemory(loads, observer)
 
 
@@ -145,15 +142,12 @@ class LinkEncoderEstimator(Estimator):
     Args:
         model: Assumed robot on a fixed base.
         sensors: Its link encoders.
-        prior: What is known of r before it is measured.
     """
 
-    def __init__(
-        self, model: RobotModel, sensors: DeflectionSensors, prior: StiffnessPrior = ARM_PRIOR
-    ) -> None:
+    def __init__(self, model: RobotModel, sensors: DeflectionSensors) -> None:
         self._sensors = sensors
-        self._regression = StiffnessRegression(model, prior)
-        self._view = ObservationView(model.observation_table, model.control_period_s)
+        self._regression = StiffnessRegression(model, ARM_PRIOR)
+        self._view = ObservationView(model)
         self._body = make_dynamics(model, GravityCompensator(model).gravity)
         self._stiffness = model.stiffness
         self._viscous = model.viscous_friction
@@ -168,17 +162,23 @@ class LinkEncoderEstimator(Estimator):
         motion = self._view.motion(rows)
         q = self._view.theta(rows) - deflection
         friction = self._regression.friction(q, memory)
-        torque = (
-            self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
-            + self._viscous * motion.q_dot
-        )
+        torque = self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
+        torque = torque + self._viscous * motion.q_dot
         h = (torque + friction) / self._stiffness
         return self._regression.add(h, deflection, friction, q, memory, measured=self._sensors.has)
 
 
+def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
+    """The estimator that makes the most of a robot's sensors."""
+    if not isinstance(model, WalkerModel):
+        return LinkEncoderEstimator(model, sensors)
+    if sensors.are_torques:
+        return LegEstimator(model, sensors)
+    return EncoderEstimator(model, sensors)
+
+
 def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
-    """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of
-    measurements.
+    """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum.
 
     Args:
         memory: Number and sum, (num_worlds, 2).

@@ -1,5 +1,6 @@
-"""A policy whose offsets are learned from trial to trial on the robot itself, see
-`iterative_learning`.
+"""A policy whose offsets are learned from trial to trial on the robot itself.
+
+`iterative_learning` has the law.
 
 It needs no simulation, no model beside that of its base, and no truth: the trials are episodes of
 the environment that it is given, which may be hardware. What it has learned is a table of offsets
@@ -48,7 +49,7 @@ class LearnedOffsets(PolicyAround):
     def __init__(
         self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
+        super().__init__(policy, model)
         self._signals = signals
         self._ramp = Ramp(model, ramp_s)
         self._period_s = model.control_period_s
@@ -61,8 +62,9 @@ class LearnedOffsets(PolicyAround):
         return self._signals.names
 
     def play(self, tables: Array) -> None:
-        """Take other offsets, (num_worlds or 1, T, k); row t acts in the period that ends t
-        periods after the start.
+        """Take other offsets, (num_worlds or 1, T, k).
+
+        Row t acts in the period that ends t periods after the start.
         """
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
         self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
@@ -130,8 +132,7 @@ class IterativeLearner(LearnedOffsets):
         self.trials = trials
 
     def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] | None = None) -> None:
-        """Learn in an environment, on the robots that its `reset(seed=seed)` draws; what was
-        learned before is dropped.
+        """Learn on the robots that `env.reset(seed=seed)` draws; earlier learning is dropped.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.
@@ -233,8 +234,6 @@ class Stage:
 
 
 def _seed_of_noise(robot: int, number: int) -> int:
-    """Seed of a trial's noise, other than that of any other trial and of the robot's own
-    episode.
-    """
+    """Seed of a trial's noise, unlike that of any other trial and of the robot's own episode."""
     sequence = np.random.SeedSequence([robot, number])
     return int(sequence.generate_state(1, np.uint64)[0] >> 1)

@@ -1,5 +1,4 @@
-r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at
-the same time.
+r"""Iterative learning control: the errors of a trial correct the offsets of the next one.
 
 .. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
 
@@ -57,11 +56,9 @@ class ChannelGains(Model):
 
     def gain_of(self, trial: int) -> float:
         """Learning gain of a trial, 0 for the first."""
-        return (
-            self.gain
-            if self.halved_after is None
-            else self.gain / (1.0 + trial / self.halved_after)
-        )
+        if self.halved_after is None:
+            return self.gain
+        return self.gain / (1.0 + trial / self.halved_after)
 
 
 def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
@@ -72,9 +69,8 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
         cutoff_hz: Where the amplitude is halved [Hz].
         period_s: Time between rows [s].
     """
-    from scipy import (
-        signal,
-    )  # here: it takes half a second to load, and most programs need none of it
+    # here: most programs need none of it, and it loads for half a second
+    from scipy import signal
 
     sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
     longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends
@@ -83,9 +79,7 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
 
 def lead_error(error: Array, steps: int) -> Array:
     """Error that comes some steps later, at every step, (T, ...); its last value behind the end."""
-    return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[
-        : len(error)
-    ]
+    return error[np.minimum(np.arange(len(error)) + steps, len(error) - 1)]
 
 
 def limit_surprise(error: Array, before: Array, surprise: float | Array) -> Array:
@@ -117,7 +111,6 @@ def update(
     for column, own in enumerate(gains):
         leading = lead_error(error[:, column], round(own.lead_s / period_s))
         wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * leading
-        following[:, column] = np.clip(
-            zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit
-        )
+        smooth = zero_phase(wanted, own.cutoff_hz, period_s)
+        following[:, column] = np.clip(smooth, -own.limit, own.limit)
     return following

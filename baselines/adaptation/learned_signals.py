@@ -1,5 +1,4 @@
-r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the
-joints correct them.
+r"""Signals that are learned from trial to trial: errors, and the offsets that correct them.
 
 | robot | error, by sensors alone | correction |
 |---|---|---|
@@ -107,9 +106,7 @@ class WalkSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        """Tilt, and error of the ZMP as if the feet were flat where they are planned,
-        (num_worlds, 4).
-        """
+        """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
         return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
 
     def measured_zmp(self, seen: Array) -> Array:
@@ -150,9 +147,10 @@ class JointSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        link = (
-            np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
-        )
+        if self._encoder is None:
+            link = np.reshape(info[LINK_IMU], (-1, 1))
+        else:
+            link = seen[:, self._encoder]
         return asked[:, self._reference] - link
 
     @override
@@ -162,6 +160,6 @@ class JointSignals(LearnedSignals):
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
     """Signals that are learned of a robot."""
-    return (
-        WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)
-    )
+    if isinstance(model, WalkerModel):
+        return WalkSignals(model, gains)
+    return JointSignals(model, gains)

@@ -1,5 +1,6 @@
-"""A compensated policy whose model of the joints is corrected while the robot walks, as adaptive
-control does.
+"""A compensated policy whose model of the joints is corrected while the robot walks.
+
+Adaptive control does the same.
 
 The deflection that is compensated, and seen, is (1 + r) times that of the model. An estimator of
 `baselines.adaptation.estimators` says r every tenth of a second, and a first-order filter smooths
@@ -51,8 +52,7 @@ class StiffnessMemory(NamedTuple):
 
 
 class OnlineStiffness(PolicyAround):
-    """A compensated policy whose model of the joints is corrected by what is measured, see the
-    module.
+    """A compensated policy whose model of the joints is corrected by what is measured.
 
     Args:
         policy: The policy that is corrected; it has the input `deflection`.
@@ -66,10 +66,9 @@ class OnlineStiffness(PolicyAround):
         policy: Policy,
         model: RobotModel,
         estimator: Estimator,
-        gains: AdaptationGains | None = None,
+        gains: AdaptationGains,
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
-        gains = gains or AdaptationGains()
+        super().__init__(policy, model)
         self._estimator = estimator
         self._every = max(round(gains.period_s / model.control_period_s), 1)
         self._gain = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s))
@@ -79,9 +78,8 @@ class OnlineStiffness(PolicyAround):
     def begin(self, rows: Array) -> StiffnessMemory:
         wait = np.zeros(len(rows), dtype=np.int64)
         zero = np.zeros((len(rows), self.view.num_joints))
-        return StiffnessMemory(
-            wait, zero, zero, self._estimator.begin(len(rows)), self.policy.begin(rows)
-        )
+        estimator = self._estimator.begin(len(rows))
+        return StiffnessMemory(wait, zero, zero, estimator, self.policy.begin(rows))
 
     @override
     def act(
@@ -94,11 +92,14 @@ class OnlineStiffness(PolicyAround):
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
             wait[due] = self._every - 1
-            estimate, estimated = self._estimator.estimate(rows[due], select_rows(estimator, due))
+            before = select_rows(estimator, due)
+            estimate, estimated = self._estimator.estimate(rows[due], before)
             target = put_rows(target, due, np.clip(estimate, -self._limit, self._limit))
             estimator = put_rows(estimator, due, estimated)
         correction = memory.correction + self._gain * (target - memory.correction)
-        further = inputs.deflection
-        together = correction if further is None else (1.0 + correction) * (1.0 + further) - 1.0
-        action, inner = self.policy.act(rows, memory.inner, inputs._replace(deflection=together))
+        together = correction
+        if inputs.deflection is not None:
+            together = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
+        inputs = inputs._replace(deflection=together)
+        action, inner = self.policy.act(rows, memory.inner, inputs)
         return action, StiffnessMemory(wait, target, correction, estimator, inner)

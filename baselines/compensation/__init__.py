@@ -1,3 +1,1 @@
-"""The analytic compensators: gravity torque, output and input compensation (Eqs. 1 to 6), the
-oracle.
-"""
+"""The analytic compensators: gravity torque, output and input compensation, the oracle."""

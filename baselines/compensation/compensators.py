@@ -1,5 +1,4 @@
-r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and from the full joint
-torque.
+r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), full joint torque.
 
 An input compensator says by how much the motor side has to lead so that the link is where it should
 be; an output compensator says where the link is when the motor encoder shows θ. All work on (...,
@@ -10,26 +9,36 @@ n) arrays.
 
 import math
 from abc import abstractmethod
-from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, Protocol, Self, TypeVar, get_args
 
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.contact_torque import LegTorque
+from baselines.compensation.contact_torque import LegTorque, WrenchTorque, shift_plan
 from baselines.compensation.gravity_torque import (
-    FixedGravity,
+    FixedTorque,
     GravityMethod,
     GravityModel,
     make_dynamics,
     make_gravity,
-    make_load,
 )
-from baselines.compensation.policy import Motion
+from baselines.compensation.inputs import DEFLECTION
+from baselines.compensation.policy import (
+    Motion,
+    Policy,
+    PolicyAround,
+    PolicyInputs,
+    WalkView,
+    put_rows,
+    select_rows,
+)
+from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, record_type
-from elastic_env.core.errors import require_known
-from elastic_env.core.signals import Array, Parameter
+from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
-from elastic_env.world.robot_model import RobotModel
+from elastic_env.motion.trajectory import STAND_S
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 
@@ -37,8 +46,9 @@ OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 def input_offset(
     q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0
 ) -> Array:
-    r"""Eq. 9, θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way: the offset that
-    brings the link to θ_d.
+    r"""Eq. 9: the offset that brings the link to θ_d.
+
+    It is θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way.
 
     .. math:: u - q = \left(K^{-1} + k_p^{-1}\right) \tau_g(q)
 
@@ -78,15 +88,17 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
 
 
 def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
-    """Eq. 10 solved by Newton-Raphson from q = θ; arguments and errors as `taylor_link_angle`,
-    residual below 1e-12.
+    """Eq. 10 solved by Newton-Raphson from q = θ, to a residual below 1e-12.
+
+    Arguments and errors are those of `taylor_link_angle`.
     """
     return static_link_angle(theta, stiffness, gravity.gravity_torque, gravity.gravity_gradient)
 
 
 class Compensator(Protocol):
-    """An input offset for a motion, and a link angle for an encoder angle: what
-    `baselines.Compensated` needs.
+    """An input offset for a motion, and a link angle for an encoder angle.
+
+    `baselines.Compensated` needs both.
 
     `memory` has one row per world: an array, or a named tuple of arrays.
     """
@@ -107,15 +119,11 @@ class Compensator(Protocol):
 
     @abstractmethod
     def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
-        """Command offset for the coming control period, (num_worlds, n) [rad], and the new
-        memory.
-        """
+        """Command offset for the coming control period, (num_worlds, n) [rad], and new memory."""
 
     @abstractmethod
     def deflection(self, offset: Array, memory: Any) -> Array:
-        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n)
-        [rad].
-        """
+        """Deflection δ that an offset leads by, as `offset` returned it, (num_worlds, n) [rad]."""
 
     @abstractmethod
     def link_angle(self, theta: Array, memory: Any) -> Array:
@@ -153,12 +161,19 @@ class GravityCompensator(Compensator):
         self._per_deflection = 1.0 + self.stiffness * self._servo_compliance
         self.gravity = make_gravity(model, method)
         """τ_g of the desired posture."""
-        self._load = make_load(model, output, self.gravity)  # of the measured posture
+        self._load: Any = self.gravity  # of the measured posture
         self._output = output
+        if output == "wrench":
+            if not isinstance(model, WalkerModel):
+                raise ConfigurationError(
+                    "the output compensator 'wrench' needs a walker with force-torque sensors at"
+                    " its feet"
+                )
+            self._load = WrenchTorque(model)
 
     @override
     def at(self, rows: Array) -> "GravityCompensator":
-        if isinstance(self.gravity, FixedGravity):
+        if isinstance(self.gravity, FixedTorque):
             return self
         bound = shallow_copy(self)
         if self._load is self.gravity:
@@ -191,8 +206,9 @@ class GravityCompensator(Compensator):
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """The derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇, at the estimated link angle,
-        (num_worlds, n) [rad/s].
+        """Rate at the estimated link angle, (num_worlds, n) [rad/s].
+
+        It is the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇.
         """
         if self._output == "none":
             return theta_dot
@@ -254,7 +270,7 @@ class DynamicCompensator(Compensator):
             self._drives[name] = [getattr(servo, name) for servo in model.servos]
 
     @override
-    def at(self, rows: Array) -> "DynamicCompensator":
+    def at(self, rows: Array) -> Self:
         static = self._static.at(rows)
         if static is self._static:
             return self
@@ -263,7 +279,7 @@ class DynamicCompensator(Compensator):
         bound._body = self._body.at(rows, static.gravity)
         return bound
 
-    def with_stiffness(self, stiffness: Array) -> "DynamicCompensator":
+    def with_stiffness(self, stiffness: Array) -> Self:
         """The compensator with another K, also one for every world, (..., n) [N·m/rad]."""
         stiffer = shallow_copy(self)
         stiffer._stiffness = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
@@ -280,15 +296,12 @@ class DynamicCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: DriveMemory) -> tuple[Array, DriveMemory]:
-        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the memory for the
-        next step.
+        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the new memory.
 
         The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
         """
-        torque = (
-            self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
-            + self._viscous * motion.q_dot
-        )
+        torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
+        torque = torque + self._viscous * motion.q_dot
         friction = memory.friction
         if self._coulomb is not None:
             friction = presliding_friction(friction, motion.q_dot * self._dt, self._coulomb)
@@ -311,10 +324,10 @@ class DynamicCompensator(Compensator):
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
-        """Link angle by the deflection of the desired motion, or by the measured wrenches,
-        (num_worlds, n) [rad].
-        """
-        return self._static.link_angle(theta) if self._measures else theta - memory.deflection
+        """Link angle by the desired motion's deflection, or by the measured wrenches [rad]."""
+        if self._measures:
+            return self._static.link_angle(theta)
+        return theta - memory.deflection
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
@@ -358,8 +371,9 @@ def settle(
 def servo_error(
     theta_dot: Array, theta_ddot: Array, torque: Array, windup: Array, drives: Any, period_s: float
 ) -> tuple[Array, Array]:
-    """Errors that servos need to move rotors under their loads, [rad], and their integrals after a
-    control period.
+    """Errors that servos need to move rotors under loads [rad], and their integrals [rad·s].
+
+    The integrals are those after a control period.
 
     Args:
         theta_dot: Rates of the motor sides, (worlds, n) [rad/s].
@@ -381,16 +395,16 @@ def servo_error(
                 integrals[world, i] = follow_lag(
                     windup[world, i], effort / drive.integral_gain, time_s, period_s
                 )
-            errors[world, i] = (
-                effort - drive.integral_gain * integrals[world, i]
-            ) / drive.position_gain
+            effort -= drive.integral_gain * integrals[world, i]
+            errors[world, i] = effort / drive.position_gain
     return errors, integrals
 
 
 @compiled
 def follow_lag(state: float, target: float, time_constant_s: float, period_s: float) -> float:
-    """State of a first-order lag after one period towards a constant target; no lag for a time
-    constant of zero.
+    """State of a first-order lag after one period towards a constant target.
+
+    There is no lag for a time constant of zero.
     """
     return target + math.exp(-period_s / time_constant_s) * (state - target)
 
@@ -400,8 +414,9 @@ PRESLIDING_RAD = 1e-3
 
 
 def presliding_friction(friction: Array, displacement: Array, coulomb: Array) -> Array:
-    r"""Coulomb friction with presliding: it turns round over a displacement, and stays at rest
-    [Dahl1968].
+    r"""Coulomb friction with presliding [Dahl1968].
+
+    It turns round over a displacement, and stays at rest.
 
     .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
 
@@ -429,3 +444,116 @@ def shallow_copy(compensator: _T) -> _T:
     other = object.__new__(type(compensator))
     other.__dict__.update(compensator.__dict__)
     return other
+
+
+class CompensatedMemory(NamedTuple):
+    """Memory of a compensated policy.
+
+    Attributes:
+        steps: Control steps since the start of the episode, (num_worlds, 1).
+        links: Link angles that the policy saw, (num_worlds, n) [rad].
+        compensator: Memory of the compensator.
+        inner: Memory of the policy.
+    """
+
+    steps: IntArray
+    links: Array
+    compensator: Any
+    inner: Any
+
+
+class Compensated(PolicyAround):
+    """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
+
+    The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees
+    the estimated link angle and rate where the observation has the encoder's; the compensator's
+    offset for q_d is added to its action. The compensation grows from zero in the first `ramp_s` of
+    an episode, while the reference stands.
+
+    Args:
+        policy: Anything with `predict`; its state may be anything. One that does not read joint
+            rates can say so by an attribute `reads_rates = False`, which saves their estimate.
+        compensator: Where the motor has to lead, and where the link is: an object with the
+            attributes and methods of `baselines.compensation.compensators.Compensator`.
+        ramp_s: Duration of the ramp.
+        corrects_policy: Whether the input `deflection` also reaches the policy, as one that winds
+            springs needs it.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        compensator: Compensator,
+        ramp_s: float = STAND_S,
+        corrects_policy: bool = False,
+    ) -> None:
+        model = compensator.model
+        super().__init__(policy, model)
+        self.compensator = compensator
+        self._theta = model.observation_table.group("encoder_angle")
+        self._corrects_policy = corrects_policy
+        self._ramp = Ramp(model, ramp_s).table
+        self._plan: tuple[WalkView, float] | None = None
+        if isinstance(model, WalkerModel):
+            self._plan = WalkView(model.observation_table), model.biped.foot_spacing
+
+    @property
+    @override
+    def inputs(self) -> tuple[str, ...]:
+        return (DEFLECTION, *self.policy.inputs)
+
+    @override
+    def begin(self, rows: Array) -> CompensatedMemory:
+        motion = self.view.motion(rows)
+        memory = self.compensator.at(rows).begin(motion)
+        steps = np.zeros((len(rows), 1), dtype=np.int64)
+        return CompensatedMemory(steps, motion.q.copy(), memory, self.policy.begin(rows))
+
+    @override
+    def act(
+        self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs
+    ) -> tuple[Array, CompensatedMemory]:
+        """It takes the input `deflection`, r: what is compensated, and seen, is (1 + r) δ.
+
+        The contact forces that load the joints act where the inputs shift the ZMP.
+        """
+        correction = inputs.deflection
+        own = memory.compensator
+        if self._plan is not None and (shift := inputs.zmp_shift) is not None:
+            view, foot_spacing = self._plan
+            rows = rows.copy()
+            shift_plan(view.fields(rows), np.ascontiguousarray(shift), foot_spacing)
+            own = self._begin_shifted(rows, memory)
+        compensator = self.compensator.at(rows)
+        theta = rows[:, self._theta]
+        links = compensator.link_angle(theta, own)
+        if correction is not None:
+            links = links - compensator.modelled * correction * (theta - links)
+            if not self._corrects_policy:
+                inputs = inputs._replace(deflection=None)
+        rates = None
+        if self.policy.reads_rates:
+            rates = compensator.link_rate(theta, self.view.theta_dot(rows))
+        seen = self.view.with_links(rows, links, rates)
+        action, inner = self.policy.act(seen, memory.inner, inputs)
+        wanted = action.astype(np.float64)
+        motion = self.view.motion(rows)
+        desired = Motion(motion.q + wanted, motion.q_dot, motion.q_ddot)
+        offset, own = compensator.offset(desired, own)
+        if correction is not None:
+            offset = offset + correction * compensator.deflection(offset, own)
+        steps = memory.steps + 1
+        total = (wanted + self._ramp.take(steps, mode="clip") * offset).astype(np.float32)
+        return total, CompensatedMemory(steps, links.copy(), own, inner)
+
+    @override
+    def link_angles(self, rows: Array, memory: CompensatedMemory) -> Array:
+        return memory.links
+
+    def _begin_shifted(self, rows: Array, memory: CompensatedMemory) -> Any:
+        """Memory of the compensator, begun under the shifted plan where an episode begins."""
+        if np.count_nonzero(memory.steps) == len(rows):
+            return memory.compensator
+        fresh = memory.steps[:, 0] == 0
+        begun = self.compensator.at(rows).begin(self.view.motion(rows))
+        return put_rows(memory.compensator, fresh, select_rows(begun, fresh))

@@ -1,5 +1,4 @@
-r"""Joint torques of a walker at rest on its feet: Eqs. 4 to 6 of the paper, and from measured foot
-wrenches.
+r"""Joint torques of a walker on its feet: Eqs. 4 to 6 of the paper, and from foot wrenches.
 
 The paper takes τ_g = J_r^T F_r + J_l^T F_l with Jacobians from the center of mass to the contact
 points. Where the contact point is, and what of the robot has mass, is chosen by name:
@@ -50,8 +49,9 @@ class LegTorque(NamedTuple):
         return self.chains.torque(self.loads, q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns
-        with its foot.
+        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad].
+
+        It is not symmetric under a wrench, which turns with its foot.
         """
         return self.chains.gradient(self.loads, q)
 
@@ -110,18 +110,15 @@ class ContactGravity:
         return self.level_and_tilted(rows)[0 if level else 1]
 
     def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
-        """The gravity torques of `at` with a level pelvis, and with one that is tilted as the
-        IMU says.
-        """
+        """The gravity torques of `at` for a level pelvis, and for one tilted as the IMU says."""
         level = np.empty(len(rows), LOADS)
         tilted = np.empty(len(rows), LOADS)
-        planned_loads(self._view.fields(rows), contact=self._contact, level=level, tilted=tilted)
+        planned_loads(self._view.fields(rows), self._contact, level, tilted)
         return LegTorque(self._chains, level), LegTorque(self._chains, tilted)
 
 
 class WrenchTorque:
-    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs above
-    the sensors.
+    """Torque of a walker's joints from foot wrenches and the weight of the legs above the sensors.
 
     Args:
         model: Assumed walker.
@@ -133,17 +130,17 @@ class WrenchTorque:
         self._gravity = model.biped.gravity
 
     def at(self, rows: Array, level: bool = False) -> LegTorque:
-        """The torque under the wrenches of observations, (num_worlds, m); `level` as in
-        `ContactGravity.at`.
+        """The torque under the wrenches of observations, (num_worlds, m).
+
+        `level` is that of `ContactGravity.at`.
         """
         loads = np.empty(len(rows), LOADS)
-        measured_loads(self._view.fields(rows), gravity=self._gravity, is_level=level, loads=loads)
+        measured_loads(self._view.fields(rows), self._gravity, level, loads)
         return LegTorque(self._chains, loads)
 
 
 class PlannedTorque:
-    """Torque of the planned motion by inverse dynamics, and the static torque of what is commanded
-    beside it.
+    """Torque of the planned motion by inverse dynamics, and the static torque of offsets from it.
 
     Args:
         model: Assumed walker.
@@ -157,15 +154,15 @@ class PlannedTorque:
         self._reference = model.observation_table.group("reference_angle")
 
     def at(self, rows: Array, gravity: LegTorque | None = None) -> "BoundPlannedTorque":
-        """The torque at the control steps of observations, (num_worlds, m); `gravity` is the
-        static one, if known.
+        """The torque at the control steps of observations, (num_worlds, m).
+
+        `gravity` is the static one, if known.
         """
         plan = self._model.plan
         row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
         torque = plan.torque.take(row, axis=0, mode="clip")
-        return BoundPlannedTorque(
-            torque, rows[:, self._reference], gravity or self._gravity.at(rows)
-        )
+        gravity = gravity or self._gravity.at(rows)
+        return BoundPlannedTorque(torque, rows[:, self._reference], gravity)
 
 
 class BoundPlannedTorque(NamedTuple):
@@ -177,9 +174,8 @@ class BoundPlannedTorque(NamedTuple):
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
         """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
-        return self.torque + (
-            self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
-        )
+        planned = self.gravity.gravity_torque(self.q_ref)
+        return self.torque + (self.gravity.gravity_torque(q) - planned)
 
 
 @compiled
@@ -200,9 +196,8 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
         share = plan.load_share
         for foot in range(2):
             weight = share if foot == 1 else 1.0 - share
-            load.mass[foot] = (
-                -ground.mass * weight
-            )  # what the ground carries is a negative mass where it does
+            # what the ground carries is a negative mass where it does
+            load.mass[foot] = -ground.mass * weight
             for i in range(2):
                 middle = (1.0 - share) * ground.footholds[0, i] + share * ground.footholds[1, i]
                 load.point[foot, i] = plan.zmp_reference[i] - middle if ground.is_at_zmp else 0.0
@@ -276,8 +271,7 @@ def shift_plan(observed: Any, shift: Array, spacing: float) -> None:
 def shifted_shares(
     observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array
 ) -> None:
-    """Load shares of the right foot at the end of the last control period, under a ZMP that is
-    shifted.
+    """Load shares of the right foot after the last control period, under a shifted ZMP.
 
     Args:
         observed: Observations, rows with fields, (n,).

@@ -4,7 +4,6 @@
 form for one hinge, link by link for a tree of them. Both agree to rounding.
 """
 
-from collections.abc import Callable
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -13,7 +12,6 @@ from baselines.compensation.contact_torque import (
     ContactGravity,
     ContactMethod,
     PlannedTorque,
-    WrenchTorque,
 )
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
@@ -35,39 +33,21 @@ class GravityModel(Protocol):
         ...
 
 
-class FixedGravity:
-    """Gravity torque of a robot that stands on nothing but its base: the same at every control
-    step.
-    """
+class FixedTorque:
+    """Torques of a robot on a fixed base, whose loads are the same at every control step."""
 
-    def __init__(self, gravity: GravityModel) -> None:
-        self.gravity_torque = gravity.gravity_torque
-        self.gravity_gradient = gravity.gravity_gradient
+    def __init__(self, torque: "HingeTorque | RigidBody") -> None:
+        self.gravity_torque = torque.gravity_torque
+        self.gravity_gradient = torque.gravity_gradient
+        self.inverse_dynamics = torque.inverse_dynamics
 
-    def at(self, rows: Array, level: bool = True) -> "FixedGravity":  # noqa: ARG002  a walker's
-        """Itself."""
-        return self
-
-
-class FixedDynamics:
-    """Inverse dynamics of a robot on a fixed base."""
-
-    def __init__(self, model: RobotModel) -> None:
-        body = (
-            HingeTorque(model)
-            if _is_plain_hinge(model)
-            else RigidBody(model.rigid, model.joint_names)
-        )
-        self.inverse_dynamics = body.inverse_dynamics
-
-    def at(self, rows: Array, gravity: Any = None) -> "FixedDynamics":  # noqa: ARG002  a walker's
+    def at(self, rows: Array, gravity: Any = None) -> "FixedTorque":  # noqa: ARG002  a walker's
         """Itself."""
         return self
 
 
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
-    """The gravity torque of a robot model by a chosen method; a `GravityModel` after
-    `at(observations)`.
+    """The gravity torque of a robot by a chosen method; a `GravityModel` after `at(observations)`.
 
     A robot on a fixed base has "hinge" (default for one joint) and "tree" (default for several),
     and is a `GravityModel` at once; a walker has the methods of
@@ -80,45 +60,25 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         chosen: Any = method or "com"
         require_known("gravity method of a walker", [chosen], get_args(ContactMethod))
         return ContactGravity(model, chosen)
-    methods: dict[str, Callable[[RobotModel], GravityModel]] = {
-        "hinge": HingeTorque,
-        "tree": lambda model: RigidBody(model.rigid, model.joint_names),
-    }
-    chosen = method or ("hinge" if _is_plain_hinge(model) else "tree")
-    require_known("gravity method", [chosen], methods)
-    if chosen != "tree" and needs_more_than_gravity(model.rigid):
+    is_more_than_gravity = needs_more_than_gravity(model.rigid)
+    is_plain_hinge = len(model.joint_names) == 1 and not is_more_than_gravity
+    chosen = method or ("hinge" if is_plain_hinge else "tree")
+    require_known("gravity method", [chosen], ("hinge", "tree"))
+    if chosen == "tree":
+        return FixedTorque(RigidBody(model.rigid, model.joint_names))
+    if is_more_than_gravity:
         raise ConfigurationError(
-            f"gravity method {chosen!r} knows gravity alone, and this model has springs of joints"
+            "gravity method 'hinge' knows gravity alone, and this model has springs of joints"
             " or gravcomp; choose tree"
         )
-    return FixedGravity(methods[chosen](model))
-
-
-def _is_plain_hinge(model: RobotModel) -> bool:
-    """True where the closed form of one hinge holds."""
-    return len(model.joint_names) == 1 and not needs_more_than_gravity(model.rigid)
-
-
-def make_load(model: RobotModel, output: str, gravity: Any) -> Any:
-    """The torque that an output compensator takes: of gravity, or of the measured foot wrenches.
-
-    Raises:
-        ConfigurationError: The robot has no feet.
-    """
-    if output != "wrench":
-        return gravity
-    if not isinstance(model, WalkerModel):
-        raise ConfigurationError(
-            "the output compensator 'wrench' needs a walker with force-torque sensors at its feet"
-        )
-    return WrenchTorque(model)
+    return FixedTorque(HingeTorque(model))
 
 
 def make_dynamics(model: RobotModel, gravity: Any) -> Any:
-    """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a
-    walker.
-    """
-    return PlannedTorque(model, gravity) if isinstance(model, WalkerModel) else FixedDynamics(model)
+    """Inverse dynamics: of any motion on a fixed base, of the planned one for a walker."""
+    if isinstance(model, WalkerModel):
+        return PlannedTorque(model, gravity)
+    return make_gravity(model)
 
 
 class HingeTorque:
@@ -155,7 +115,5 @@ class HingeTorque:
         return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
-        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to (...,
-        1) [N·m].
-        """
+        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to [N·m]."""
         return self._inertia * q_ddot + self.gravity_torque(q)

@@ -1,5 +1,4 @@
-"""Named inputs of a base policy: the quantities of its own in which something outside, such as a
-residual, may act.
+"""Named inputs of a base policy: its own quantities in which a residual may act.
 
 Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the
 base to the last bit. An input acts on the quantity that the base itself plans or feeds back, so
@@ -89,19 +88,15 @@ Every policy has `command`; a policy's `inputs` names the others that it has.
 def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
     """The columns of an input as signals, which say what each is in the mirror."""
     kind = INPUTS[name]
-    if kind.axes is not None:
-        return tuple(
-            Signal(f"{name}.{axis}", kind.unit, kind.meaning, mirrored=m)
-            for axis, m in kind.axes.items()
-        )
-    signs: list[Mirrored | None] = ["same"] * len(
-        model.joint_names
-    )  # a relative change has no direction
+    columns: dict[str, Mirrored | None] = {**(kind.axes or {})}
+    if kind.axes is None:  # a relative change has no direction
+        columns = dict.fromkeys(model.joint_names, "same")
     if name == COMMAND:
-        signs = [signal.mirrored for signal in model.observation_table.signals_of("last_command")]
-    named = zip(model.joint_names, signs, strict=True)
+        commands = model.observation_table.signals_of("last_command")
+        columns = dict(zip(columns, [signal.mirrored for signal in commands], strict=True))
     return tuple(
-        Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named
+        Signal(f"{name}.{column}", kind.unit, kind.meaning, mirrored=mirrored)
+        for column, mirrored in columns.items()
     )
 
 

@@ -11,13 +11,18 @@ The command leads by the model's deflection instead, which `baselines.adaptation
 what is measured.
 """  # noqa: E501
 
-from typing import Any
+from typing import Self
 
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import Compensator, shallow_copy
-from baselines.compensation.policy import Motion
+from baselines.compensation.compensators import (
+    DriveMemory,
+    DynamicCompensator,
+    OutputMethod,
+    shallow_copy,
+)
+from baselines.compensation.gravity_torque import GravityMethod
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 from elastic_env.world.robot_model import RobotModel
@@ -54,6 +59,7 @@ class DeflectionSensors:
 
     Attributes:
         has: Which joints have it, (n,).
+        are_torques: They measure torques, not link angles.
         modelled: 1 where δ follows from the assumed K, 0 where it does not, (n,) [1].
 
     Raises:
@@ -64,7 +70,7 @@ class DeflectionSensors:
         table = model.observation_table
         require_sensor(table, sensor)
         self._stiffness = model.stiffness
-        self._is_torque = sensor == TORQUE_SENSOR
+        self.are_torques = sensor == TORQUE_SENSOR
         self._columns = table.group(sensor)
         self._encoder = table.group("encoder_angle")
         self.has: BoolArray = np.array(
@@ -75,54 +81,44 @@ class DeflectionSensors:
     def deflection(self, rows: Array) -> Array:
         """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
         shown = rows[:, self._columns]
-        return self.has * (
-            shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown
-        )
+        if self.are_torques:
+            return self.has * (shown / self._stiffness)
+        return self.has * (rows[:, self._encoder] - shown)
 
 
-class MeasuredCompensator(Compensator):
+class MeasuredCompensator(DynamicCompensator):
     """A compensator whose links are those of sensors where there are any.
 
     Args:
-        base: Compensator for the command, and for the links of joints without a sensor.
-        sensors: Of the joints.
+        model: Assumed robot.
+        sensors: Of the joints; links of joints without a sensor follow from the model, and so do
+            all rates.
+        output: As of `DynamicCompensator`.
+        method: As of `DynamicCompensator`.
     """
 
-    def __init__(self, base: Compensator, sensors: DeflectionSensors) -> None:
-        self.model = base.model
-        self._base = base
+    def __init__(
+        self,
+        model: RobotModel,
+        sensors: DeflectionSensors,
+        output: OutputMethod,
+        method: GravityMethod | None = None,
+    ) -> None:
+        super().__init__(model, output, method)
         self._sensors = sensors
         self.modelled = sensors.modelled
         self._measures_all = bool(sensors.has.all())
-        self._deflection: Array = np.zeros(len(base.model.joint_names))
+        self._deflection: Array = np.zeros(len(model.joint_names))
 
     @override
-    def at(self, rows: Array) -> "MeasuredCompensator":
-        bound = shallow_copy(self)
-        bound._base = self._base.at(rows)
+    def at(self, rows: Array) -> Self:
+        bound = shallow_copy(super().at(rows))
         bound._deflection = self._sensors.deflection(rows)
         return bound
 
     @override
-    def begin(self, motion: Motion) -> Any:
-        return self._base.begin(motion)
-
-    @override
-    def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
-        return self._base.offset(motion, memory)
-
-    @override
-    def deflection(self, offset: Array, memory: Any) -> Array:
-        return self._base.deflection(offset, memory)
-
-    @override
-    def link_angle(self, theta: Array, memory: Any) -> Array:
+    def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
         measured = theta - self._deflection
         if self._measures_all:
             return measured
-        return np.where(self._sensors.has, measured, self._base.link_angle(theta, memory))
-
-    @override
-    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """The rate by the model, (num_worlds, n) [rad/s]."""
-        return self._base.link_rate(theta, theta_dot)
+        return np.where(self._sensors.has, measured, super().link_angle(theta, memory))

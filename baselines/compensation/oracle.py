@@ -60,7 +60,7 @@ class Oracle(PolicyAround):
     ) -> None:
         self._env = env.unwrapped
         model = self._env.truth().model
-        super().__init__(policy, self._env.task.observation_table, model.control_period_s)
+        super().__init__(policy, model)
         self.integral_gain = integral_gain
         self._compensator = DynamicCompensator(model, friction=friction)
         self._dt = model.control_period_s

@@ -10,7 +10,7 @@ per world; the memory of the policy inside it is one of its fields.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
+from elastic_env.world.robot_model import RobotModel
 
 Action = npt.NDArray[np.float32]
 Records: TypeAlias = npt.NDArray[Any]
@@ -40,8 +41,7 @@ class Policy(Protocol):
 
 
 class PolicyInputs(NamedTuple):
-    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is
-    not used.
+    """Values of a policy's inputs, (num_worlds, columns) each; None for one that is not used.
 
     A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what
     each input is. `command` is no field: it is added to whatever a policy commands. The last two
@@ -78,21 +78,19 @@ class BatchPolicy(ABC):
     """A policy that commands a batch of worlds at once.
 
     Args:
-        table: Of the observations.
-        control_period_s: Time between two observations [s].
+        model: Assumed robot.
     """
 
     reads_rates = True
     """It reads the rates of the joints; if not, a compensator around it does not estimate them."""
 
-    def __init__(self, table: SignalTable, control_period_s: float) -> None:
-        self.view = ObservationView(table, control_period_s)
+    def __init__(self, model: RobotModel) -> None:
+        self.model = model
+        self.view = ObservationView(model)
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs that it has beside `command`: its own, and those of the policies
-        inside it.
-        """
+        """Names of its inputs beside `command`, and of those of the policies inside it."""
         return ()
 
     def predict(
@@ -126,8 +124,7 @@ class BatchPolicy(ABC):
         return as_action(action, is_single), memory
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw in the place of an observation's encoders, (..., n)
-        [rad].
+        """Link angles that the policy saw in the place of the encoders', (..., n) [rad].
 
         Args:
             observation: As in `predict`.
@@ -155,9 +152,7 @@ class BatchPolicy(ABC):
         """
 
     def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002
-        """`link_estimate` of rows, (num_worlds, n) [rad]: the encoder angles of a policy that
-        estimates nothing.
-        """
+        """`link_estimate` of rows, (num_worlds, n) [rad]: without one the encoder angles."""
         return self.view.theta(rows)
 
 
@@ -166,13 +161,12 @@ class PolicyAround(BatchPolicy):
 
     Args:
         policy: Any policy.
-        table: Of the observations.
-        control_period_s: Time between two observations [s].
+        model: Assumed robot.
     """
 
-    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
-        super().__init__(table, control_period_s)
-        self.policy = as_batch_policy(policy, table, control_period_s)
+    def __init__(self, policy: Any, model: RobotModel) -> None:
+        super().__init__(model)
+        self.policy = as_batch_policy(policy, model)
 
     @property
     @override
@@ -189,9 +183,6 @@ class Zero(BatchPolicy):
 
     reads_rates = False
 
-    def __init__(self, table: SignalTable) -> None:
-        super().__init__(table, 0.0)  # without memory it does not ask where episodes begin
-
     @override
     def predict(
         self,
@@ -201,9 +192,7 @@ class Zero(BatchPolicy):
         deterministic: bool = True,
         inputs: PolicyInputs = NO_INPUTS,
     ) -> tuple[Action, Any]:
-        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of
-        it.
-        """
+        """Zero offset, (..., n) [rad], whatever the observation holds."""
         return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
 
     @override
@@ -231,8 +220,8 @@ class UserMemory(NamedTuple):
 class UserPolicy(BatchPolicy):
     """A policy of a user as one of ours: it gets observations of the shape that the caller gave."""
 
-    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
-        super().__init__(table, control_period_s)
+    def __init__(self, policy: Any, model: RobotModel) -> None:
+        super().__init__(model)
         self._policy = policy
         self.reads_rates = getattr(policy, "reads_rates", True)
 
@@ -258,11 +247,9 @@ class UserPolicy(BatchPolicy):
         return self._policy.link_estimate(rows, memory.state[0])
 
 
-def as_batch_policy(policy: Any, table: SignalTable, control_period_s: float) -> BatchPolicy:
+def as_batch_policy(policy: Any, model: RobotModel) -> BatchPolicy:
     """The policy itself if it is one of ours, else one around it."""
-    return (
-        policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, table, control_period_s)
-    )
+    return policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, model)
 
 
 def as_action(offsets: Array, is_single: bool) -> Action:
@@ -287,9 +274,10 @@ def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> A
         if memory is not None:
             policy.view.require_start(rows, episode_start)
         return memory
-    if (number := count_rows(state)) != len(rows):
+    number = count_rows(state)
+    if number != len(rows):
         raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {number}")
-    if episode_start is None or episode_start is False or np.count_nonzero(episode_start) == 0:
+    if episode_start is None or np.count_nonzero(episode_start) == 0:
         return state
     fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
     return put_rows(state, fresh, select_rows(policy.begin(rows), fresh))
@@ -303,31 +291,31 @@ def count_rows(memory: Any) -> int:
 
 
 def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
-    """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor
-    tuple stays.
+    """Memory with other rows in some worlds, a (num_worlds,) mask.
+
+    What is neither array nor tuple stays.
     """
-    if isinstance(memory, np.ndarray):
-        changed = memory.copy()
-        changed[worlds] = rows
+
+    def put(array: Array, other: Array) -> Array:
+        changed = array.copy()
+        changed[worlds] = other
         return changed
-    if isinstance(memory, tuple):
-        return _like(
-            memory,
-            [put_rows(part, worlds, other) for part, other in zip(memory, rows, strict=True)],
-        )
-    return memory
+
+    return _map_arrays(put, memory, rows)
 
 
 def select_rows(memory: Any, worlds: BoolArray) -> Any:
     """Memory of some worlds, a (num_worlds,) mask."""
+    return _map_arrays(lambda array: array[worlds], memory)
+
+
+def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> Any:
+    """Memory of the same form whose arrays are a function of those of several memories."""
     if isinstance(memory, np.ndarray):
-        return memory[worlds]
-    if isinstance(memory, tuple):
-        return _like(memory, [select_rows(part, worlds) for part in memory])
-    return memory
-
-
-def _like(memory: tuple[Any, ...], parts: list[Any]) -> tuple[Any, ...]:
+        return function(memory, *others)
+    if not isinstance(memory, tuple):
+        return memory
+    parts = [_map_arrays(function, *own) for own in zip(memory, *others, strict=True)]
     return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
 
 
@@ -342,9 +330,10 @@ class Motion(NamedTuple):
 class ObservationView:
     """Columns of an observation that compensators need, by name."""
 
-    def __init__(self, table: SignalTable, control_period_s: float) -> None:
+    def __init__(self, model: RobotModel) -> None:
+        table = model.observation_table
         self._width = len(table)
-        self._period_s = control_period_s
+        self._period_s = model.control_period_s
         self._clock = table.group("clock") if "clock.time" in table.names else None
         self._theta = table.group("encoder_angle")
         self._theta_dot = table.group("encoder_rate")
@@ -367,9 +356,7 @@ class ObservationView:
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
 
     def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
-        """A copy of the observation with link angles in place of the encoders', and rates if
-        they are given.
-        """
+        """A copy with link angles in the encoders' place, and rates if they are given."""
         seen = rows.copy()
         seen[:, self._theta] = q
         if q_dot is not None:
@@ -403,11 +390,9 @@ class ObservationView:
         """
         starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
         if not np.all(starts):
-            sign = (
-                "clock.time"
-                if self._clock is not None
-                else "a reference at rest, and no command yet"
-            )
+            sign = "a reference at rest, and no command yet"
+            if self._clock is not None:
+                sign = "clock.time"
             raise ElasticError(
                 "predict() was called without `state` in what looks like the middle of an episode"
                 f" (a beginning is known by {sign}): this policy has memory; pass the state that"
@@ -415,8 +400,9 @@ class ObservationView:
             )
 
     def is_start(self, rows: Array) -> BoolArray:
-        """True for an observation that can be the first of an episode: by its clock, or at rest
-        without a command.
+        """True for an observation that can be the first of an episode.
+
+        It is known by its clock, or at rest without a command.
 
         Nothing is commanded where the last command is the reference, or zero, as an environment may
         begin with.

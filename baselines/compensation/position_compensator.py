@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import get_lapack_funcs
 
-from elastic_env.core.config import read_mapping
+from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import (
     ActionError,
     ConfigurationError,
@@ -71,18 +71,14 @@ _LAST_RESIDUAL_RAD = 1e-12
 _SAME_RAD = 1e-6
 """Largest distance of two results that count as one equilibrium."""
 _FILES = (".yaml", ".yml")
-_HOW_TO_GIVE = (
-    "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
-)
 _POSES = 500
 _TRIES = 33
 """Poses at which the weight is looked at, and angles of a joint beside the heaviest of them."""
 _JUMP_RAD = 1e-3
 _CALM_RAD_S = 0.02
 """Jump of a command that is worth a word, and a rate of the command that is not [rad], [rad/s]."""
-_factored, _solved = get_lapack_funcs(
-    ("getrf", "getrs")
-)  # without the checks of lu_factor, which take longer
+# without the checks of lu_factor, which take longer
+_factored, _solved = get_lapack_funcs(("getrf", "getrs"))
 
 
 class PositionCompensator:
@@ -133,50 +129,37 @@ class PositionCompensator:
     ) -> None:
         self._model = model
         require_robot(model)
-        known = _known_joints(model, stiffness, joints)
+        is_free = joints is None
         if joints is None:
-            hinges = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
-            held_by_name = (
-                [] if known is None else [name for name, own in known.items() if own is None]
-            )
-            joints = [name for name in hinges if name not in held_by_name]
-            if not joints:
-                raise ConfigurationError(
-                    f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]"
-                )
-        self.joints = tuple(joints)
-        require_known_torque(model, self.joints)
-        held = _held(model, self.joints)
-        self._links = RigidBody(model, self.joints, held)
+            joints = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
+        settings = _read_stiffness(model, stiffness, joints, is_held_left_out=is_free)
+        self.joints = tuple(settings)
+        self._links = RigidBody(model, self.joints, _held(model, self.joints))
         at = [int(model.joint(name).id) for name in self.joints]
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
         self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
-        if known is None:
-            servos = [ServoSettings()] * len(self.joints)
-            self._compliance = 1.0 / _per_joint("stiffness", stiffness, self.joints)
-        else:
-            settings = _settings_of(known, self.joints)
-            servos = [one.servo for one in settings]
-            self._compliance = 1.0 / np.array([one.stiffness for one in settings])
-        _require_patterns_that_fit(position_gain, _joint_names(model))
-        self._of_command = self._compliance + 1.0 / _servo_gains(
-            model, self.joints, servos, position_gain
-        )
-        self._limit = _number("limit_rad", limit_rad, "rad")
-        self._ramp = _number("ramp_s", ramp_s, "s", least=0.0)
-        self._steps = max(int(np.ceil(self._ramp / _number("period_s", period_s, "s"))), 1)
+        self._compliance = 1.0 / np.array([one.stiffness for one in settings.values()])
+        gains = _servo_gains(model, settings, position_gain)
+        self._of_command = self._compliance + 1.0 / gains
+        limits = CommandLimits(limit_rad=limit_rad, ramp_s=ramp_s, period_s=period_s)
+        self._limit = limits.limit_rad
+        self._ramp = limits.ramp_s
+        self._steps = max(int(np.ceil(limits.ramp_s / limits.period_s)), 1)
         self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[max(at, key=lambda j: int(model.jnt_bodyid[j]))])
         self.reset()
-        self._warn_of_room()
+        needed = self._of_command * self._heaviest()
+        if (needed > self._limit).any():
+            self._warn_of_offset(needed, "at some pose within the joint ranges")
 
     @classmethod
     def from_model(
         cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any
     ) -> Self:
-        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as
-        of the class.
+        """From a file of MJCF or URDF, its text, or what MuJoCo made of one.
+
+        Further arguments are those of the class.
 
         `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
         Hinges that such a file does not name are rigid, as those are that were not identified.
@@ -189,11 +172,10 @@ class PositionCompensator:
         """
         compiled = compiled_model(model)
         require_robot(compiled)
+        given: Any = stiffness
         if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
-            return cls(
-                compiled, _of_file(compiled, Path(stiffness), options.get("joints")), **options
-            )
-        return cls(compiled, stiffness, **options)  # type: ignore[arg-type]
+            given = _of_file(compiled, Path(stiffness), options.get("joints"))
+        return cls(compiled, given, **options)
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
@@ -208,8 +190,9 @@ class PositionCompensator:
     def set_payload(
         self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None
     ) -> None:
-        """Let the robot carry another point mass; commands take it over within the time of the
-        ramp.
+        """Let the robot carry another point mass.
+
+        Commands take it over within the time of the ramp.
 
         In another place or on another body it is taken over from zero: the command lets go of the
         last one at once.
@@ -222,8 +205,8 @@ class PositionCompensator:
         Raises:
             ConfigurationError: No mass, no place, or no such body or site.
         """
-        mass = _number("mass_kg", mass_kg, "kg", least=0.0)
-        place = np.array(_finite("at", at, 3, "m"))
+        payload = Payload(mass_kg=mass_kg, at=at)  # pyright: ignore[reportArgumentType]
+        place = np.array(payload.at)
         carrier = self._tip
         if body is not None:
             bodies = {self._model.body(i).name: i for i in range(self._model.nbody)}
@@ -231,16 +214,18 @@ class PositionCompensator:
             require_known("body or site", [body], bodies | sites)
             carrier = bodies[body] if body in bodies else int(self._model.site_bodyid[sites[body]])
             if body not in bodies:
-                place = _in_body(self._model, sites[body], place)
+                site = self._model.site(body)
+                mujoco.mju_rotVecQuat(place, np.array(payload.at), site.quat)
+                place += site.pos
         before = None if self._asked is None else self._torque(*self._asked)
         if (carrier, *place) != (self._carrier, *self._place):
             self._load = 0.0
             self._carrier = carrier
             self._place = place
-        self._load_wanted = mass
-        self._load_step = abs(mass - self._load) / self._steps
+        self._load_wanted = payload.mass_kg
+        self._load_step = abs(payload.mass_kg - self._load) / self._steps
         if self._ramp == 0.0:
-            self._load = mass
+            self._load = payload.mass_kg
         self._links.set_load(self._carrier, self._load, self._place)
         if before is not None and self._asked is not None:
             self._warn_of_jump(self._of_command * (self._torque(*self._asked) - before))
@@ -284,11 +269,13 @@ class PositionCompensator:
         self.clipped = command != offset + motion[0]
         self._asked = motion
         if self.clipped.any():
-            self._warn_of_limits(offset, motion[0])
+            if np.abs(offset).max() > self._limit:
+                self._warn_of_offset(np.abs(offset), "now")
+            self._warn_of_range(offset + motion[0])
         return command
 
     def link_angle(self, theta: npt.ArrayLike) -> Array:
-        """Where the links are when the motor encoders show θ, at rest: Eq. 10.
+        """Link angles for motor encoders that show θ, at rest: Eq. 10.
 
         Args:
             theta: Motor side, (n,) [rad].
@@ -304,9 +291,8 @@ class PositionCompensator:
         shown_angle = self._checked("theta", theta, "rad")
         gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
         size = gradient.ravel()
-        is_soft = (
-            size.dot(size) >= 1.0
-        )  # by the Frobenius norm, which is fast: there may be other equilibria
+        # by the Frobenius norm, which is fast: there may be other equilibria
+        is_soft = size.dot(size) >= 1.0
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at
         # θ alone, for speed;
@@ -322,19 +308,15 @@ class PositionCompensator:
             missing = residual.dot(residual)
             if missing < _LAST_STEP_RAD**2:
                 way = q - shown_angle
-                return (
-                    self._soft_link_angle(shown_angle, q)
-                    if is_soft or way.dot(way) > _FAR_RAD**2
-                    else q
-                )
+                if is_soft or way.dot(way) > _FAR_RAD**2:
+                    return self._soft_link_angle(shown_angle, q)
+                return q
             if not missing < _LARGEST_STEP_RAD**2:
                 break
         return self._soft_link_angle(shown_angle, None)
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
-        """The same where the load bends a spring far: by a load that grows; the guess if it is
-        the same pose.
-        """
+        """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
         found = follow_load(
             theta,
             self._compliance,
@@ -347,17 +329,9 @@ class PositionCompensator:
             raise ElasticError(
                 f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
             )
-        return guess if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD else found.q
-
-    def _warn_of_room(self) -> None:
-        """Warn where the weight at some pose within the ranges needs a larger offset than the
-        limit.
-        """
-        needed = self._of_command * self._heaviest()
-        if (needed > self._limit).any():
-            self._warn_of_offset(
-                int(needed.argmax()), float(needed.max()), "at some pose within the joint ranges"
-            )
+        if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD:
+            return guess
+        return found.q
 
     def _heaviest(self) -> Array:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
@@ -377,55 +351,55 @@ class PositionCompensator:
                     pose = tried[there.argmax()]
         return found
 
-    def _warn_of_limits(self, offset: Array, q: Array) -> None:
-        """Say once that a command met `limit_rad`, and once that it met a joint range."""
-        beyond = np.abs(offset)
-        if beyond.max() > self._limit:
-            self._warn_of_offset(int(beyond.argmax()), float(beyond.max()), "now")
-        wanted = q + offset
+    def _warn_of_range(self, wanted: Array) -> None:
+        """Say once that a command, (n,) [rad], met a joint range."""
         over = np.maximum(self._lowest - wanted, wanted - self._highest)
-        if over.max() > 0.0 and "range" not in self._said:
-            self._said.add("range")
+        if over.max() > 0.0:
             worst = int(over.argmax())
             ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
-            _warn(
+            self._warn_once(
+                "range",
                 f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond"
                 f" its range of {ends} in the model: its link stays {over[worst]:.2g} rad short;"
-                " keep q_desired that far from the end"
+                " keep q_desired that far from the end",
             )
 
-    def _warn_of_offset(self, joint: int, needed: float, when: str) -> None:
-        """Say once that `limit_rad` is too small."""
-        if "limit_rad" in self._said:
-            return
-        self._said.add("limit_rad")
+    def _warn_of_offset(self, offsets: Array, when: str) -> None:
+        """Say once that `limit_rad` is too small for offsets, (n,) [rad]."""
+        needed = float(offsets.max())
+        joint = self.joints[offsets.argmax()]
         digit = 10.0 ** (np.floor(np.log10(needed)) - 1.0)
         enough = np.ceil(1.05 * needed / digit) * digit
-        _warn(
-            f"the load needs an offset of {needed:.3g} rad of joint {self.joints[joint]!r} {when},"
+        self._warn_once(
+            "limit_rad",
+            f"the load needs an offset of {needed:.3g} rad of joint {joint!r} {when},"
             f" and commands are cut at limit_rad = {self._limit:g}: the link ends short of where it"
-            f" should be; limit_rad={enough:.3g} is enough"
+            f" should be; limit_rad={enough:.3g} is enough",
         )
 
     def _warn_of_jump(self, jump: Array) -> None:
         """Say once that a payload moved the command at once, by `jump`, (n,) [rad]."""
         worst = int(np.abs(jump).argmax())
         size = float(np.abs(jump[worst]))
-        if size <= _JUMP_RAD or "jump" in self._said:
+        if size <= _JUMP_RAD:
             return
-        self._said.add("jump")
-        cure = (
-            f"ramp_s={max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5):.3g} takes it over in"
-            " that time"
-        )
+        calm_s = max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5)
+        cure = f"ramp_s={calm_s:.3g} takes it over in that time"
         if self._ramp > 0.0:
             cure = (
                 "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
             )
-        _warn(
+        self._warn_once(
+            "jump",
             f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
-            f" mrad at once; {cure}"
+            f" mrad at once; {cure}",
         )
+
+    def _warn_once(self, about: str, text: str) -> None:
+        """Warn the caller of a public method, unless it was warned about the same before."""
+        if about not in self._said:
+            self._said.add(about)
+            _warn(text)
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
         return (
@@ -435,7 +409,7 @@ class PositionCompensator:
         )
 
     def _checked(self, name: str, given: Any, unit: str) -> Array:
-        """What a robot is asked for, as (n,)."""
+        """An argument of a public method, as (n,)."""
         n = len(self.joints)
         values = _array(given)
         if values.shape != (n,):
@@ -445,11 +419,7 @@ class PositionCompensator:
                 f" {quote(given)}{size}"
             )
         if not np.isfinite(values).all():
-            bad = [
-                name
-                for name, value in zip(self.joints, values, strict=True)
-                if not np.isfinite(value)
-            ]
+            bad = np.array(self.joints)[~np.isfinite(values)]
             raise ActionError(
                 f"{name} must be finite [{unit}], got {quote(values.tolist())}; see"
                 f" {', '.join(bad)}"
@@ -459,20 +429,18 @@ class PositionCompensator:
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
         if q_dot is None and q_ddot is None:
             return self._links.gravity_torque(q)
-        rest = np.zeros(len(q))
-        return self._links.inverse_dynamics(
-            q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot
-        )
+        q_dot = np.zeros(len(q)) if q_dot is None else q_dot
+        q_ddot = np.zeros(len(q)) if q_ddot is None else q_ddot
+        return self._links.inverse_dynamics(q, q_dot, q_ddot)
 
     def _take_load(self) -> None:
         """One step towards the payload that is wanted."""
         if self._load != self._load_wanted:
             way = self._load_wanted - self._load
-            self._load = (
-                self._load_wanted
-                if abs(way) <= self._load_step
-                else self._load + np.copysign(self._load_step, way)
-            )
+            if abs(way) <= self._load_step:
+                self._load = self._load_wanted
+            else:
+                self._load += np.copysign(self._load_step, way)
             self._links.set_load(self._carrier, self._load, self._place)
 
 
@@ -486,13 +454,6 @@ def _warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
-    """A place in the frame of a site in that of its body, (3,) [m]."""
-    turned = np.empty(3)
-    mujoco.mju_rotVecQuat(turned, place, model.site_quat[site])
-    return model.site_pos[site] + turned
-
-
 def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
@@ -503,12 +464,8 @@ def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     }
 
 
-def _joint_names(model: mujoco.MjModel) -> list[str]:
-    return [name for j in range(model.njnt) if (name := model.joint(j).name)]
-
-
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
-    """What a file says of joints, in which the hinges that it leaves out are rigid."""
+    """Content of a file of joints, in which the hinges that it leaves out are rigid."""
     mapping = read_mapping(file)
     names = [
         model.joint(j).name
@@ -526,30 +483,65 @@ def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None)
     return mapping | dict.fromkeys(said, RIGID)
 
 
-def _known_joints(
-    model: mujoco.MjModel, given: Any, commanded: Sequence[str] | None
-) -> dict[str, JointSettings | None] | None:
-    """Settings by joint, None for one that is held; None where numbers alone are given."""
-    if not isinstance(given, Mapping):
-        return None
+class CommandLimits(Model):
+    """How far commands lead, and how offsets begin."""
+
+    limit_rad: float = quantity("rad", gt=0)
+    """Largest offset between command and desired angle [rad]."""
+    ramp_s: float = quantity("s", ge=0)
+    """Time in which offsets grow from zero [s]."""
+    period_s: float = quantity("s", gt=0)
+    """Time between two commands [s]."""
+
+
+class Payload(Model):
+    """A point mass that the robot carries."""
+
+    mass_kg: float = quantity("kg", ge=0)
+    """Mass [kg]."""
+    at: list[float] = quantity("m", min_length=3, max_length=3)
+    """Place in the frame of what carries it [m]."""
+
+
+class PositionGain(Model):
+    """A servo that gives way under a load, or holds its angle."""
+
+    position_gain: float = quantity("N·m/rad", ge=SOFTEST, allow_inf_nan=True)
+    """k_p, infinite for a servo that holds its angle [N·m/rad]."""
+
+
+def _read_stiffness(
+    model: mujoco.MjModel, given: Any, joints: Sequence[str], is_held_left_out: bool
+) -> dict[str, JointSettings]:
+    """Settings of the joints that are commanded, in order.
+
+    Args:
+        model: Compiled rigid model.
+        given: Argument `stiffness`.
+        joints: Hinges that may be commanded.
+        is_held_left_out: Whether those that are held are left out, or refused.
+    """
     hinges = hinges_of(model)
-    known = read_joints(given, hinges, [name for name in _joint_names(model) if name not in hinges])
-    for name in commanded or ():
-        if name in known and known[name] is None:
+    known: dict[str, JointSettings | None] = {}
+    if isinstance(given, Mapping):
+        known = read_joints(given, hinges, set(_joint_names(model)) - set(hinges))
+    held = [name for name, own in known.items() if own is None]
+    if is_held_left_out:
+        joints = [name for name in joints if name not in held]
+        if not joints:
+            raise ConfigurationError(
+                f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]"
+            )
+    for name in joints:
+        if name in held:
             raise ConfigurationError(
                 f"joint {name!r} is named by `joints`, and stiffness says that it is {HELD}; give"
                 " it a stiffness K [N·m/rad], or leave it out of `joints`"
             )
-    return known
-
-
-def _settings_of(
-    known: Mapping[str, JointSettings | None], joints: Sequence[str]
-) -> list[JointSettings]:
-    """Settings of the joints that are commanded, all of which have to be known and without
-    backlash.
-    """
-    found: list[JointSettings] = []
+    require_known_torque(model, joints)
+    if not isinstance(given, Mapping):
+        known = read_joints(_by_joint("stiffness", given, joints), joints)
+    found: dict[str, JointSettings] = {}
     for joint in joints:
         own = known.get(joint)
         if own is None:
@@ -564,37 +556,31 @@ def _settings_of(
                 f" cannot take away: at rest {own.backlash / 2.0:g} rad remain to either side;"
                 " leave the key out of what you give it"
             )
-        found.append(own)
+        found[joint] = own
     return found
 
 
-def _servo_gains(
-    model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[ServoSettings], given: Any
-) -> Array:
+def _servo_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], given: Any) -> Array:
     """k_p of servos that give way, infinite for those that hold their angle, (n,) [N·m/rad].
 
     Args:
-        model: Whose actuators say it where nothing else does.
-        joints: Those that are commanded.
-        servos: What is known of their servos.
-        given: The argument `position_gain`.
+        model: Its actuators say it where nothing else does.
+        settings: Joints that are commanded.
+        given: Argument `position_gain`.
     """
-    said = [own.position_gain is not None or own.integral_gain is not None for own in servos]
     if given is not None:
-        if any(said):
-            raise ConfigurationError(
-                f"the servo of joint {joints[said.index(True)]!r} is said twice, under `servo` in"
-                " stiffness and by position_gain; keep one of them"
-            )
-        return _per_joint("position_gain", given, joints)
-    gains = np.full(len(joints), np.inf)
+        return _given_gains(model, settings, given)
+    gains: list[float] = []
     unsaid: dict[str, float] = {}
-    for at, (joint, own) in enumerate(zip(joints, servos, strict=True)):
-        found = None if own.position_gain is not None else position_servo(model, joint)
+    for joint, own in settings.items():
+        servo = own.servo
+        found = None if servo.position_gain is not None else position_servo(model, joint)
         of_model = ServoSettings() if found is None else found.settings
-        if said[at]:
-            gains[at] = own.over(of_model).sagging_gain(joint)
-        elif np.isfinite(gain := of_model.sagging_gain(joint)):
+        if _is_said(servo):
+            gains.append(servo.over(of_model).sagging_gain(joint))
+            continue
+        gains.append(np.inf)
+        if np.isfinite(gain := of_model.sagging_gain(joint)):
             unsaid[joint] = gain
     if unsaid:
         listed = ", ".join(f"{name}: {gain:g}" for name, gain in unsaid.items())
@@ -603,91 +589,66 @@ def _servo_gains(
             f" give position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that"
             " hold their angle"
         )
-    return gains
+    return np.array(gains)
 
 
-def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
-    """Positive numbers of all joints, (n,) [N·m/rad]."""
-    if given is None:
-        raise ConfigurationError(f"{name} is missing; {_HOW_TO_GIVE}")
+def _is_said(servo: ServoSettings) -> bool:
+    return servo.position_gain is not None or servo.integral_gain is not None
+
+
+def _given_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], given: Any) -> Array:
+    """The argument `position_gain`, (n,) [N·m/rad]."""
+    by_joint = _by_joint("position_gain", given, list(settings))
+    names = _joint_names(model)
+    for key in by_joint:
+        if not isinstance(key, str) or not any(key_of([key], name) for name in names):
+            raise unknown_name("joint or pattern of joints", key, names)
+    gains: list[float] = []
+    for joint, own in settings.items():
+        if _is_said(own.servo):
+            raise ConfigurationError(
+                f"the servo of joint {joint!r} is said twice, under `servo` in stiffness and by"
+                " position_gain; keep one of them"
+            )
+        key = key_of(by_joint, joint)
+        if key is None:
+            raise ConfigurationError(
+                f"position_gain of joint {joint!r} is missing; give {joint!r} or a pattern such as"
+                " '*', and inf for a servo that holds its angle"
+            )
+        try:
+            gains.append(PositionGain(position_gain=by_joint[key]).position_gain)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"joint {joint!r}: {error}") from None
+    return np.array(gains)
+
+
+def _by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]:
+    """Numbers of joints by their names or patterns."""
+    if given is None or isinstance(given, str | Path):
+        raise ConfigurationError(
+            f"{name} must be numbers [N·m/rad], got {quote(given)}; give a number for all joints,"
+            " one per joint, a mapping by name, or a YAML file (.yaml) of that"
+        )
     if isinstance(given, Mapping):
-        values = [_of_joint(name, given, joint) for joint in joints]
-    elif isinstance(given, str | Path):
+        return given
+    if not isinstance(given, list | tuple | np.ndarray):
+        return dict.fromkeys(joints, given)
+    if len(given) != len(joints):
         raise ConfigurationError(
-            f"{name} must be numbers [N·m/rad], got {quote(str(given))}; {_HOW_TO_GIVE}"
+            f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got"
+            f" {len(given)}"
         )
-    elif isinstance(given, list | tuple | np.ndarray):
-        values = list(given)
-        if len(values) != len(joints):
-            raise ConfigurationError(
-                f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got"
-                f" {len(values)}"
-            )
-    else:
-        values = [given] * len(joints)
-    numbers = [
-        _number(f"{name} of {joint}", value, "N·m/rad", finite=False)
-        for joint, value in zip(joints, values, strict=True)
-    ]
-    for joint, number in zip(joints, numbers, strict=True):
-        if number < SOFTEST:
-            raise ConfigurationError(
-                f"{name} of {joint} must be at least {SOFTEST:g} [N·m/rad], got {number:g}"
-            )
-    return np.array(numbers)
+    return dict(zip(joints, given, strict=True))
 
 
-def _require_patterns_that_fit(given: Any, joints: Sequence[str]) -> None:
-    """Refuse a name or a pattern that is of no joint, such as a misspelt one."""
-    for key in given if isinstance(given, Mapping) else ():
-        if not isinstance(key, str) or not any(key_of([key], joint) for joint in joints):
-            raise unknown_name("joint or pattern of joints", key, joints)
-
-
-def _of_joint(name: str, given: Mapping[str, Any], joint: str) -> Any:
-    """The value of a joint by its name or the last pattern that fits it."""
-    key = key_of(given, joint)
-    if key is None:
-        raise ConfigurationError(
-            f"{name} of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and"
-            " inf for a servo that holds its angle"
-        )
-    return given[key]
-
-
-def _number(
-    name: str, value: Any, unit: str, least: float | None = None, finite: bool = True
-) -> float:
-    """A positive number, or one from `least` on."""
-    if isinstance(value, bool | str) or not isinstance(
-        value, int | float | np.integer | np.floating
-    ):
-        raise ConfigurationError(f"{name} must be a number [{unit}], got {quote(value)}")
-    number = float(value)
-    if (
-        np.isnan(number)
-        or (finite and np.isinf(number))
-        or not (number > 0.0 if least is None else number >= least)
-    ):
-        bound = "> 0" if least is None else f">= {least:g}"
-        raise ConfigurationError(
-            f"{name} must be {'finite and ' if finite else ''}{bound} [{unit}], got {number:g}"
-        )
-    return number
+def _joint_names(model: mujoco.MjModel) -> list[str]:
+    return [name for j in range(model.njnt) if (name := model.joint(j).name)]
 
 
 def _array(given: Any) -> Array:
-    """What was given as an array; empty where it is none of numbers."""
+    """The argument as an array; empty where it is none of numbers."""
     try:
         return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         return np.empty(0)
-
-
-def _finite(name: str, given: Any, size: int, unit: str) -> Array:
-    values = _array(given)
-    if values.shape != (size,) or not np.isfinite(values).all():
-        raise ConfigurationError(
-            f"{name} must be {size} finite numbers [{unit}], got {quote(given)}"
-        )
-    return values

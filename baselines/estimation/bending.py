@@ -1,5 +1,4 @@
-r"""How much more a walker's joints bend than the model says, from what their motors and the IMU
-disagree on.
+r"""Model error of a walker's bending joints, from what motors and IMU disagree on.
 
 A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be
 tilted: by what the joints of its leg bend, δ = θ − q about their axes z, and by what never changes,
@@ -48,8 +47,7 @@ ESTIMATE = record_type(
 
 
 class BendingObserver:
-    """Estimates of the model's error, from the observations of a walker; its memory is rows of
-    `ESTIMATE`.
+    """Estimates of the model's error from a walker's observations; memory: rows of `ESTIMATE`.
 
     Args:
         model: Assumed walker.
@@ -92,7 +90,9 @@ class BendingObserver:
             bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under
                 the foot wrenches.
         """
-        seen, expected = self.disagreement(rows, self.bending(rows) if bending is None else bending)
+        if bending is None:
+            bending = self.bending(rows)
+        seen, expected = self.disagreement(rows, bending)
         memory = memory.copy()
         found = np.empty((len(rows), len(self.signals)))
         regress(
@@ -108,21 +108,16 @@ class BendingObserver:
         return found, memory
 
     def bending(self, rows: Array) -> Array:
-        """Expected bending of the joints under the measured foot wrenches, δ = θ − q,
-        (num_worlds, 12) [rad].
-        """
+        """Expected bending under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
         theta = rows[:, self._theta]
         return theta - self._compensator.at(rows).link_angle(theta)
 
     def expected_tilt(self, rows: Array) -> Array:
-        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds,
-        2 legs, 2) [rad].
-        """
+        """Tilt of the pelvis over each flat foot by the bending, s, (num_worlds, 2, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]
 
     def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
-        """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a
-        foot that is flat.
+        """Tilt of a flat foot's sole by motors and IMU, e, and the bending that is expected, s.
 
         Args:
             rows: Observations, (num_worlds, m).
@@ -146,8 +141,7 @@ def regress(
     memory: Any,
     found: Array,
 ) -> None:
-    """One step of recursive least squares for seen − expected = ρ · expected + c, of feet that are
-    loaded.
+    """A step of recursive least squares for seen − expected = ρ · expected + c of loaded feet.
 
     Args:
         observed: Observations, rows with fields.
@@ -169,7 +163,8 @@ def regress(
                 x = memory[world].unknowns[leg, axis]
                 P = memory[world].covariance[leg, axis]
                 if force >= loaded_n:
-                    update(x, P, expected[world, leg, axis], seen[world, leg, axis], deviation_rad)
+                    at = (world, leg, axis)
+                    update(x, P, expected[at], seen[at], deviation_rad)
                 found[world, 2 * leg + axis] = x[0]
                 found[world, 4 + 2 * leg + axis] = math.sqrt(P[0])
         found[world, 8] = load / carried_n - 1.0
@@ -177,9 +172,7 @@ def regress(
 
 @compiled
 def update(x: Array, P: Array, expected: float, seen: float, deviation_rad: float) -> None:
-    """A measurement of (expected, 1) · x = seen − expected, whose errors have a standard
-    deviation.
-    """
+    """Take in a measurement of (expected, 1) · x = seen − expected with a standard deviation."""
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
     variance = (expected * first + second) + deviation_rad**2

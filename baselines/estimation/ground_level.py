@@ -106,9 +106,7 @@ class GroundLevel:
         return np.hstack([own, wrenches]), memory
 
     def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
-        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12),
-        and the new memory.
-        """
+        """Tilt of the ground [rad], level foot wrenches, (num_worlds, 12), and new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
         force = wrench[:, :, 0]
@@ -118,10 +116,8 @@ class GroundLevel:
         lean = mean * self._certainty(number)[:, None]
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
-        added = over_ankles * (upright - force)[..., :2]
-        turned = moment + np.stack(
-            [-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1
-        )
+        x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
+        turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
 
@@ -142,8 +138,9 @@ class GroundLevel:
         return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
-        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded
-        one, (n, 2).
+        """Center of mass on the ankles: height [m], and velocity against the loaded one [m/s].
+
+        Shapes are (n, 2, 1) and (n, 2).
         """
         theta = rows[:, self._theta]
         rate = rows[:, self._rate]

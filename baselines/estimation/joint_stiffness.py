@@ -92,10 +92,8 @@ class StiffnessRegression:
 
     def begin(self, num_worlds: int) -> RegressionMemory:
         """Memory before the first measurement."""
-        n = len(self._coulomb)
-        return RegressionMemory(
-            np.zeros((num_worlds, n)), np.zeros((num_worlds, n)), np.zeros((num_worlds, 5, n))
-        )
+        zero = np.zeros((num_worlds, len(self._coulomb)))
+        return RegressionMemory(zero, zero, np.stack([zero] * 5, axis=1))
 
     def friction(self, q: Array, memory: RegressionMemory) -> Array:
         """Coulomb friction of links that have moved to q, (num_worlds, n) [rad] to [N·m]."""
@@ -122,5 +120,7 @@ class StiffnessRegression:
             measured: Which joints have a sensor, (n,).
         """
         y = deflection - h
-        sums = memory.sums + measured * np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
-        return regress(sums.swapaxes(0, 1), self._prior), RegressionMemory(friction, q, sums)
+        own = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
+        sums = memory.sums + measured * own
+        error = regress(sums.swapaxes(0, 1), self._prior)
+        return error, RegressionMemory(friction, q, sums)

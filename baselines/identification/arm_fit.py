@@ -1,5 +1,4 @@
-r"""Stiffness of every joint of an arm from static poses: least squares over all poses, with 95 %
-intervals.
+r"""Stiffness of every joint of an arm by least squares over static poses, with 95 % intervals.
 
 The unknowns x of `PoseModel` minimise the squared residuals of the measurement. A weak prior,
 Gaussian with the scales of the model, keeps unknowns near zero that the poses say nothing about; on
@@ -159,11 +158,9 @@ def _least_squares(problem: "_Problem", start: Array, evaluations: int, **option
 
 
 def _spread_near(model: PoseModel) -> float:
-    """Spread of the residuals of poses to first order about small deflections, in the unit of
-    the measurement.
-    """
+    """Spread of the residuals to first order about small deflections, in the measurement's unit."""
     start = model.start_with(_FIRST_DEFLECTION_RAD)
-    predicted, gradient = model.predicted(start)
+    predicted, gradient = model.predict(start)
     noise = _FINEST[model.log.kind]
     rows = gradient.reshape(-1, len(start)) * model.scale / noise
     residual = (model.target - predicted).ravel() / noise
@@ -172,8 +169,7 @@ def _spread_near(model: PoseModel) -> float:
 
 
 class _Problem:
-    """Residuals of the poses and of the prior, and their derivatives, in units of noise and of the
-    scales.
+    """Residuals of poses and prior, and their derivatives, in units of noise and of the scales.
 
     Args:
         model: The poses.
@@ -193,8 +189,9 @@ class _Problem:
         self._size = model.target.size + model.unknowns.size
 
     def residual(self, x: Array) -> Array:
-        """Predicted less measured, then the prior, (N m + p,); infinite where a load overcomes a
-        spring.
+        """Predicted less measured, then the prior, (N m + p,).
+
+        Infinite where a load overcomes a spring.
 
         Raises:
             ElasticError: It does so at the start.
@@ -203,7 +200,7 @@ class _Problem:
         if self._progress is not None:
             self._progress(self._count)
         try:
-            predicted, self._gradient = self._model.predicted(self._model.scale * x)
+            predicted, self._gradient = self._model.predict(self._model.scale * x)
         except ElasticError:
             if not len(self._at):
                 raise
@@ -212,8 +209,9 @@ class _Problem:
         return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
 
     def jacobian(self, x: Array) -> Array:
-        """Its derivatives, (N m + p, p); `least_squares` asks for them where it has asked for
-        the residual.
+        """Its derivatives, (N m + p, p).
+
+        `least_squares` asks for them where it has asked for the residual.
         """
         if not np.array_equal(x, self._at):
             self.residual(x)
@@ -240,9 +238,7 @@ def require_poses(model: PoseModel) -> None:
 
 
 def _require_reach(model: PoseModel) -> None:
-    """Refuse positions that spread far more or less than those of the model, such as
-    millimetres.
-    """
+    """Refuse positions that spread far more or less than the model's, such as millimetres."""
     own, measured = (
         _radius(points)
         for points in (model.arm.attitude(model.log.theta).position, model.log.measured)
@@ -262,14 +258,14 @@ def _radius(points: Array) -> float:
 
 def information_of(model: PoseModel, unknowns: Array, spread: float) -> tuple[Array, Array]:
     """Scaled derivatives of a unit of noise, (N, m, p), and JᵀJ + Λ of them, (p, p)."""
-    _, gradient = model.predicted(unknowns)
+    _, gradient = model.predict(unknowns)
     rows = gradient * model.scale / spread
     return rows, np.tensordot(rows, rows, axes=([0, 1], [0, 1])) + np.eye(len(unknowns))
 
 
 def _described(model: PoseModel, unknowns: Array, finest: float) -> ArmFit:
     """Spread and covariance at the estimates."""
-    predicted, _ = model.predicted(unknowns)
+    predicted, _ = model.predict(unknowns)
     residual = model.target - predicted
     rows, information = information_of(model, unknowns, finest)
     inverse = np.linalg.inv(information)

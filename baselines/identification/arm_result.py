@@ -1,6 +1,4 @@
-"""What an identification of an arm found, as files hold it: intervals in JSON, stiffness in
-YAML.
-"""
+"""Result of an identification of an arm: intervals in JSON, stiffness in YAML."""
 
 import math
 from pathlib import Path
@@ -30,7 +28,8 @@ _OFFSET_KNOWN_RAD = 0.05
 """Half-width of an offset's interval above which the poses do not tell the offset."""
 _KNOWN = 0.5
 """The same for friction and payload, as a share of their plausible size."""
-_SHOWN = 0.05  # of the largest derivative by a joint: gravity couples the others by less
+_SHOWN = 0.05
+"""Share of the largest derivative by a joint: gravity couples the others by less."""
 UNLOADED = "gravity does not load it in these poses"
 UNSEEN = "the measurement does not show its angle"
 NEGATIVE = "stiffer than the log can tell; the estimate is negative"
@@ -51,12 +50,12 @@ class JointStiffness(Model):
     reason: str
     """Why the poses do not tell the stiffness apart; empty where they do."""
     is_negative: bool = False
-    """Whether the estimate of 1/K is negative: the joint is stiffer than the log can tell."""
+    """True if the estimate of 1/K is negative: the joint is stiffer than the log can tell."""
     friction_nm: float | None
     """Friction on the link side of the spring; None where the poses do not tell it."""
     friction_half_width_nm: float | None
     offset_rad: float | None
-    """What the motor encoder reads beyond θ; None where the poses do not tell it."""
+    """Reading of the motor encoder beyond θ; None where the poses do not tell it."""
     offset_half_width_rad: float
     largest_torque_nm: float
     """Largest gravity torque in the poses."""
@@ -78,7 +77,7 @@ class ArmIdentification(Model):
     residual_spread: float
     """Standard deviation of the residuals [m], [rad] or [N·m]."""
     friction_is_noise: bool
-    """Whether the log has no sides of approach, so that friction widens the intervals."""
+    """True if the log has no sides of approach, so that friction widens the intervals."""
     rigid_joints: tuple[str, ...] = ()
     """Joints of the log that were taken as rigid."""
     held_joints: tuple[str, ...] = ()
@@ -108,7 +107,7 @@ class ArmIdentification(Model):
         return files
 
 
-def described(
+def describe_fit(
     fit: ArmFit, within: float, assumed: float | None, planned: Array | None = None
 ) -> ArmIdentification:
     """The result of a fit.
@@ -162,8 +161,11 @@ def expected_half_width(fit: ArmFit, information: Array) -> Array:
 def reasons(fit: ArmFit, within: float) -> list[str]:
     """Why the poses do not tell each stiffness apart; empty text where they do, (k,)."""
     compliance, half = fit.estimate("compliance")
-    unloaded = _unloaded(fit)
-    unseen = _unseen(fit)
+    model = fit.model
+    unloaded = model.load < SMALLEST_LOAD * np.abs(model.arm.torque(fit.q)).max()
+    _, gradient = model.predict(fit.unknowns)
+    moved = np.abs(gradient[..., model.unknowns.slices["offset"]]).max(axis=(0, 1))
+    unseen = moved < _SHOWN * moved.max()
     alike = _alike(fit)
     names = [fit.model.log.joints[at] for at in fit.model.unknowns.elastic]
 
@@ -185,20 +187,8 @@ def reasons(fit: ArmFit, within: float) -> list[str]:
     return [reason(i) for i in range(len(names))]
 
 
-def _unloaded(fit: ArmFit) -> BoolArray:
-    """Which elastic joints carry no torque, (k,)."""
-    return fit.model.load < SMALLEST_LOAD * np.abs(fit.model.arm.torque(fit.q)).max()
-
-
-def _unseen(fit: ArmFit) -> BoolArray:
-    """Which elastic joints do not move the measurement, (k,)."""
-    _, gradient = fit.model.predicted(fit.unknowns)
-    moved = np.abs(gradient[..., fit.model.unknowns.slices["offset"]]).max(axis=(0, 1))
-    return moved < _SHOWN * moved.max()
-
-
 def _alike(fit: ArmFit) -> BoolArray:
-    """Which pairs of compliances have estimates that hardly differ in what they explain, (k, k)."""
+    """Pairs of compliances whose estimates hardly differ in what they explain, (k, k)."""
     own = fit.model.unknowns.slices["compliance"]
     spread = np.linalg.inv(fit.information)[own, own]
     correlation = spread / np.sqrt(np.outer(np.diag(spread), np.diag(spread)))
@@ -238,9 +228,7 @@ def _joint(
 
 
 def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float | None) -> Source:
-    """Origin of the stiffness of a joint with the compliance c and the half-width h of its
-    interval.
-    """
+    """Origin of a stiffness, from the compliance c and the half-width h of its interval."""
     if c > h and not is_rigid:
         return "told apart" if h <= within * c else "wide interval"
     if assumed is not None:
@@ -269,9 +257,7 @@ def bounded_compliance(fit: ArmFit) -> Array:
 
 
 def _first_known(fit: ArmFit, name: str, i: int = 0) -> tuple[float | None, float | None]:
-    """An estimate, None where the poses do not tell it, and its half-width, None where it is not
-    sought.
-    """
+    """An estimate, None where the poses do not tell it, and its half-width, None if not sought."""
     values, half = fit.estimate(name)
     if not len(values):
         return None, None

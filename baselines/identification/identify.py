@@ -1,5 +1,6 @@
-r"""Stiffness of an elastic joint from static positions: deflection against gravity torque (Fig. 5
-of the paper).
+r"""Stiffness of an elastic joint from static positions (Fig. 5 of the paper).
+
+Deflection is regressed on gravity torque.
 
 The joint is driven to positions from both sides and left to settle; encoder and IMU are averaged.
 Of link angle q and encoder θ the regression is
@@ -35,9 +36,7 @@ _RESAMPLES = 999
 
 
 class Identification(Model):
-    """Result of an identification; written as `identification.json`, which env and compensator
-    take as their K.
-    """
+    """Result of an identification, in `identification.json`; env and compensator take K from it."""
 
     stiffness_nm_per_rad: float
     stiffness_low_nm_per_rad: float
@@ -57,7 +56,7 @@ class Identification(Model):
     residual_rad: float
     """Standard deviation of the residuals."""
     hysteresis: bool
-    """Whether the two directions of approach differ: the 95 % interval of the friction excludes
+    """True if the two directions of approach differ: the 95 % interval of the friction excludes
     zero, and the difference 2 F/K exceeds `HYSTERESIS_RESOLUTION_RAD`."""
     friction_low_nm: float
     friction_high_nm: float
@@ -87,14 +86,12 @@ class Identification(Model):
 
 @dataclass(frozen=True)
 class Fit:
-    """Coefficients of the regression: compliance 1/K, F/K, b/2, c, and with two loads the sine
-    error.
-    """
+    """Coefficients of the regression: 1/K, F/K, b/2, c, and with two loads the sine error."""
 
     coefficients: Array
     residuals: Array
     is_determined: bool
-    """Whether the points tell all coefficients apart."""
+    """True if the points tell all coefficients apart."""
 
     @property
     def offset(self) -> float:
@@ -118,8 +115,9 @@ class Fit:
 
 
 def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: bool) -> Fit:
-    """Least squares of the deflections; the sign of the load, which depends on the friction, by
-    iteration.
+    """Least squares of the deflections.
+
+    The sign of the load depends on the friction, and is found by iteration.
 
     Args:
         points: Static points.
@@ -202,9 +200,8 @@ def identify_points(
         )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    # here: most programs need none of it, and it loads for half a second
+    from scipy import stats
 
     generator = np.random.default_rng(seed)
 
@@ -272,23 +269,22 @@ def identify(
         )
         parts.append(record_points(env, seed, share))
     gravity = [make_gravity(env.unwrapped.assumed_model) for env in envs]
-    points = [StaticPoints.joined(world) for world in zip(*parts, strict=True)]
+    points = [StaticPoints.join(world) for world in zip(*parts, strict=True)]
     return [identify_points(world, gravity, seed=seed or 0) for world in points], points
 
 
 def _expanded_level(positions: int, level: float = 0.95) -> float:
-    """Level of a percentile interval that covers `level` with few positions, where the plain one is
-    too narrow.
+    """Level of a percentile interval that covers `level` with few positions.
+
+    There the plain one is too narrow.
 
     The expanded percentile interval of T. Hesterberg, "What Teachers Should Know About the
     Bootstrap", The American Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the
     normal quantile.
     """
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    # here: most programs need none of it, and it loads for half a second
+    from scipy import stats
 
-    quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf(
-        (1.0 + level) / 2.0, positions - 1
-    )
+    t = stats.t.ppf((1.0 + level) / 2.0, positions - 1)
+    quantile = np.sqrt(positions / (positions - 1)) * t
     return float(1.0 - 2.0 * stats.norm.sf(quantile))

@@ -1,6 +1,4 @@
-"""Signs of a log that contradict the model: encoders that are swapped, and joints that turn the
-other way.
-"""
+"""Signs of a log that contradict the model: swapped encoders, joints that turn the other way."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -93,7 +91,7 @@ def require_signs(model: PoseModel, spread_of: Callable[[PoseModel], float]) -> 
     joints = model.log.joints
     if len(joints) > _MOST_JOINTS:
         return
-    found = {joint: spread_of(replace(model, log=turned(model.log, joint))) for joint in joints}
+    found = {joint: spread_of(replace(model, log=turn_joint(model.log, joint))) for joint in joints}
     least = min(found.values())
     if least < _BETTER * spread_of(model):
         wrong = [joint for joint, own in found.items() if own < 2.0 * least]
@@ -104,7 +102,7 @@ def require_signs(model: PoseModel, spread_of: Callable[[PoseModel], float]) -> 
         )
 
 
-def turned(log: PoseLog, joint: str) -> PoseLog:
+def turn_joint(log: PoseLog, joint: str) -> PoseLog:
     """A log in which a joint turns the other way."""
     at = np.array(log.joints) == joint
     measured = log.measured

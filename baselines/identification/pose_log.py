@@ -3,21 +3,21 @@
 docs/identification.md describes it.
 """
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal
 
 import numpy as np
+import pandas as pd
 
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.signals import Array
 
 Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
-"""What a log has besides the motor encoders."""
+"""Measurements of a log besides the motor encoders."""
 
 KINDS: dict[str, tuple[Kind, str]] = {
     "q": ("link_encoders", "rad"),
@@ -110,20 +110,18 @@ def read_log(
     if chosen == "link_encoders":
         _require_radians(path, "q", order, log.measured, ranges)
     if chosen == "imu":
-        _require_radians(
-            path, "imu", order, log.measured, dict.fromkeys(order, (-math.pi, math.pi))
-        )
+        turn = dict.fromkeys(order, (-math.pi, math.pi))
+        _require_radians(path, "imu", order, log.measured, turn)
     if np.ptp(log.theta, axis=0).max() < _ALIKE_RAD:
         raise ConfigurationError(
             f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log"
             " poses that differ in all joints, such as those that --plan proposes"
         )
-    return averaged(log)
+    return average_poses(log)
 
 
-def averaged(log: PoseLog) -> PoseLog:
-    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as
-    their mean.
+def average_poses(log: PoseLog) -> PoseLog:
+    """The log with the mean of consecutive rows whose encoders and sides of approach agree.
 
     Their friction and the errors of the model are the same, so that they do not count as
     independent.
@@ -145,17 +143,12 @@ def averaged(log: PoseLog) -> PoseLog:
 
 def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:
     """Write columns such as `theta.elbow`, each (N,), as a log with units in its header."""
-    units = [UNITS[name.split(".", 1)[0]] for name in columns]
-    header = [
-        name if unit == "1" else f"{name} [{unit}]"
-        for name, unit in zip(columns, units, strict=True)
-    ]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(
-            [[f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)]
-        )
+    table = pd.DataFrame(columns)
+    header = []
+    for name in columns:
+        unit = UNITS[name.split(".", 1)[0]]
+        header.append(name if unit == "1" else f"{name} [{unit}]")
+    table.to_csv(path, header=header, index=False, float_format="%.9g", lineterminator="\n")
     return path
 
 
@@ -228,9 +221,7 @@ def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
 
 
 def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> None:
-    """Refuse axes that are missing or unknown, and measurements of joints without a motor
-    encoder.
-    """
+    """Refuse axes that are missing or unknown, and joints without a motor encoder."""
     if kind in AXES and sorted(given) != sorted(AXES[kind]):
         raise ConfigurationError(
             f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
@@ -267,29 +258,15 @@ def _require_radians(
     low = np.where(finite[:, 0], bounds[:, 0] - _BEYOND_RAD, -_TURNS_RAD)
     high = np.where(finite[:, 1], bounds[:, 1] + _BEYOND_RAD, _TURNS_RAD)
     beyond = (angles < low) | (angles > high)
-    if beyond.any():
-        pose, column = np.argwhere(beyond)[0]
-        in_degrees = np.deg2rad(angles)
-        is_degrees = bool(((in_degrees >= low) & (in_degrees <= high)).all())
-        _refuse_angle(
-            path,
-            f"{quantity}.{of[column]}",
-            float(angles[pose, column]),
-            bounds[column],
-            is_degrees,
-            int(pose),
-        )
-
-
-def _refuse_angle(
-    path: Path, name: str, angle: float, bounds: Array, is_degrees: bool, pose: int
-) -> NoReturn:
-    cure = (
-        "the angles look like degrees: convert them to radians"
-        if is_degrees
-        else "give angles in radians, in the zero and the sign of the model"
-    )
+    if not beyond.any():
+        return
+    pose, column = np.argwhere(beyond)[0]
+    in_degrees = np.deg2rad(angles)
+    cure = "give angles in radians, in the zero and the sign of the model"
+    if ((in_degrees >= low) & (in_degrees <= high)).all():
+        cure = "the angles look like degrees: convert them to radians"
     raise ConfigurationError(
-        f"{path}, pose {pose + 1}, column {name}: {angle:g} rad lies beyond the joint's range of"
-        f" {bounds[0]:g} to {bounds[1]:g} rad; {cure}"
+        f"{path}, pose {pose + 1}, column {quantity}.{of[column]}: {angles[pose, column]:g} rad"
+        f" lies beyond the joint's range of {bounds[column, 0]:g} to {bounds[column, 1]:g} rad;"
+        f" {cure}"
     )

@@ -1,4 +1,4 @@
-r"""What static poses show of an arm with elastic joints, and how that changes with the unknowns.
+r"""Measurements of an arm with elastic joints at rest, and their derivatives by the unknowns.
 
 The encoders read θ + o. At rest the transmissions carry
 
@@ -28,7 +28,7 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.joint.load_path import follow_load
 
 Frame = Literal["known", "offset", "pose"]
-"""What is known of the measurement's frame: all, its directions, or nothing."""
+"""Knowledge of the measurement's frame: all, its directions, or nothing."""
 
 LARGEST_DEFLECTION_RAD = 0.3
 """Scale of the unknown compliances: the largest torque of a joint bends it by about as much, or
@@ -51,7 +51,7 @@ _FARTHEST_RAD = 1e3
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Where the unknowns stand in one vector: c, o, F of the elastic joints, m, then the frame.
+    """Places of the unknowns in one vector: c, o, F of the elastic joints, m, then the frame.
 
     Attributes:
         elastic: Positions of the joints whose stiffness is sought, (k,).
@@ -139,9 +139,7 @@ class PoseModel:
         return scale
 
     def start_with(self, deflection_rad: float) -> Array:
-        """Unknowns to begin with, (p,): joints that bend by as much under their largest torque,
-        and zeros.
-        """
+        """Unknowns to begin with, (p,): a deflection under each largest torque, and zeros."""
         values = np.zeros(self.unknowns.size)
         compliance = self.unknowns.slices["compliance"]
         values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
@@ -153,20 +151,20 @@ class PoseModel:
         if not self.unknowns.rotation:
             return np.eye(3)
         at = self.arm.attitude(self.log.theta)
-        shown = self.log.measured
-        own = at.position
         if self.log.kind == "imu":
             shown = vertical(self.log.measured)
             own = at.rotation.transpose(0, 2, 1) @ self.arm.up
-            return Rotation.align_vectors(shown, own)[0].as_matrix()
-        return Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[
-            0
-        ].as_matrix()
+        else:
+            shown = self.log.measured - self.log.measured.mean(axis=0)
+            own = at.position - at.position.mean(axis=0)
+        return Rotation.align_vectors(shown, own)[0].as_matrix()
 
     @property
     def target(self) -> Array:
-        """What `predicted` has to meet, (N, m)."""
-        return np.zeros((len(self.log), 2)) if self.log.kind == "imu" else self.log.measured
+        """Measurements that `predict` has to meet, (N, m)."""
+        if self.log.kind == "imu":
+            return np.zeros((len(self.log), 2))
+        return self.log.measured
 
     def expand(self, unknowns: Array, name: str) -> Array:
         """One of c, o, F of all joints, zero where it is not sought, (n,)."""
@@ -180,7 +178,7 @@ class PoseModel:
         return float(unknowns[self.unknowns.slices["payload"]].sum())
 
     def torque(self, unknowns: Array, q: Array) -> Array:
-        """What the transmissions carry at link angles, (N, n) [N·m]."""
+        """Torques that the transmissions carry at link angles, (N, n) [N·m]."""
         torque = self.arm.torque(q)
         if self.unknowns.payload:
             torque = torque + self.payload_kg(unknowns) * self.arm.payload_torque(q)
@@ -240,7 +238,7 @@ class PoseModel:
             )
         return path.q
 
-    def predicted(self, unknowns: Array) -> tuple[Array, Array]:
+    def predict(self, unknowns: Array) -> tuple[Array, Array]:
         """Measurements, (N, m), and their derivatives by the unknowns, (N, m, p)."""
         q, inverse = self.link_angles(unknowns)
         dq = self._link_gradient(unknowns, q, inverse)
@@ -259,29 +257,26 @@ class PoseModel:
         elastic = self.unknowns.elastic
         compliance = self.expand(unknowns, "compliance")
         gradient = np.zeros((*q.shape, self.unknowns.size))
-        gradient[..., own["compliance"]] = -(inverse * self.torque(unknowns, q)[:, None])[
-            ..., elastic
-        ]
+        by_torque = inverse * self.torque(unknowns, q)[:, None]
+        gradient[..., own["compliance"]] = -by_torque[..., elastic]
         gradient[..., own["offset"]] = -inverse[..., elastic]
         if self.log.direction is not None:
-            gradient[..., own["friction"]] = -(
-                inverse * (compliance * self.log.direction)[:, None]
-            )[..., elastic]
+            by_friction = inverse * (compliance * self.log.direction)[:, None]
+            gradient[..., own["friction"]] = -by_friction[..., elastic]
         if self.unknowns.payload:
-            gradient[..., own["payload"]] = (
-                -inverse @ (compliance * self.arm.payload_torque(q))[..., None]
-            )
+            bend = compliance * self.arm.payload_torque(q)
+            gradient[..., own["payload"]] = -inverse @ bend[..., None]
         return gradient
 
     def _turned(self, unknowns: Array) -> Array:
         """Rotation from the model's to the measurement's frame, (3, 3)."""
         turn = unknowns[self.unknowns.slices["rotation"]]
-        return (
-            Rotation.from_rotvec(turn).as_matrix() @ self._aligned if len(turn) else self._aligned
-        )
+        if not len(turn):
+            return self._aligned
+        return Rotation.from_rotvec(turn).as_matrix() @ self._aligned
 
     def _positions(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
-        """What a tracker shows [m]."""
+        """Positions that a tracker shows [m]."""
         own = self.unknowns.slices
         R = self._turned(unknowns)
         at = self.arm.attitude(q)
@@ -294,9 +289,7 @@ class PoseModel:
         return turned + (shift if len(shift) else 0.0), gradient
 
     def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
-        """Tilt between the vertical that the IMU should see and the one that it saw, about two
-        axes [rad].
-        """
+        """Tilt between the verticals that the IMU should see and saw, about two axes [rad]."""
         own = self.unknowns.slices
         R = self._turned(unknowns)
         at = self.arm.attitude(q)
@@ -310,22 +303,20 @@ class PoseModel:
         return (across @ seen[..., None])[..., 0], across @ gradient
 
     def _torques(self, unknowns: Array, q: Array, dq: Array, at: list[int]) -> tuple[Array, Array]:
-        """What torque sensors show [N·m]."""
+        """Torques that sensors show [N·m]."""
         own = self.unknowns.slices
         elastic = self.unknowns.elastic
         gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns)) @ dq
         if self.log.direction is not None:
-            gradient[..., own["friction"]] += (np.eye(q.shape[1]) * self.log.direction[:, None])[
-                ..., elastic
-            ]
+            sides = np.eye(q.shape[1]) * self.log.direction[:, None]
+            gradient[..., own["friction"]] += sides[..., elastic]
         if self.unknowns.payload:
             gradient[..., own["payload"]] += self.arm.payload_torque(q)[..., None]
         return self.torque(unknowns, q)[:, at], gradient[:, at]
 
 
 def vertical(attitude: Array) -> Array:
-    """Unit vector against gravity in the frame of an IMU, from roll and pitch, (N, 2) [rad] to (N,
-    3).
+    """Unit vector against gravity in an IMU's frame from roll and pitch, (N, 2) [rad] to (N, 3).
 
     Of R = R_z(yaw) R_y(pitch) R_x(roll), from the IMU's to the world's frame, it is the last row.
     """

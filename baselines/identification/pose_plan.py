@@ -1,5 +1,4 @@
-r"""Which further poses would tell the stiffness of joints apart: a D_s-optimal choice from random
-poses.
+r"""Further poses that tell stiffness apart: a D_s-optimal choice from random poses.
 
 Poses are drawn within the joint ranges. Those in which parts of the arm touch are dropped, where
 the model has shapes. Of the rest those are chosen that shrink the joint confidence region of the
@@ -89,8 +88,9 @@ def plan_further(fit: ArmFit, candidates: PoseLog, count: int) -> PosePlan:
 def candidate_poses(
     arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, generator: np.random.Generator
 ) -> PoseLog:
-    """Random poses within limits and without contacts; pairs of bodies that touch in all poses of
-    the log do not count.
+    """Random poses within limits and without contacts.
+
+    Pairs of bodies that touch in all poses of the log do not count.
 
     Args:
         arm: The arm.
@@ -121,10 +121,11 @@ def candidate_poses(
                 " ranges and shapes of the model, or give a model without shapes"
             )
     theta = np.array(poses)
-    sides = None if like.direction is None else generator.choice([-1.0, 1.0], size=theta.shape)
-    return PoseLog(
-        arm.joints, theta, like.kind, like.columns, _rigid_measurement(arm, like, theta), sides
-    )
+    sides = None
+    if like.direction is not None:
+        sides = generator.choice([-1.0, 1.0], size=theta.shape)
+    measured = _rigid_measurement(arm, like, theta)
+    return replace(like, theta=theta, measured=measured, direction=sides)
 
 
 def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
@@ -135,8 +136,9 @@ def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
 
 
 def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
-    """What a sensor in the model's own frame would show of rigid joints; only its directions
-    matter, (N, m).
+    """Measurement of a sensor in the model's own frame, of rigid joints.
+
+    Only its directions matter, (N, m).
     """
     if like.kind == "end_effector":
         return arm.attitude(theta).position
@@ -146,7 +148,7 @@ def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
 
 
 class _Contacts:
-    """Which pairs of bodies touch.
+    """Pairs of bodies that touch.
 
     Args:
         model: The arm with its shapes.
@@ -196,7 +198,7 @@ def _best(rows: Array, information: Array, taken: list[int], sought: int) -> tup
 
 
 def _gain(rows: Array, information: Array) -> Array:
-    """What each pose adds to log det M, (candidates,), by the determinant lemma."""
+    """Gain of each pose in log det M, (candidates,), by the determinant lemma."""
     if not len(information):
         return np.zeros(len(rows))
     inner = rows @ np.linalg.solve(information, rows.transpose(0, 2, 1))

@@ -1,6 +1,4 @@
-"""An arm at rest as identification needs it: torques with and without a payload, and where a
-body of it is.
-"""
+"""An arm at rest: torques with and without a payload, and the pose of a body of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -102,7 +100,7 @@ class StaticArm:
         return _rows(self._bare, q)
 
     def payload_torque(self, q: Array) -> Array:
-        """What a payload of 1 kg adds, (N, n) [rad] to (N, n) [N·m]; zero without a payload."""
+        """Torque that a payload of 1 kg adds, (N, n) [rad] to (N, n) [N·m]; 0 without one."""
         return (
             np.zeros(q.shape)
             if self._loaded is None
@@ -122,7 +120,7 @@ class StaticArm:
         return np.stack(columns, axis=-1)
 
     def attitude(self, q: Array) -> Attitude:
-        """Where the end effector is, (N, n) [rad]."""
+        """Poses of the end effector, (N, n) [rad]."""
         count, n = q.shape
         found = Attitude(*(np.empty((count, 3, k) if k else (count, 3)) for k in (0, 3, n, n)))
         jacobians: Any = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
@@ -141,9 +139,7 @@ class StaticArm:
 
 
 def _rows(compensator: PositionCompensator, q: Array) -> Array:
-    """Torques at rest of all poses at once, with the bits of `PositionCompensator.torque`, (N,
-    n) [N·m].
-    """
+    """Torques at rest of all poses, with the bits of `PositionCompensator.torque`, (N, n) [N·m]."""
     return compensator._links.gravity_torque(q)
 
 

@@ -1,9 +1,7 @@
-"""Static points of a joint: encoder and IMU averaged at rest, at positions approached from both
-sides.
-"""
+"""Static points of a joint: encoder and IMU at rest, approached from both sides."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -38,32 +36,25 @@ class StaticPoints:
 
     def rows(self, chosen: IntArray) -> "StaticPoints":
         """Some of the points, in the given order."""
-        return StaticPoints(
-            self.theta[chosen],
-            self.q[chosen],
-            self.direction[chosen],
-            self.position[chosen],
-            self.load[chosen],
-        )
+        columns = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return StaticPoints(**columns)
 
     @staticmethod
-    def joined(parts: "Sequence[StaticPoints]") -> "StaticPoints":
+    def join(parts: "Sequence[StaticPoints]") -> "StaticPoints":
         """The points of several loads together, positions numbered through."""
-        first = np.concatenate([[0], np.cumsum([part.position.max() + 1 for part in parts])[:-1]])
-        return StaticPoints(
-            theta=np.concatenate([part.theta for part in parts]),
-            q=np.concatenate([part.q for part in parts]),
-            direction=np.concatenate([part.direction for part in parts]),
-            position=np.concatenate(
-                [part.position + start for part, start in zip(parts, first, strict=True)]
-            ),
-            load=np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)]),
-        )
+        numbered: list[StaticPoints] = []
+        first = 0
+        for load, part in enumerate(parts):
+            own = replace(part, position=part.position + first, load=np.full(len(part), load))
+            first += part.position.max() + 1
+            numbered.append(own)
+        names = [field.name for field in fields(StaticPoints)]
+        columns = {name: [getattr(part, name) for part in numbered] for name in names}
+        return StaticPoints(**{name: np.concatenate(own) for name, own in columns.items()})
 
 
 class HoldRecorder:
-    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations
-    and infos alone.
+    """Averages encoder and IMU over the windows at rest of a `hold` reference.
 
     Args:
         directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
@@ -76,16 +67,14 @@ class HoldRecorder:
         self._counts = np.zeros(len(directions), dtype=np.int64)
 
     def take(self, encoder: Array, imu: Array, rest: int) -> None:
-        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window,
-        -1 outside.
-        """
+        """Take in encoder and IMU, (num_worlds,) [rad], and the window, -1 outside."""
         if rest >= 0:
             self._sums[rest] += np.stack([encoder, imu], axis=-1)
             self._counts[rest] += 1
 
     @property
     def is_complete(self) -> bool:
-        """Whether every window has been visited."""
+        """True when every window has been visited."""
         return bool(self._counts.all())
 
     def points(self) -> list[StaticPoints]:
@@ -146,9 +135,7 @@ def record_points(
 
 
 def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], q: Array) -> Array:
-    """Gravity torque at link angles q, each under the load of its point, (len(points),) [rad] to
-    [N·m].
-    """
+    """Gravity torque at link angles q [rad], each under its point's load, (len(points),) [N·m]."""
     torque = np.empty(len(points))
     for load, model in enumerate(gravity):
         rows = points.load == load

@@ -6,6 +6,7 @@ pair of joints. It is decided from the features of `baselines.residual.features`
 becomes an input of the base (`baselines.compensation.inputs`).
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,6 @@ from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
     Action,
-    ObservationView,
     Policy,
     PolicyInputs,
     as_action,
@@ -60,14 +60,13 @@ class Corrected:
                 f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set"
                 " cautious: false"
             )
-        self.base = as_batch_policy(base, model.observation_table, model.control_period_s)
+        self.base = as_batch_policy(base, model)
         self.settings = settings
         self.model = model
-        self.view = ObservationView(model.observation_table, model.control_period_s)
+        self.view = self.base.view
         self.channels = Channels(model, settings)
-        self._share = 1.0 - float(
-            np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s)
-        )
+        turns = settings.cutoff_hz * model.control_period_s
+        self._share = 1.0 - float(np.exp(-2.0 * np.pi * turns))
 
     @property
     def num_residuals(self) -> int:
@@ -76,9 +75,8 @@ class Corrected:
 
     def begin(self, rows: Array) -> CorrectedMemory:
         """Memory at the start of an episode, whose first observations are rows, (num_worlds, m)."""
-        return CorrectedMemory(
-            np.zeros((len(rows), len(self.channels.bounds))), self.base.begin(rows)
-        )
+        values = np.zeros((len(rows), len(self.channels.bounds)))
+        return CorrectedMemory(values, self.base.begin(rows))
 
     def act(
         self, observation: Array, residual: Array, state: Any = None, episode_start: Any = None
@@ -115,21 +113,17 @@ class Corrected:
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        memory = resume_memory(
-            self.base, rows, None if state is None else state.inner, episode_start
-        )
+        inner = None if state is None else state.inner
+        memory = resume_memory(self.base, rows, inner, episode_start)
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Estimated link angle for an observation and the state that `act` returned for it,
-        (..., n) [rad].
-        """
+        """Estimated link angle for an observation and the state after it, (..., n) [rad]."""
         return self.base.link_estimate(observation, state.inner)
 
 
 class Channels:
-    """Columns on which a residual acts, by its settings: those of all its inputs, one input after
-    the other.
+    """Columns on which a residual acts, those of one input after the other.
 
     Args:
         model: What may be known of the robot.
@@ -162,14 +156,13 @@ class Channels:
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
         order = list(signals)
-        self._source = np.array(
-            [0 if source is None else order.index(source) for source in sources]
+        self._source = np.array([order.index(source) if source else 0 for source in sources])
+        self.signals = tuple(
+            replace(signal, name=name, low=-1.0, high=1.0) for name, signal in signals.items()
         )
-        self.signals = tuple(_rename(signal, name) for name, signal in signals.items())
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
-        """Values of all columns after a share of their way to what a residual wants, (num_worlds,
-        width).
+        """Values of all columns after a share of their way to a residual, (num_worlds, width).
 
         Args:
             values: Before.
@@ -196,7 +189,7 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
     bounds = np.zeros(len(names))
     for wanted, value in bound.items():
         bounds[fit_columns(wanted, names, kind)] = value
-    missing = [column for column, acts in zip(names, chosen & (bounds == 0.0), strict=True) if acts]
+    missing = np.array(names)[chosen & (bounds == 0.0)].tolist()
     if missing and kind.axes is None and settings.joints is not None:
         raise ConfigurationError(
             f"{name} must have a bound for every joint of `joints`, none fits {missing}"
@@ -220,7 +213,3 @@ def _without_side(name: str) -> str:
     """A column's name without its side."""
     group, _, part = name.partition(".")
     return f"{group}.{part.removeprefix('l_').removeprefix('r_')}"
-
-
-def _rename(signal: Signal, name: str) -> Signal:
-    return Signal(name, signal.unit, signal.meaning, -1.0, 1.0, mirrored=signal.mirrored)

@@ -21,7 +21,6 @@ import numpy as np
 from baselines.adaptation.estimators import mean_load
 from baselines.compensation.policy import Records
 from baselines.estimation.bending import BendingObserver
-from baselines.residual.correction import Corrected
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import WalkerModel
 
@@ -41,9 +40,7 @@ _LOAD = _SEEN.names.index("excess_load")
 
 
 class EvidenceMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the
-    observer.
-    """
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the observer's memory."""
 
     loads: Array
     bending: Records
@@ -73,21 +70,8 @@ class Evidence:
         return g[:, None], EvidenceMemory(loads, bending)
 
 
-def caution(corrected: Corrected) -> Evidence | None:
-    """Judge of how far a residual may act; None for one that is not cautious."""
-    model = corrected.model
-    settings = corrected.settings
-    if settings.cautious and isinstance(
-        model, WalkerModel
-    ):  # `Corrected` refuses it for other robots
-        return Evidence(model, settings.decision_period * model.control_period_s)
-    return None
-
-
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:
-    """g, (...), from ρ of the legs and its uncertainty, (..., 2), and the mean excess μ of the
-    load, (...) [1].
-    """
+    """g, (...), from ρ of the legs and its error, (..., 2), and the mean load μ, (...) [1]."""
     bending = model_error**2 / (ERROR_SCALE**2 + (2.0 * uncertainty) ** 2)
     squared = (np.mean(bending, axis=-1) + (excess_load / LOAD_SCALE) ** 2) ** 2
     return squared / (1.0 + squared)

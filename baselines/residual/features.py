@@ -1,5 +1,4 @@
-"""Features that decide a residual: groups of the observation, and what can be said from it, the
-plan and the model.
+"""Features that decide a residual: from the observation, the plan and the model.
 
 | name | what it is |
 |---|---|
@@ -14,7 +13,7 @@ plan and the model.
 """  # noqa: E501
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,30 +31,10 @@ OBSERVATION = "observation"
 BASE_ACTION = "base_action"
 
 
-class Source(Protocol):
-    """Some features from observations; its memory is an array or a named tuple, one row per
-    world.
-    """
-
-    @property
-    def signals(self) -> tuple[Signal, ...]:
-        """Signals of its features."""
-        ...
-
-    def begin(self, num_worlds: int) -> Any:
-        """Memory before the first measurement."""
-        ...
-
-    def observe(self, rows: Array, memory: Any) -> tuple[Array, Any]:
-        """Features of observations, (num_worlds, m) to (num_worlds, signals), and the new
-        memory.
-        """
-        ...
-
-
 class FeaturesMemory(NamedTuple):
-    """Measurements of the last decisions, (num_worlds, history · k), the latest first; memory of
-    the sources.
+    """Measurements of the last decisions, (num_worlds, history · k), the latest first.
+
+    Memory of the sources.
     """
 
     past: Array
@@ -63,8 +42,9 @@ class FeaturesMemory(NamedTuple):
 
 
 class Features:
-    """Features that decide a residual, in the order of the settings; the base's action and earlier
-    measurements last.
+    """Features that decide a residual, in the order of the settings.
+
+    The base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -78,21 +58,14 @@ class Features:
         model = corrected.model
         self._corrected = corrected
         period_s = settings.decision_period * model.control_period_s
-        self._sources = [
-            _source(name, model, period_s) for name in _source_names(settings.observe, model)
-        ]
+        names = _source_names(settings.observe, model)
+        self._sources = [_source(name, model, period_s) for name in names]
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
-        self._measured = np.array(
-            [i for i, signal in enumerate(seen) if signal.kind == "measured"], dtype=np.int64
-        )
+        self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
         self._history = settings.history
-        commands = (
-            rename_group(model.observation_table.signals_of("last_command"), BASE_ACTION)
-            if self._acts
-            else ()
-        )
-        self.signals = (*seen, *commands)
+        commands = model.observation_table.signals_of("last_command") if self._acts else ()
+        self.signals = (*seen, *rename_group(commands, BASE_ACTION))
         self.width = len(self.signals) + self._history * len(self._measured)
         measured = [seen[i] for i in self._measured]
         self._mirror = LeftFirst(self.signals, measured, corrected) if settings.mirror else None
@@ -122,23 +95,20 @@ class Features:
         Returns:
             (num_worlds, width), and the memory.
         """
-        n = len(rows)
-        begun = self.begin(n)
+        kept = self.begin(len(rows))
         if memory is None:
             fresh = np.ones_like(fresh)
-        kept: FeaturesMemory = (
-            begun if memory is None else put_rows(memory, fresh, select_rows(begun, fresh))
-        )
-        observed = [
-            source.observe(rows, own)
-            for source, own in zip(self._sources, kept.sources, strict=True)
-        ]
-        seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
+        else:
+            kept = put_rows(memory, fresh, select_rows(kept, fresh))
+        pairs = zip(self._sources, kept.sources, strict=True)
+        observed = [source.observe(rows, own) for source, own in pairs]
+        seen = np.hstack([np.zeros((len(rows), 0)), *(values for values, _ in observed)])
         measured = seen[:, self._measured]
         past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), kept.past)
         parts = [seen]
         if self._acts:
-            parts.append(self._corrected.base_action(rows, state, episode_start).astype(np.float64))
+            action = self._corrected.base_action(rows, state, episode_start)
+            parts.append(action.astype(np.float64))
         features = np.hstack([*parts, past])
         if self._mirror is not None:
             features = self._mirror(rows, features)
@@ -146,8 +116,9 @@ class Features:
         return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself
-        without one.
+        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k).
+
+        Itself without one.
 
         Args:
             rows: Observations of the decision.
@@ -163,9 +134,9 @@ def _groups(model: RobotModel) -> list[str]:
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     """Names of the sources, with all groups for the whole observation."""
-    names = [
-        group for name in observe for group in (_groups(model) if name == OBSERVATION else [name])
-    ]
+    names: list[str] = []
+    for name in observe:
+        names += _groups(model) if name == OBSERVATION else [name]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ConfigurationError(
@@ -174,26 +145,33 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     return [name for name in names if name != BASE_ACTION]
 
 
-def _source(name: str, model: RobotModel, period_s: float) -> Source:
-    if name in _groups(model) or name in model.observation_table.names:
-        group = model.observation_table.group(name)
-        return _Instant(model.observation_table.signals[group], lambda rows: rows[:, group])
-    if name in _ERRORS and set(_ERRORS[name]) <= set(_groups(model)):
-        return _error(name, model)
-    if isinstance(model, WalkerModel) and name == "contact_error":
-        return _ContactError(model, period_s)
-    if isinstance(model, WalkerModel) and name == "level":
-        return GroundLevel(model, period_s)
-    if isinstance(model, WalkerModel) and name == "bending":
-        return BendingObserver(model)
-    errors = [error for error, groups in _ERRORS.items() if set(groups) <= set(_groups(model))]
-    further = [
-        *errors,
-        *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else []),
-    ]
-    raise unknown_name(
-        "feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)]
-    )
+def _source(name: str, model: RobotModel, period_s: float) -> Any:
+    """A source of features.
+
+    It has `signals`, `begin(num_worlds)` makes its memory, and `observe(rows, memory)` returns
+    features and the new memory.
+    """
+    table = model.observation_table
+    groups = _groups(model)
+    if name in groups or name in table.names:
+        columns = table.group(name)
+        return _Instant(table.signals[columns], lambda rows: rows[:, columns])
+    further = [error for error, pair in _ERRORS.items() if set(pair) <= set(groups)]
+    if name in further:
+        whole, less = (table.group(group) for group in _ERRORS[name])
+        signals = rename_group(table.signals_of("encoder_angle"), name)
+        return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
+    if isinstance(model, WalkerModel):
+        match name:
+            case "contact_error":
+                return _ContactError(model, period_s)
+            case "level":
+                return GroundLevel(model, period_s)
+            case "bending":
+                return BendingObserver(model)
+        further += ["contact_error", "level", "bending"]
+    known = [OBSERVATION, BASE_ACTION, *further, *groups]
+    raise unknown_name("feature of a residual", name, known)
 
 
 class _Instant:
@@ -217,16 +195,8 @@ _ERRORS = {
 """Differences of two groups of the observation with a column per joint."""
 
 
-def _error(name: str, model: RobotModel) -> _Instant:
-    table = model.observation_table
-    whole, less = (table.group(group) for group in _ERRORS[name])
-    signals = rename_group(table.signals_of("encoder_angle"), name)
-    return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
-
-
 class _ContactError:
-    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less
-    the planned ones.
+    """ZMP [m] and load share by the foot wrenches of flat feet, less the planned ones.
 
     The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too
     little for a ZMP.
@@ -248,8 +218,7 @@ class _ContactError:
         table = model.observation_table
         biped = model.biped
         self._level = GroundLevel(model, period_s)
-        self._share = table.group("load_share")
-        self._zmp = table.group("zmp_reference")
+        self._planned = table.columns("zmp_reference.x", "zmp_reference.y", "load_share")
         self._sensors = FootSensors.of_biped(biped)
         self._ankles = biped.ankles
 
@@ -262,10 +231,8 @@ class _ContactError:
         force, moment = self._sensors.ground_wrench(
             wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
         )
-        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
+        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N)
         vertical = force[:, :, 2].sum(axis=1)
-        share = (
-            force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
-            - rows[:, self._share][:, 0]
-        )
-        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0), memory
+        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
+        error = np.column_stack([zmp, share]) - rows[:, self._planned]
+        return np.nan_to_num(error, nan=0.0), memory

@@ -1,5 +1,6 @@
-"""A walker seen in the mirror of its plane of symmetry, x and z: what the right leg does looks as
-if the left did it.
+"""A walker seen in the mirror of its plane of symmetry, x and z.
+
+What the right leg does looks as if the left did it.
 
 A robot that is its own mirror image needs one answer for both of its steps. A residual that always
 sees the step on the left foot has half as much to learn, and learns it from twice as many steps. In
@@ -98,8 +99,7 @@ class LeftFirst:
         self._support = model.observation_table.columns("clock.support")
 
     def __call__(self, rows: Array, features: Array) -> Array:
-        """Features as they are while the left foot is that of the step, and mirrored while the
-        right is.
+        """Features as they are in a step of the left foot, and mirrored in one of the right.
 
         Args:
             rows: Observations, (num_worlds, m).
@@ -113,9 +113,7 @@ class LeftFirst:
         return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """A residual as it acts, (num_worlds, k): what was decided in the mirror is its mirror
-        image.
-        """
+        """A residual as it acts, (num_worlds, k): a decision of the mirror is turned back."""
         return np.where(rows[:, self._support] == 1.0, self._residual(residual), residual)
 
 

@@ -1,11 +1,12 @@
 """The network of a residual in NumPy, and the tensors that make one."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.compiled import compiled
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.signals import Array
@@ -20,25 +21,6 @@ _LARGEST = 1e6
 _TYPES = ("float32", "float64")
 
 
-class NetworkSettings(Protocol):
-    """Settings of a network beside its tensors."""
-
-    @property
-    def activation(self) -> Literal["tanh", "relu"]:
-        """Between the layers."""
-        ...
-
-    @property
-    def output(self) -> Literal["clip", "tanh"]:
-        """How the last layer comes to [−1, 1]: clipped, or by tanh."""
-        ...
-
-    @property
-    def clip(self) -> float:
-        """Bound of normalised features, in standard deviations."""
-        ...
-
-
 def require_network(tensors: Tensors) -> int:
     """The number of layers of tensors that make a network.
 
@@ -46,7 +28,8 @@ def require_network(tensors: Tensors) -> int:
         ConfigurationError: Tensors that are missing, have a wrong shape or type, or are not finite.
     """
     depth = sum(name.startswith("weight") for name in tensors)
-    names = {"mean", "std", *(f"{kind}{i}" for i in range(depth) for kind in ("weight", "bias"))}
+    layers = range(depth)
+    names = {"mean", "std", *(f"weight{i}" for i in layers), *(f"bias{i}" for i in layers)}
     if not 1 <= depth <= _MOST_LAYERS or set(tensors) != names:
         raise ConfigurationError(
             f"weights must be mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers; "
@@ -54,16 +37,18 @@ def require_network(tensors: Tensors) -> int:
         )
     for name, tensor in tensors.items():
         _require_numbers(name, tensor)
-    for name in ("mean", *(f"bias{i}" for i in range(depth))):
+    vectors = ["mean", *(f"bias{i}" for i in range(depth))]
+    for name in vectors:
         if tensors[name].ndim != 1 or len(tensors[name]) == 0:
             raise ConfigurationError(
                 f"{name} must have the shape (n,) with n >= 1, got {tensors[name].shape}"
             )
-    widths = [len(tensors[name]) for name in ("mean", *(f"bias{i}" for i in range(depth)))]
+    widths = [len(tensors[name]) for name in vectors]
     for i in range(depth):
-        if (shape := tensors[f"weight{i}"].shape) != (widths[i + 1], widths[i]):
+        shape = (widths[i + 1], widths[i])
+        if tensors[f"weight{i}"].shape != shape:
             raise ConfigurationError(
-                f"weight{i} must have the shape {(widths[i + 1], widths[i])}, got {shape}"
+                f"weight{i} must have the shape {shape}, got {tensors[f'weight{i}'].shape}"
             )
     if tensors["std"].shape != tensors["mean"].shape or not (tensors["std"] > 0.0).all():
         raise ConfigurationError(
@@ -83,31 +68,27 @@ def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
 
 
 class Network:
-    """Feed-forward network in single precision, as it was trained: the mean action of normalised
-    features.
+    """Feed-forward network in single precision: the mean action of normalised features.
 
     A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant.
     They would also keep threads in the way of the physics.
 
     Args:
-        settings: Activation, output and clipping.
+        settings: Description of the residual, with activation, output and clipping.
         tensors: `mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ...
 
     Raises:
         ConfigurationError: Tensors that are missing, not finite, or do not fit one another.
     """
 
-    def __init__(self, settings: NetworkSettings, tensors: Tensors) -> None:
+    def __init__(self, settings: ResidualDescription, tensors: Tensors) -> None:
         depth = require_network(tensors)
         self._mean = tensors["mean"].astype(np.float64)
         self._std = tensors["std"].astype(np.float64)
-        self._layers = [
-            (
-                np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T),
-                tensors[f"bias{i}"].astype(np.float32),
-            )
-            for i in range(depth)
-        ]
+        self._layers: list[tuple[Single, Single]] = []
+        for i in range(depth):
+            W = np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T)
+            self._layers.append((W, tensors[f"bias{i}"].astype(np.float32)))
         self._activation = _ACTIVATIONS[settings.activation]
         self._output = settings.output
         self._clip = settings.clip
@@ -135,16 +116,16 @@ class Network:
 
 @compiled
 def affine(rows: Single, W: Single, b: Single) -> Single:
-    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up
-    in the same order.
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m).
+
+    All rows are added up in the same order.
     """
     out = np.empty((len(rows), len(b)), dtype=np.float32)
     for row in range(len(rows)):
         for j in range(len(b)):
             out[row, j] = b[j]
-        for i in range(
-            W.shape[0]
-        ):  # along the outputs, whose sums are apart, the processor works on several at once
+        # along the outputs, whose sums are apart, the processor works on several at once
+        for i in range(W.shape[0]):
             x = rows[row, i]
             for j in range(len(b)):
                 out[row, j] += x * W[i, j]

@@ -1,9 +1,9 @@
-"""How a residual acts and what it sees."""
+"""How a residual acts and what it sees, and the content of `residual.json`."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
@@ -11,6 +11,9 @@ from elastic_env.core.errors import quote, require_known
 
 Bound = float | dict[str, float]
 """Value at a residual of 1: for all columns of an input, or by joint or axis."""
+
+RESIDUAL = "residual:"
+"""Before the folder of a trained residual, where policies are named."""
 
 _OLD_SPACES = {"model": DEFLECTION, "joint": COMMAND}
 
@@ -92,3 +95,81 @@ class ResidualSettings(Model):
             name: INPUTS[name].default if bound is None else bound
             for name, bound in self.acts_on.items()
         }
+
+
+class TrainedOn(Model):
+    """Part of the configuration of a training that comparisons read."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[], max_length=MOST_ENTRIES)
+    scenarios: list[Title] | None = Field(default=None, max_length=MOST_ENTRIES)
+    reference: str | float | list[float] | dict[str, Any] | None = None
+
+
+class Origin(Model):
+    """Part of the origin of a residual that comparisons read; the rest of it is for people."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    config: TrainedOn = TrainedOn()
+    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    commit: Title | None = None
+
+
+class ResidualDescription(Model):
+    """Content of `residual.json`, about the weights beside it."""
+
+    robot: Title
+    """Task of the environment, walker or testbed."""
+    joints: list[Title] = Field(default=[], max_length=MOST_ENTRIES)
+    """Joints of the robot that it was trained on; none in folders from before they were written."""
+    base: Title
+    """Name of the base policy."""
+    base_options: dict[str, Any] = {}
+    settings: ResidualSettings = ResidualSettings()
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Between the layers."""
+    output: Literal["clip", "tanh"] = "clip"
+    """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6)
+    """Bound of normalised features, in standard deviations [1]."""
+    weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """Digest of the weights; None for those of folders from before it was written."""
+    training: dict[str, Any] = {}
+    """How it was trained: configuration, seed, versions, commit."""
+
+    @field_validator("base")
+    @classmethod
+    def _base_is_no_residual(cls, value: str) -> str:
+        return require_plain_base(value)
+
+    @field_validator("training")
+    @classmethod
+    def _origin_is_readable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        Origin(**value)
+        return value
+
+    @property
+    def origin(self) -> Origin:
+        """How it was trained, as far as comparisons read it."""
+        return Origin(**self.training)
+
+
+def require_plain_base(name: str) -> str:
+    """The name of a base policy.
+
+    Raises:
+        ValueError: It is itself a residual, which could name another, or itself; or it is code,
+            which a folder from elsewhere must not run.
+    """
+    if name.startswith(RESIDUAL):
+        raise ValueError(
+            f"the base of a residual must be no residual itself, got {name!r}; name a baseline"
+        )
+    if ":" in name:
+        raise ValueError(
+            f"the base of a residual must be no residual and no code, got {quote(name)}; name a "
+            "baseline, as a residual plays without code of its own"
+        )
+    return name

@@ -1,5 +1,4 @@
-r"""The walking controller: foot force difference control, and feedback of the center of mass from
-joint angles.
+r"""The walking controller: foot forces, and feedback of the center of mass from joint angles.
 
 * Foot force difference control [Kajita2010]: the leg that carries too little grows,
   ż = k ((F_l − F_r)_ref − (F_l − F_r)) − z/T, half of z on each side.
@@ -26,7 +25,6 @@ Tracking", IROS.
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -81,8 +79,7 @@ class WalkingGains(Model):
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Center of mass and feet as a controller sees them, level and relative to the pelvis, one row
-    per world.
+    """Center of mass and feet for a controller, level and relative to the pelvis, a row per world.
 
     Attributes:
         com: Center of mass, (num_worlds, 3) [m].
@@ -91,11 +88,6 @@ class LocalFrame:
 
     com: Array
     soles: Array
-
-    @property
-    def com_from_soles(self) -> Array:
-        """Center of mass relative to each sole, (num_worlds, 2, 3) [m]."""
-        return self.com[:, None] - self.soles
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
@@ -154,7 +146,7 @@ INPUTS = record_type(
     zmp=(2,),  # [m]
     com=(2,),  # [m]
     leg_length=(),  # [m]
-    hip=(2, 2),  # roll and pitch of either leg [rad]
+    hip=(2,),  # roll and pitch of both legs [rad]
     balance_gain=(),  # relative change [1]
     deflection=(2, 6),  # relative change [1]
 )
@@ -181,8 +173,8 @@ class WalkingController(BatchPolicy):
         gains: WalkingGains | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
+        super().__init__(model)
         table = model.observation_table
-        super().__init__(table, model.control_period_s)
         self._biped = model.biped
         self._walk_view = WalkView(table)
         self._attitude = table.group("imu_attitude")
@@ -213,9 +205,7 @@ class WalkingController(BatchPolicy):
 
     @override
     def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> tuple[Array, Records]:
-        """A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as
-        much.
-        """
+        """With a `deflection` r, handed on by a compensator, springs are wound by 1 + r as much."""
         observed = self._walk_view.fields(rows)
         com, soles = self._biped.chains.com_and_feet(
             rows[:, self._theta], self._sole, rows[:, self._attitude]
@@ -244,8 +234,9 @@ class WalkingController(BatchPolicy):
         return action.astype(np.float32), now
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for
-        those of the plan.
+        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1].
+
+        (0,) for those of the plan.
         """
         if shift is None:
             return _NO_SHARES
@@ -294,28 +285,14 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     """Inputs as rows of `INPUTS`, (num_worlds,)."""
-    if inputs is NO_INPUTS or inputs is ONE_WORLD:
-        return _none(num_worlds)
     dense = np.zeros(num_worlds, INPUTS)
-    if inputs.zmp is not None:
-        dense["zmp"] = inputs.zmp
-    if inputs.com is not None:
-        dense["com"] = inputs.com
-    if inputs.leg_length is not None:
-        dense["leg_length"] = inputs.leg_length[:, 0]
-    if inputs.balance_gain is not None:
-        dense["balance_gain"] = inputs.balance_gain[:, 0]
-    if inputs.hip is not None:
-        dense["hip"] = inputs.hip if inputs.hip.ndim == 3 else inputs.hip[:, None]
-    if inputs.deflection is not None:
-        dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
+    if inputs is NO_INPUTS or inputs is ONE_WORLD:
+        return dense
+    for name in INPUTS.names or ():
+        values = getattr(inputs, name)
+        if values is not None:
+            dense[name] = values.reshape(dense[name].shape)
     return dense
-
-
-@lru_cache
-def _none(num_worlds: int) -> Records:
-    """No inputs, which the kernel does not change."""
-    return np.zeros(num_worlds, INPUTS)
 
 
 def _share(period_s: float, time_constant_s: float) -> float:
@@ -391,8 +368,9 @@ def control(
 
 @compiled
 def follow_zmp(center: float, zmp: float, share: float) -> float:
-    """The center of mass a period later, under a ZMP shift that stays as it is; see
-    `baselines.walking.zmp_shift`.
+    """The center of mass a period later, under a ZMP shift that stays as it is.
+
+    See `baselines.walking.zmp_shift`.
     """
     return center + share * (zmp - center)
 
@@ -444,7 +422,8 @@ def follow_com(
                 deviating - last.velocity[i]
             )
             error = deviation + own.velocity[i] / controller.omega
-            wanted = within((1.0 + change) * controller.dcm * error, controller.zmp_limit_m)
+            gain = (1.0 + change) * controller.dcm
+            wanted = within(gain * error, controller.zmp_limit_m)
             own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
 
 
@@ -452,8 +431,9 @@ def follow_com(
 def offset_leg(
     controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array
 ) -> None:
-    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added,
-    and friction [rad].
+    """Offsets of a leg's joints [rad].
+
+    They hold its length, the torque of the ZMP shift, what is added, and friction.
     """
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
@@ -467,9 +447,9 @@ def offset_leg(
         wound = 1.0 + given.deflection[leg, i]
         moved = 0.0
         if i == 1:
-            moved = given.hip[leg, 0]
+            moved = given.hip[0]
         elif i == 2:
-            moved = hip + given.hip[leg, 1]
+            moved = hip + given.hip[1]
         elif i == 3:
             moved = knee
         elif i == 4:
@@ -485,8 +465,7 @@ def offset_leg(
 def lengthening(
     controller: Any, knee: float, difference: float, sign: float
 ) -> tuple[float, float, float]:
-    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or
-    shorten it [rad].
+    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference [rad].
 
     The ankle stays on the line from the hip, and the sole keeps its attitude.
     """

@@ -1,5 +1,6 @@
-r"""Balance by moving the feet: the published stabiliser of THORMANG3, in the place of the walking
-controller.
+r"""Balance by moving the feet: the published stabiliser of THORMANG3.
+
+It takes the place of the walking controller.
 
 The planned poses of the feet in the pelvis are adjusted, and inverse kinematics give the joint
 angles:
@@ -92,11 +93,11 @@ class FootBalance(BatchPolicy):
     """
 
     def __init__(
-        self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S
+        self, model: WalkerModel, gains: FootBalanceGains, ramp_s: float = STAND_S
     ) -> None:
+        super().__init__(model)
         table = model.observation_table
-        super().__init__(table, model.control_period_s)
-        self._gains = gains or FootBalanceGains()
+        self._gains = gains
         self._biped = model.biped
         self._plan = model.plan
         self._dt = model.control_period_s
@@ -134,9 +135,7 @@ class FootBalance(BatchPolicy):
         return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
     def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> tuple[Array, Array]:
-        """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y, (num_worlds, 2,
-        2) [rad].
-        """
+        """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y [rad]."""
         gains = self._gains
         row = np.clip(
             np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1,
@@ -157,9 +156,7 @@ class FootBalance(BatchPolicy):
         )
 
     def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
-        """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)
-        [rad].
-        """
+        """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)."""
         leg = self._biped.leg
         up = self._biped.ankle_height
         position, R = foot_pose(leg, q.reshape(-1, 2, 6))

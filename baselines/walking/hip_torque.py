@@ -83,13 +83,11 @@ class HipTorque(PolicyAround):
         ConfigurationError: The observation does not have the sensors.
     """
 
-    def __init__(
-        self, policy: Policy, model: WalkerModel, gains: HipTorqueGains | None = None
-    ) -> None:
+    def __init__(self, policy: Policy, model: WalkerModel, gains: HipTorqueGains) -> None:
+        super().__init__(policy, model)
         table = model.observation_table
-        super().__init__(policy, table, model.control_period_s)
         require_sensor(table, TORQUE_SENSOR)
-        self._gains = gains or HipTorqueGains()
+        self._gains = gains
         self._dt = model.control_period_s
         self._clock = table.group("clock")
         self._torque = table.group(TORQUE_SENSOR)

@@ -97,13 +97,12 @@ class PostureFeedback(PolicyAround):
         self,
         policy: Any,
         model: WalkerModel,
-        gains: PostureGains | None = None,
+        gains: PostureGains,
         ramp_s: float = STAND_S,
     ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
+        super().__init__(policy, model)
         self._walk_view = WalkView(model.observation_table)
         self._ramp = Ramp(model, ramp_s).table
-        gains = gains or PostureGains()
         period_s = model.control_period_s
         self._gains: Any = np.zeros(1, POSTURE)
         for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):
@@ -153,8 +152,7 @@ _NO_CHANGE: Array = np.empty((0, 1))
 
 
 def hip_offsets(turn: Array) -> Array:
-    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and
-    −pitch.
+    """Offsets of the joints, (n, 12) [rad], that turn a standing pelvis by −roll and −pitch.
 
     Args:
         turn: Roll and pitch of both hips, (n, 2), or of either, (n, 2, 2) [rad].
@@ -214,8 +212,9 @@ def hold_posture(
 def pitch_of_leg(
     own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any
 ) -> float:
-    """Hip pitch of a leg [rad]: one that carries half of the weight stands and turns, one in the
-    air follows slowly.
+    """Hip pitch of a leg [rad].
+
+    A leg that carries half of the weight stands and turns, one in the air follows slowly.
     """
     share = share_right if leg == 1 else 1.0 - share_right
     standing = min(2.0 * share, 1.0)

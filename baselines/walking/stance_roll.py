@@ -1,5 +1,4 @@
-r"""A constant lift of the pelvis in single support: the published hip roll feedforward of
-THORMANG3.
+r"""The published hip roll feedforward of THORMANG3: it lifts the pelvis in single support.
 
 In single support the stance hip is commanded φ(t) further, so that the swing side of the pelvis
 rises. The swing hip gets −0.35 φ(t) about the same axis, which takes the swing foot outwards. φ
@@ -60,8 +59,9 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
 
 
 class StanceRoll(PolicyAround):
-    """Any policy of a walker with the hip roll feedforward added, see the module; it has no memory
-    of its own.
+    """Any policy of a walker with the hip roll feedforward added, see the module.
+
+    It has no memory of its own.
 
     Args:
         policy: What commands the robot.
@@ -69,11 +69,9 @@ class StanceRoll(PolicyAround):
         gains: Angle and share.
     """
 
-    def __init__(
-        self, policy: Policy, model: WalkerModel, gains: StanceRollGains | None = None
-    ) -> None:
-        super().__init__(policy, model.observation_table, model.control_period_s)
-        self._gains = gains or StanceRollGains()
+    def __init__(self, policy: Policy, model: WalkerModel, gains: StanceRollGains) -> None:
+        super().__init__(policy, model)
+        self._gains = gains
         self._clock = model.observation_table.group("clock")
 
     @override

@@ -37,9 +37,7 @@ class ZmpOffsetGains(Model):
 
 
 class ZmpOffsetMemory(NamedTuple):
-    """The shift of the ZMP forward and to the left, (num_worlds, 2) [m], and the memory of the
-    policy.
-    """
+    """Shift of the ZMP forward and left, (num_worlds, 2) [m], and the memory of the policy."""
 
     shift: Array
     inner: Any
@@ -54,12 +52,9 @@ class ZmpOffset(PolicyAround):
         gains: Gains.
     """
 
-    def __init__(
-        self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains | None = None
-    ) -> None:
+    def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
+        super().__init__(policy, model)
         table = model.observation_table
-        super().__init__(policy, table, model.control_period_s)
-        gains = gains or ZmpOffsetGains()
         self._ankles = model.biped.ankles
         self._sensors = FootSensors.of_biped(model.biped)
         self._wrench = table.group("wrench")

@@ -56,8 +56,7 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
 
 
 def following_share(omega: float, period_s: float) -> float:
-    """Share of its way that the c of a ZMP shift goes in a period, where the shift stays as it is
-    [1].
+    """Share of its way that the c of a constant ZMP shift goes in a period [1].
 
     Args:
         omega: Natural frequency of the pendulum [rad/s].
@@ -67,8 +66,7 @@ def following_share(omega: float, period_s: float) -> float:
 
 
 def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
-    """Motion of the center of mass per motion of the standing pelvis over its feet, x and y, (2,)
-    [1].
+    """Motion of the center of mass per motion of the standing pelvis, x and y, (2,) [1].
 
     The legs follow the pelvis by half on average: it is the share of the weight that the pelvis
     carries along.
@@ -99,9 +97,7 @@ STANCE = record_type(
 
 
 class Stances(NamedTuple):
-    """The legs, a row of `LEGS`, and the planned stances, rows of `STANCE`, over which the
-    pelvis is moved.
-    """
+    """The legs, a row of `LEGS`, and planned stances, rows of `STANCE`, to move the pelvis over."""
 
     legs: Any
     rows: Any
@@ -138,7 +134,8 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     stances = Stances.of(model)
     offsets = np.zeros((len(zmp), len(model.joint_names)))
     shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
-    move_pelvis(stances.legs, stances.rows, steps=np.arange(len(zmp)), shift=shift, offset=offsets)
+    steps = np.arange(len(zmp))
+    move_pelvis(*stances, steps=steps, shift=shift, offset=offsets)
     return offsets
 
 
@@ -161,9 +158,11 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
             continue
         stance = stances[steps[row]]
         for side in range(2):
-            x = stance.ankles[side, 0] - (stance.pelvis[0] + shift[row, 0]) - leg.hips[side, 0]
-            y = stance.ankles[side, 1] - (stance.pelvis[1] + shift[row, 1]) - leg.hips[side, 1]
-            z = stance.ankles[side, 2] - stance.pelvis[2] - leg.hips[side, 2]
+            ankle = stance.ankles[side]
+            hip = leg.hips[side]
+            x = ankle[0] - (stance.pelvis[0] + shift[row, 0]) - hip[0]
+            y = ankle[1] - (stance.pelvis[1] + shift[row, 1]) - hip[1]
+            z = ankle[2] - stance.pelvis[2] - hip[2]
             pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
             roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
             first = 6 * side
@@ -178,8 +177,9 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
 
 @compiled
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle
-    less hip [m].
+    """Hip roll, hip pitch and knee of a leg whose sole is parallel to the pelvis [rad].
+
+    The arguments are the ankle less the hip [m].
 
     `elastic_env.rigid.leg_kinematics.leg_angles` has soles of every attitude.
     """
@@ -188,7 +188,6 @@ def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, fl
     shank = legs.shank
     cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
     knee = math.acos(min(max(cosine, -1.0), 1.0))
-    of_shank = math.atan2(
-        thigh * math.sin(knee), shank + thigh * math.cos(knee)
-    )  # from the line of hip and ankle
+    # from the line of hip and ankle
+    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))
     return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee

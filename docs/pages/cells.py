@@ -15,7 +15,8 @@ import yaml
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.episodes import group_by
-from train.report.render import Table, render, write_table
+from train.report.render import Table, to_markdown
+from train.runs.escaping import write_csv
 
 Rows = Sequence[Mapping[str, str]]
 """Rows of a table, a column by its name."""
@@ -105,7 +106,7 @@ def keep(run: Path, results: Path) -> Path:
     name = kept_name(run)
     kept = KEPT[name]
     head, *rows = condense(read_rows(run / "episodes.csv"), kept)
-    return write_table([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
+    return write_csv([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
 
 
 def kept_name(run: Path) -> str:
@@ -184,7 +185,7 @@ def format_metrics(
 
 def page_table(head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1) -> str:
     """A table of a page, whose first columns hold words and the others figures."""
-    return render(Table.plain(head, rows, words), "markdown") + "\n"
+    return to_markdown(Table.plain(head, rows, words)) + "\n"
 
 
 def minus(text: str) -> str:

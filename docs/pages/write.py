@@ -34,7 +34,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
 from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.render import Head, Row, Table, render
+from train.report.render import Head, Row, Table, to_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = (
@@ -165,7 +165,7 @@ def gallery_table(gallery: Rows) -> str:
         "`input`, soft",
     ]
     heads = tuple(Head(title, is_number=title not in _WORDS) for title in head)
-    return render(Table(heads, tuple(Row(tuple(row)) for row in rows)), "markdown") + "\n"
+    return to_markdown(Table(heads, tuple(Row(tuple(row)) for row in rows))) + "\n"
 
 
 def gallery_pictures(gallery: Rows) -> str:

@@ -11,8 +11,7 @@ from typing import Any
 
 from baselines.adaptation import offset_table
 from baselines.policies import is_saved
-from baselines.residual import residual
-from baselines.residual.residual import located
+from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
 from elastic_env.core.files import read_bounded
 from train.evaluate.conditions import Condition
 from train.evaluate.robot_file import files_of_robot
@@ -24,7 +23,7 @@ tables list it.
 """
 _LABELS = {"label": True, "policy": {"label"}, "member": {"base"}}
 """Parts of a condition that are text for people and name no files."""
-_SAVED = (residual.DESCRIPTION, residual.WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
+_SAVED = (DESCRIPTION, WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
 """Files of which the folder of a policy consists."""
 _LARGEST_SOURCE = 10_000_000
 """Bytes of a Python file that is looked through for imports."""
@@ -51,7 +50,7 @@ def named_files(text: str) -> list[Path]:
     module:NAME, or a path.
     """
     if is_saved(text):
-        folder = located(Path(text.partition(":")[2]))
+        folder = find_folder(Path(text.partition(":")[2]))
         return [folder / name for name in _SAVED if _is_file(folder / name)]
     place, _, name = text.rpartition(":")
     if name.isidentifier() and place.endswith(".py"):

@@ -34,11 +34,12 @@ from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
-from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import print_leaderboard, write_leaderboard
+from train.report.report_text import Results
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
+from train.report.write import require_libraries, write_report
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import TRUST, load_without_code
@@ -328,8 +329,7 @@ def compare(
     work = work or Work()
     plots.require_matplotlib()
     if report:
-        require_plotly()
-        require_jinja2()
+        require_libraries()
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with _folder(config, output, work) as folder:
@@ -359,8 +359,9 @@ def compare(
             console.print("measuring the time of every policy, in turn")
             board = standings(evaluations, rows, config.groups, step_times(conditions))
             files += write_leaderboard(board, folder)
-        if report:
+        if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
+        if report:
             files += write_report(
                 Results(config.name, evaluations, rows, folder, axis, maps, board, robots)
             )

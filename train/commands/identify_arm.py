@@ -27,7 +27,7 @@ from baselines.identification.arm_result import (
     ArmIdentification,
     JointStiffness,
     Source,
-    described,
+    describe_fit,
 )
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
@@ -159,7 +159,7 @@ def run_arm_identification(
             plan_further(fit, _candidates(setting, console), options.plan) if options.plan else None
         )
         information = None if plan is None else plan.information
-        result = described(fit, options.within, options.assume, information)
+        result = describe_fit(fit, options.within, options.assume, information)
         files = result.save(folder)
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]

@@ -37,7 +37,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.figures import plots
-from train.report import require_jinja2, require_plotly
+from train.report.write import require_libraries
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
@@ -175,8 +175,7 @@ def try_robot(trial: Robot, console: Console) -> RobotResult:
         MissingExtraError: A package for reports or videos is missing.
     """
     plots.require_matplotlib()
-    require_plotly()
-    require_jinja2()
+    require_libraries()
     arguments = robot_arguments(trial)
     moving, config = (
         configure_robot(**arguments, reference=reference, scenario=SCENARIO)

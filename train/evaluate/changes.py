@@ -1,8 +1,7 @@
-"""Paired changes of a comparison: every residual against its base and against the best policy
-without learning.
+"""Paired changes of a comparison: residuals against bases and rivals, baselines against bases.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first
-policy.
+A residual is compared with its base and with the best policy without learning. A baseline is
+compared with the base of the residuals, or without residuals with the first policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -110,6 +109,11 @@ class Change:
     is_rival: bool = False
 
     @property
+    def line(self) -> tuple[object, ...]:
+        """Key of the rows that have policy, base and cell in common."""
+        return (self.policy, self.base, self.reference, self.scope, *self.swept.items())
+
+    @property
     def num_seeds(self) -> int:
         """Training seeds; 0 of a baseline."""
         return len(self.per_seed) if self.is_family else 0
@@ -121,9 +125,7 @@ class Change:
 
     @property
     def verdict(self) -> Verdict:
-        """lower, higher, none (the interval includes zero), or unclear (too few training seeds
-        to say).
-        """
+        """lower, higher, none (the interval includes zero), or unclear (too few training seeds)."""
         low = self.relative.low
         high = self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
@@ -143,50 +145,37 @@ class Change:
     @property
     def sentence(self) -> str:
         """The row in a sentence: what it shows, and what it does not."""
-        parts = [self._first_words()]
+        parts = [self._size]
         missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
-            parts.append(
-                f"{missing} of {self.num_seeds} training seeds have nothing to compare and are not"
-                " in it"
-            )
+            seeds = f"{missing} of {self.num_seeds} training seeds"
+            parts.append(f"{seeds} have nothing to compare and are not in it")
         if self.falls_more:
             parts.append(f"MORE {self.failure.upper()} than {self.base}")
         elif self.falls_less:
             parts.append(f"fewer {self.failure} than {self.base}")
         return "; ".join(parts)
 
-    def _first_words(self) -> str:
+    @property
+    def _size(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = (
-                "in one of the scenarios there is no episode in which"
-                if self.is_group
-                else "in no episode did"
-            )
-            return (
-                f"nothing to compare: {where} both {'stayed' if self.is_group else 'stay'} up to"
-                " the end"
-            )
-        direction = (
-            "no change"
-            if value == 0.0
-            else f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
-        )
+            where = "in no episode did both stay"
+            if self.is_group:
+                where = "in one of the scenarios there is no episode in which both stayed"
+            return f"nothing to compare: {where} up to the end"
+        size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
+        if value == 0.0:
+            size = "no change"
         if not self.is_family:
-            return f"{direction} (difference of means, no training seeds)"
-        return {
-            "lower": direction,
-            "higher": direction,
-            "none": "the interval includes zero: no difference shown",
-            "unclear": f"{direction} with {self._few_seeds}",
-        }[self.verdict]
-
-    @property
-    def _few_seeds(self) -> str:
+            return f"{size} (difference of means, no training seeds)"
+        if self.verdict == "none":
+            return "the interval includes zero: no difference shown"
+        if self.verdict != "unclear":
+            return size
         if self.num_compared == 1:
-            return "one training seed: no interval"
-        return f"{self.num_compared} training seeds: too few to tell it from chance"
+            return f"{size} with one training seed: no interval"
+        return f"{size} with {self.num_compared} training seeds: too few to tell it from chance"
 
 
 def signed_off(text: str, verdict: str) -> str:
@@ -198,36 +187,31 @@ def percent(value: float, signed: bool = True) -> str:
     """A share in per cent, with a decimal where it is small; - where there is none."""
     if not np.isfinite(value):
         return "-"
-    digits = 1 if 0.0 < abs(value) < _SMALL else 0
-    text = f"{100.0 * value:{'+' if signed else ''}.{digits}f}".replace("-", "−")
-    return f"{text} %"
+    return f"{_hundredths(value, signed, 0.0 < abs(value) < _SMALL)} %"
 
 
 def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     """A share with its interval, such as −40 % [−45, −33]."""
-    if estimate.low is None or estimate.high is None:
+    if not estimate.has_interval:
         return percent(estimate.value, signed)
-    values = estimate.value, estimate.low, estimate.high
-    is_fine = 0.0 < max(map(abs, values)) < _SMALL or any(
-        0.0 < abs(value) < _LEAST for value in values
-    )
-    number = f"{'+' if signed else ''}.{1 if is_fine else 0}f"
-    value, low, high = (f"{100.0 * value:{number}}".replace("-", "−") for value in values)
+    shares = (estimate.value, *estimate.ends)
+    is_fine = 0.0 < max(map(abs, shares)) < _SMALL or any(0.0 < abs(s) < _LEAST for s in shares)
+    value, low, high = (_hundredths(share, signed, is_fine) for share in shares)
     return f"{value} % [{low}, {high}]"
 
 
+def _hundredths(share: float, signed: bool, is_fine: bool) -> str:
+    return f"{100.0 * share:{'+' if signed else ''}.{int(is_fine)}f}".replace("-", "−")
+
+
 def signed_interval(estimate: Estimate, verdict: str) -> str:
-    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *; - where
-    there is none.
-    """
+    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *."""
     text = percent_interval(estimate)
     return signed_off(text, verdict) if np.isfinite(estimate.value) else text
 
 
 def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-    """Cells with the training seeds of a family put together: all of their episodes, the trace
-    of the first.
-    """
+    """Cells with all training seeds of a family in one: all episodes, the trace of the first."""
     together: dict[tuple[object, ...], Evaluation] = {}
     for number, e in enumerate(evaluations):
         c = e.condition
@@ -240,153 +224,41 @@ def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def opponents(table: EpisodeTable) -> dict[str, list[str]]:
-    """Titles of those whom each policy is compared with: base and rival, or of a baseline the
-    bases, or the first.
+    """Titles of the policies that each policy is compared with.
+
+    A residual has a base and a rival. A baseline has the bases of the residuals, or the first
+    policy.
     """
-    members = {title: next(reversed(own.values())) for title, own in table.members.items()}
-    default = list(dict.fromkeys(member.base for member in members.values())) or table.policies[:1]
     found = {}
+    bases = dict.fromkeys(m.base for own in table.members.values() for m in own.values())
     for title in table.policies:
-        member = members.get(title)
-        if member is None:
-            found[title] = [base for base in default if base != title]
-        else:
+        if title in table.members:
+            member = next(reversed(table.members[title].values()))
             found[title] = [other for other in (member.base, member.rival) if other is not None]
+        else:
+            found[title] = [base for base in bases or table.policies[:1] if base != title]
     return found
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
-    """All paired changes: residuals against bases and rivals, baselines against bases or, without
-    residuals, the first.
+    """All paired changes of a comparison.
 
     Args:
         evaluations: All cells, one per training seed.
         groups: Scenarios to pool over, by name.
     """
-    table = EpisodeTable(evaluations)
-    rows = []
-    for title, others in opponents(table).items():
-        for base in others:
-            if base in table.policies:
-                rows += _against(Pairing(table, title, base), groups or {})
-    return rows
-
-
-class Pairing:
-    """A policy beside another one on the same episodes.
-
-    Args:
-        table: All episodes.
-        policy: Title of the policy.
-        base: Title of the other one.
-
-    Raises:
-        ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
-    """
-
-    def __init__(self, table: EpisodeTable, policy: str, base: str) -> None:
-        self.table = table
-        self.policy = policy
-        self.base = base
-        known = table.environment
-        self.columns = (*known.judged, *known.also)
-        self.cells = {
-            cell: other
-            for cell in table.cells_of(policy)
-            if (other := self._cell_of_base(cell)) is not None
-        }
-        """Number of the base's cell, by that of the policy's."""
-        self._pairs: dict[tuple[int, str], pd.DataFrame] = {}
-
-    def _cell_of_base(self, cell: int) -> int | None:
-        """The same cell; where the base is not swept, the one of its level."""
-        condition = self.table.conditions[self.policy, cell]
-        for place in (condition.cell, condition.cell[:2]):
-            number = self.table.cells.get(place)
-            if number is not None and (self.base, number) in self.table.conditions:
-                return number
-        return None
-
-    def pairs(self, cell: int, metric: str) -> pd.DataFrame:
-        """Figures of every training seed over the pairs of a cell: means `mine` and `base`,
-        number `played`, `won`.
-        """
-        if (cell, metric) not in self._pairs:
-            mine = self.table.of(self.policy, cell)
-            base = self.table.of(self.base, self.cells[cell])
-            both = pair(mine, base, metric)
-            figures = []
-            for member in mine["member"].unique():
-                own = both[both["member"] == member]
-                ours = np.asarray(own["mine"])
-                theirs = np.asarray(own["base"])
-                figures.append(
-                    {
-                        "mine": ours.mean() if len(own) else np.nan,
-                        "base": theirs.mean() if len(own) else np.nan,
-                        "played": len(own),
-                        "won": wins(ours, theirs),
-                    }
-                )
-            self._pairs[cell, metric] = pd.DataFrame(figures)
-        return self._pairs[cell, metric]
-
-    def change(
-        self,
-        column: Column,
-        cells: Sequence[int],
-        scope: str,
-        is_group: bool,
-        marks: tuple[str, ...] = (),
-    ) -> Change:
-        """The change of one metric, over one cell or pooled over several.
-
-        Args:
-            column: The metric.
-            cells: Numbers of the policy's cells.
-            scope: Scenario, or name of the group.
-            is_group: Whether it is a group.
-            marks: See `Change`.
-        """
-        pairs = [self.pairs(cell, column.metric) for cell in cells]
-        mine, base, played, won = (
-            np.column_stack([own[name] for own in pairs])
-            for name in ("mine", "base", "played", "won")
-        )
-        relative = change(mine, base)
-        condition = self.table.conditions[self.policy, cells[0]]
-        falls, episodes = failures(self.table.of(self.policy, *cells))
-        base_falls, base_episodes = failures(
-            self.table.of(self.base, *(self.cells[cell] for cell in cells))
-        )
-        return Change(
-            policy=self.policy,
-            base=self.base,
-            is_family=condition.member is not None,
-            reference=condition.reference_name,
-            scope=scope,
-            is_group=is_group,
-            swept=condition.swept,
-            marks=marks,
-            column=column,
-            is_judged=column in self.table.environment.judged,
-            per_seed=relative,
-            relative=over_seeds(relative),
-            improvement=improvement(won, played),
-            mine=_mean(mine),
-            theirs=_mean(base),
-            num_pairs=int(played.sum()),
-            falls=falls,
-            episodes=episodes,
-            base_falls=base_falls,
-            base_episodes=base_episodes,
-            failure=self.table.environment.failures,
-            is_rival=condition.member is not None and self.base == condition.member.rival,
-        )
+    pairings = Pairings(EpisodeTable(evaluations))
+    return [
+        row
+        for title, others in opponents(pairings.table).items()
+        for base in others
+        if base in pairings.table.policies
+        for row in _against(pairings, title, base, groups or {})
+    ]
 
 
 class Pairings:
-    """Policies of a table beside one another, each pair made once.
+    """Policies of a table beside one another on the same episodes, each pair made once.
 
     Args:
         table: All episodes.
@@ -394,18 +266,99 @@ class Pairings:
 
     def __init__(self, table: EpisodeTable) -> None:
         self.table = table
-        self._found: dict[tuple[str, str], Pairing] = {}
+        self._pairs: dict[tuple[str, str, int, str], Array] = {}
 
-    def of(self, policy: str, base: str) -> Pairing:
-        """A policy beside another one, by their titles."""
-        if (policy, base) not in self._found:
-            self._found[policy, base] = Pairing(self.table, policy, base)
-        return self._found[policy, base]
+    def cells(self, policy: str, base: str) -> dict[int, int]:
+        """Number of the base's cell, by that of the policy's.
+
+        A base that is not swept has one cell for all values, its level.
+        """
+        found = {}
+        for own in self.table.cells_of(policy):
+            condition = self.table.conditions[policy, own]
+            for place in (condition.cell[:2], condition.cell):
+                number = self.table.cells.get(place, -1)
+                if (base, number) in self.table.conditions:
+                    found[own] = number
+        return found
+
+    def change(
+        self,
+        policy: str,
+        base: str,
+        column: Column,
+        cells: Sequence[int],
+        scope: str,
+        is_group: bool = False,
+        marks: tuple[str, ...] = (),
+    ) -> Change:
+        """The change of one metric, over one cell or pooled over several.
+
+        Args:
+            policy: Title of the policy.
+            base: Title of the other one.
+            column: The metric.
+            cells: Numbers of the policy's cells.
+            scope: Scenario, or name of the group.
+            is_group: Whether it is a group.
+            marks: See `Change`.
+
+        Raises:
+            ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
+        """
+        table = self.table
+        base_cells = self.cells(policy, base)
+        figures = np.stack([self._figures(policy, base, cell, column.metric) for cell in cells])
+        mine, theirs, played, won = map(np.ascontiguousarray, figures.transpose(1, 2, 0))
+        relative = change(mine, theirs)
+        condition = table.conditions[policy, cells[0]]
+        falls, episodes = failures(table.of(policy, *cells))
+        base_falls, base_episodes = failures(table.of(base, *(base_cells[cell] for cell in cells)))
+        return Change(
+            policy=policy,
+            base=base,
+            is_family=condition.member is not None,
+            reference=condition.reference_name,
+            scope=scope,
+            is_group=is_group,
+            swept=condition.swept,
+            marks=marks,
+            column=column,
+            is_judged=column in table.environment.judged,
+            per_seed=relative,
+            relative=over_seeds(relative),
+            improvement=improvement(won, played),
+            mine=_mean(mine),
+            theirs=_mean(theirs),
+            num_pairs=int(played.sum()),
+            falls=falls,
+            episodes=episodes,
+            base_falls=base_falls,
+            base_episodes=base_episodes,
+            failure=table.environment.failures,
+            is_rival=condition.member is not None and base == condition.member.rival,
+        )
+
+    def _figures(self, policy: str, base: str, cell: int, metric: str) -> Array:
+        """Figures of a cell: means of policy and base, number of pairs, number won, (4, seeds)."""
+        key = (policy, base, cell, metric)
+        if key not in self._pairs:
+            mine = self.table.of(policy, cell)
+            theirs = self.table.of(base, self.cells(policy, base)[cell])
+            both = pair(mine, theirs, metric)
+            figures = []
+            for member in mine["member"].unique():
+                own = both[both["member"] == member]
+                x = np.asarray(own["mine"])
+                y = np.asarray(own["base"])
+                means = (x.mean(), y.mean()) if len(own) else (np.nan, np.nan)
+                figures.append((*means, len(own), wins(x, y)))
+            self._pairs[key] = np.array(figures).T
+        return self._pairs[key]
 
 
 def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Episodes of two policies in one cell with the same seed, in which neither failed: `member`,
-    `mine`, `base`.
+    """Episodes of two policies with equal seeds, in which neither failed.
 
     Args:
         mine: Rows of a policy, with `member`, `seed`, `failed` and the metric.
@@ -420,29 +373,32 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
             raise ValueError(
                 f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
             )
-    own = mine.sort_values("seed", kind="stable")
-    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(
-        own["seed"].to_numpy()
-    )
-    figures = {"member": own["member"], "mine": own[metric], "base": others}
-    return pd.DataFrame({name: column.to_numpy() for name, column in figures.items()}).dropna()
+    own = mine.sort_values("seed", kind="stable")[["member", "seed", metric]]
+    both = own.merge(base[["seed", metric]], on="seed", suffixes=("", "_base")).dropna()
+    return both.rename(columns={metric: "mine", f"{metric}_base": "base"})
 
 
-def _against(pairing: Pairing, groups: Groups) -> list[Change]:
-    """Rows of one policy and one base: every cell, and every group behind the last one of its
-    scenarios.
-    """
-    conditions = {cell: pairing.table.conditions[pairing.policy, cell] for cell in pairing.cells}
-    blocks = group_by(conditions, lambda cell: _apart_from_scenario(conditions[cell]))
+def _against(pairings: Pairings, policy: str, base: str, groups: Groups) -> list[Change]:
+    """Rows of a policy and a base: every cell, and every group behind the last of its scenarios."""
+    table = pairings.table
+    cells = list(pairings.cells(policy, base))
+    conditions = {cell: table.conditions[policy, cell] for cell in cells}
     rows = []
-    for cell, condition in conditions.items():
-        rows += _scope_rows(pairing, condition.scenario, [cell], is_group=False)
-        block = {conditions[own].scenario: own for own in blocks[_apart_from_scenario(condition)]}
-        if cell != list(block.values())[-1]:
-            continue
-        for name, scenarios in groups.items():
-            if all(scenario in block for scenario in scenarios):
-                rows += _scope_rows(pairing, name, [block[s] for s in scenarios], is_group=True)
+
+    def add(scope: str, own: Sequence[int], is_group: bool) -> None:
+        marks = _marks(table.families.get(policy), [conditions[cell] for cell in own])
+        for column in (*table.environment.judged, *table.environment.also):
+            rows.append(pairings.change(policy, base, column, own, scope, is_group, marks))
+
+    blocks = group_by(cells, lambda cell: _apart_from_scenario(conditions[cell]))
+    for cell in cells:
+        add(conditions[cell].scenario, [cell], is_group=False)
+        block = blocks[_apart_from_scenario(conditions[cell])]
+        own = {conditions[each].scenario: each for each in block}
+        if cell == block[-1]:
+            for name, scenarios in groups.items():
+                if all(scenario in own for scenario in scenarios):
+                    add(name, [own[scenario] for scenario in scenarios], is_group=True)
     return rows
 
 
@@ -450,42 +406,27 @@ def _apart_from_scenario(condition: Condition) -> tuple[object, ...]:
     return (condition.reference_name, *condition.swept.items())
 
 
-def _scope_rows(pairing: Pairing, scope: str, cells: Sequence[int], is_group: bool) -> list[Change]:
-    """A row per judged column, over one scenario or several."""
-    table = pairing.table
-    trained = table.families.get(pairing.policy)
-    first = table.conditions[pairing.policy, cells[0]]
-    scenarios = [_seen_as(table.conditions[pairing.policy, cell], trained) for cell in cells]
-    reference = _motion(table.environment, first.reference)
-    marks = _marks(trained, table.environment, reference, scenarios, first.swept)
-    return [pairing.change(column, cells, scope, is_group, marks) for column in pairing.columns]
-
-
 def _mean(values: Array) -> float:
-    """Interquartile mean, over the training seeds that have all, of means over scenarios and
-    episodes.
-    """
+    """Interquartile mean over training seeds of means over scenarios and episodes."""
     means = np.mean(values, axis=-1)
     means = means[np.isfinite(means)]
     return float(interquartile_mean(means)) if len(means) else float("nan")
 
 
-def _marks(
-    trained: Origin | None,
-    known: Environment,
-    reference: str,
-    scenarios: Sequence[str],
-    swept: Mapping[str, float],
-) -> tuple[str, ...]:
-    """Marks of a row: how far training has seen its condition."""
+def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str, ...]:
+    """Marks of a row: how far training has seen its conditions."""
     if trained is None:
         return ()
     if trained.scenarios is None:
         return ("training condition unknown",)
-    motion: Any = known.default_reference if trained.reference is None else trained.reference
-    seen = _motion(known, motion) == reference
-    unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
+    known = conditions[0].environment
+    motion: Any = trained.reference
+    if motion is None:
+        motion = known.default_reference
+    seen = _motion(known, motion) == _motion(known, conditions[0].reference)
     quantity = known.quantity or "reference"
+    scenarios = [_seen_as(condition, trained) for condition in conditions]
+    unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
     if unseen:
         if len(unseen) == len(scenarios):
             return (HELD_OUT if seen else f"{HELD_OUT} scenario and {quantity}",)
@@ -493,7 +434,7 @@ def _marks(
         return (f"{PARTLY}{named}" if seen else f"{HELD_OUT}{named} and {quantity}",)
     if not seen:
         return (f"{HELD_OUT} {quantity}",)
-    if swept:
+    if conditions[0].swept:
         return ()
     if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
         return (CEILING,)
@@ -502,31 +443,20 @@ def _marks(
     return (f"{SAME_ROBOT}{named}",) if same else ()
 
 
-def _seen_as(condition: Condition, trained: Origin | None) -> str:
-    """The scenario of a condition; one whose fields are varied by the name under which training
-    has seen the same.
-    """
+def _seen_as(condition: Condition, trained: Origin) -> str:
+    """The scenario of a condition, by the name under which training has seen the same."""
     played = condition.scenario_played
-    ranges = {} if trained is None else trained.ranges
-    if isinstance(played, str) and not ranges:
+    seen = trained.scenarios or ()
+    if isinstance(played, str) and not trained.ranges:
         return played
-    seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
-    played = make_scenario(played)
-    same = (
-        name
-        for name in seen
-        if make_scenario(name).with_ranges(ranges).replace(name="") == played.replace(name="")
-    )
+    played = make_scenario(played).replace(name="")
+    for name in seen:
+        if make_scenario(name).with_ranges(trained.ranges).replace(name="") == played:
+            return name
     if condition.swept:
-        return next(same, f"varied {condition.scenario}")
-    return next(
-        same,
-        (
-            f"{condition.scenario} of other ranges"
-            if condition.scenario in seen
-            else condition.scenario
-        ),
-    )
+        return f"varied {condition.scenario}"
+    is_other = condition.scenario in seen
+    return f"{condition.scenario} of other ranges" if is_other else condition.scenario
 
 
 def _motion(known: Environment, reference: Any) -> str:
@@ -536,7 +466,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(
-        rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items())
-    )
+    lines = group_by(rows, lambda row: row.line)
     return list(lines.values())

@@ -1,6 +1,4 @@
-"""Cells of a comparison: which policy plays which motion in which environment, as configurations
-say it.
-"""
+"""Cells of a comparison: which policy plays which motion in which environment."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -12,7 +10,7 @@ from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.config_problems import meaning_of
-from elastic_env.core.errors import ConfigurationError, quote, shorten
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.world.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import (
@@ -50,12 +48,10 @@ def _reference(value: Any) -> Reference:
 def _refuse(taken: set[str], what: str) -> None:
     """Refuse arguments of the environments that stand in the wrong place."""
     for name in sorted(taken):
-        place = (
-            "the commands set it themselves"
-            if name in UNPLACED
-            else "it has a key, or an option, of its own"
-        )
-        raise ValueError(f"{name} cannot be {what}; {shorten(place)}")
+        place = "it has a key, or an option, of its own"
+        if name in UNPLACED:
+            place = "the commands set it themselves"
+        raise ValueError(f"{name} cannot be {what}; {place}")
 
 
 GivenReference = Annotated[Any, AfterValidator(_reference)]
@@ -90,9 +86,7 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
 
 
 class PolicySpec(Model):
-    """A policy of a comparison: a baseline's name, or "FILE.py:function" for one's own, with
-    options.
-    """
+    """A policy of a comparison: a baseline, or "FILE.py:function" for one's own, with options."""
 
     name: Locator
     label: Locator | None = None
@@ -176,48 +170,37 @@ class Condition(Model):
 
     @property
     def number(self) -> float | None:
-        """Number of the reference that scores can be drawn against, such as the step period [s];
-        None for nothing.
-        """
+        """Number of the reference that scores can be drawn against [s]; None without one."""
         return next(iter(self.environment.abscissa(self.reference).values()), None)
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the environment; what the policy says goes before, and what the reference
-        says before that.
+        """Arguments of the environment, with the sensors that a baseline reads.
 
-        The environment also has the sensors that a baseline reads.
+        The policy's options replace those of the condition, and the reference replaces both.
         """
         motion = self.environment.arguments(self.reference)
-        found = {
-            "scenario": self.scenario_played,
-            **self.env_options,
-            **self.policy.env_options,
-            **motion,
-        }
-        needed = sensors_needed(self.policy.name)
+        options = {**self.env_options, **self.policy.env_options, **motion}
+        found = {"scenario": self.scenario_played, **options}
         given = found.get("sensors", [])
-        if not needed or not isinstance(
-            given, list | tuple
-        ):  # the environment says what sensors are
-            return found
-        return {**found, "sensors": [*given, *(name for name in needed if name not in given)]}
+        needed = sensors_needed(self.policy.name)
+        if needed and isinstance(given, list | tuple):  # else the environment says what they are
+            found["sensors"] = [*given, *(name for name in needed if name not in given)]
+        return found
 
     @property
     def scenario_played(self) -> str | Scenario:
-        """The scenario with ranges of its own and the fields that are varied; its name where it
-        has neither.
-        """
-        fields = {name: value for name, value in self.swept.items() if name.startswith(SCENARIO)}
+        """The scenario with its own ranges and varied fields; its name where it has neither."""
+        fields = {name: self.swept[name] for name in self.swept if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
-        return varied(make_scenario(self.scenario).with_ranges(self.ranges), fields)
+        return vary_scenario(make_scenario(self.scenario).with_ranges(self.ranges), fields)
 
     @property
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy with the swept one."""
-        swept = {name: value for name, value in self.swept.items() if not name.startswith(SCENARIO)}
-        return {**self.policy.options, **swept}
+        names = [name for name in self.swept if not name.startswith(SCENARIO)]
+        return {**self.policy.options, **{name: self.swept[name] for name in names}}
 
     @property
     def track(self) -> Track:
@@ -225,9 +208,8 @@ class Condition(Model):
         return self.policy.track or track(self.policy.name, self.environment.walks)
 
 
-def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
-    """A scenario with other values of some fields, such as {"scenario.pelvis_imu.bias_spread_rad":
-    0.002} [SI].
+def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
+    """A scenario with other values of some fields, such as `scenario.stiffness_scale` [SI].
 
     Raises:
         ConfigurationError: A value is beyond the bounds of its field.
@@ -241,9 +223,7 @@ def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
 
 @lru_cache(maxsize=1)
 def scenario_fields() -> Mapping[str, tuple[str, str]]:
-    """Numbers of a scenario that can be varied: description and unit, by name with `SCENARIO`
-    before it.
-    """
+    """Numbers of a scenario that can be varied: description and unit by name."""
     return _numbers_of(Scenario, SCENARIO)
 
 

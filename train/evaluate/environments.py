@@ -1,6 +1,4 @@
-"""The environments as the commands know them: how it is made, what of it is kept, and how its
-figures are shown.
-"""
+"""The environments as the commands know them: their arguments, figures and tables."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -88,15 +86,18 @@ class TracedSignal:
         title: Words for it.
         name: Its name in the trace.
         unit: Unit in which it is shown.
-        scale: Factor from SI to that unit.
         reference: Name of what it should be in the trace; None where that is zero.
     """
 
     title: str
     name: str
     unit: str
-    scale: float
     reference: str | None = None
+
+    @property
+    def scale(self) -> float:
+        """Factor from SI to the shown unit."""
+        return 1e3 if self.unit.startswith("m") else 1.0
 
     @property
     def label(self) -> str:
@@ -119,11 +120,8 @@ class Environment:
             truth.
         live_policy: Policy that is timed against the clock; None for the looped one.
         on_hardware: Short name of the same robot on hardware; empty where there is none.
-        arguments: Arguments of `gymnasium.make` for a reference.
-        label: How tables and figures call a reference.
-        draws: Whether episodes of a reference have motions of their own.
-        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where
-            there is nothing.
+        make_reference: The motion of a reference; None where it is never random.
+        given: Further arguments of `gymnasium.make`.
         traced: Signals of the first episode that are kept.
         columns: The summary table.
         splits: Further tables of the summary, title and columns.
@@ -148,10 +146,6 @@ class Environment:
     robot: str
     motion: str
     default_reference: Reference
-    arguments: Callable[[Reference], dict[str, Any]]
-    label: Callable[[Reference], str]
-    draws: Callable[[Reference], bool]
-    abscissa: Callable[[Reference], dict[str, float]]
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
     subject: str
@@ -172,6 +166,24 @@ class Environment:
     looped_policy: str = "zero"
     live_policy: str | None = None
     on_hardware: str = ""
+    make_reference: Callable[[Any], Any] | None = None
+    given: dict[str, Any] = field(default_factory=dict)
+
+    def arguments(self, reference: Reference) -> dict[str, Any]:
+        """Arguments of `gymnasium.make` for a reference."""
+        return {**self.given, self.motion: reference}
+
+    def label(self, reference: Reference) -> str:
+        """Name of a reference in tables and figures."""
+        return str(reference.get("kind") if isinstance(reference, dict) else reference)
+
+    def abscissa(self, reference: Reference) -> dict[str, float]:  # noqa: ARG002
+        """Number of a reference that sweeps can be drawn against, by name; empty without one."""
+        return {}
+
+    def draws(self, reference: Reference) -> bool:
+        """True if episodes of a reference have motions of their own."""
+        return self.make_reference is not None and self.make_reference(reference).is_random
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition are one and the same."""
@@ -195,47 +207,23 @@ _STEPS_OF_THE_PAPER = {"24 s": 2}
 """Number of steps of the gaits of configs/paper.yaml that have another one than the default."""
 
 
-def environment(name: str) -> Environment:
-    """The environment of a short name, or that of a robot of one's own.
+class _Walker(Environment):
+    """The walker, whose reference is a step period, or a mapping with one."""
 
-    Args:
-        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or
-            "module:ROBOT", a `JointRobot`, which is imported and registered.
+    def arguments(self, reference: Reference) -> dict[str, Any]:
+        given = reference if isinstance(reference, dict) else {}
+        return {**given, self.motion: _step_period(reference)}
 
-    Raises:
-        ConfigurationError: It does not exist.
-    """
-    if name.endswith(ENDINGS):
-        return _of_file(name)
-    if ":" in name:
-        return _of_ones_own(name)
-    if name not in ENVIRONMENTS:
-        raise unknown_name("environment", name, [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"])
-    return ENVIRONMENTS[name]
+    def label(self, reference: Reference) -> str:
+        parts = _durations(reference)
+        texts = (f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts)
+        label = f"{'+'.join(texts)} s"
+        steps = reference.get("num_steps") if isinstance(reference, dict) else None
+        usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
+        return label if steps in usual else f"{label} num_steps={steps}"
 
-
-def _of_file(name: str) -> Environment:
-    of_robot = read_robot_file(name)
-    return replace(
-        ENVIRONMENTS["robot"], arguments=lambda reference: {**of_robot, "reference": reference}
-    )
-
-
-@lru_cache(maxsize=64)
-def _of_ones_own(name: str) -> Environment:
-    robot = named_object(name)
-    if not isinstance(robot, JointRobot):
-        raise ConfigurationError(
-            f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
-        )
-    robot.register()
-    return replace(
-        _JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id, robot=robot.name
-    )
-
-
-def _kind(reference: Reference) -> str:
-    return str(reference.get("kind")) if isinstance(reference, dict) else str(reference)
+    def abscissa(self, reference: Reference) -> dict[str, float]:
+        return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
 
 
 def _step_period(reference: Reference) -> Any:
@@ -250,43 +238,49 @@ def _step_period(reference: Reference) -> Any:
     return reference["step_period"]
 
 
-def _walk_arguments(reference: Reference) -> dict[str, Any]:
-    return {
-        **(reference if isinstance(reference, dict) else {}),
-        "step_period": _step_period(reference),
-    }
+def _durations(reference: Reference) -> Any:
+    period = _step_period(reference)
+    return period if isinstance(period, list | tuple) else [period]
 
 
-def _walk_label(reference: Reference) -> str:
-    """Step period or durations, and the number of steps where it is not the one that goes
-    without saying.
+def environment(name: str) -> Environment:
+    """The environment of a short name, or that of a robot of one's own.
+
+    Args:
+        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or
+            "module:ROBOT", a `JointRobot`, which is imported and registered.
+
+    Raises:
+        ConfigurationError: It does not exist.
     """
-    period = _step_period(reference)
-    parts = period if isinstance(period, list | tuple) else [period]
-    label = (
-        "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts)
-        + " s"
-    )
-    steps = reference.get("num_steps") if isinstance(reference, dict) else None
-    usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
-    return label if steps in usual else f"{label} num_steps={steps}"
+    if name.endswith(ENDINGS):
+        return replace(ENVIRONMENTS["robot"], given=read_robot_file(name))
+    if ":" in name:
+        return _of_ones_own(name)
+    if name not in ENVIRONMENTS:
+        raise unknown_name("environment", name, [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"])
+    return ENVIRONMENTS[name]
 
 
-def _walk_abscissa(reference: Reference) -> dict[str, float]:
-    period = _step_period(reference)
-    parts = period if isinstance(period, list | tuple) else [period]
-    return {"step_period_s": float(f"{sum(map(float, parts)):.6g}")}
+@lru_cache(maxsize=64)
+def _of_ones_own(name: str) -> Environment:
+    robot = named_object(name)
+    if not isinstance(robot, JointRobot):
+        raise ConfigurationError(
+            f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
+        )
+    robot.register()
+    known = _JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR
+    return replace(known, id=robot.id, robot=robot.name)
 
 
+_LINK = Column("link error rms", "link_error_rms_rad")
 _TESTBED = Environment(
     id=IDS["testbed"],
     robot="testbed",
     motion="reference",
     default_reference="hold",
-    arguments=lambda reference: {"reference": reference},
-    label=_kind,
-    draws=lambda reference: make_reference(reference).is_random,  # pyright: ignore[reportArgumentType]
-    abscissa=lambda _: {},
+    make_reference=make_reference,
     traced=(
         "time_s",
         "reference_angle",
@@ -306,12 +300,12 @@ _TESTBED = Environment(
     ),
     subject="link error",
     figures=("time", "static"),
-    overview=Column("link error rms", "link_error_rms_rad"),
-    swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
-    judged=(Column("link error rms", "link_error_rms_rad"),),
+    overview=_LINK,
+    swept=(_LINK, Column("peak", "link_error_peak_rad")),
+    judged=(_LINK,),
     curves=(
-        TracedSignal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
-        TracedSignal("link error", "link_error", "mrad", 1e3),
+        TracedSignal("link angle", "link_angle", "rad", reference="reference_angle"),
+        TracedSignal("link error", "link_error", "mrad"),
     ),
     watched_reference="sine",
     looped_policy="input",
@@ -321,33 +315,24 @@ _TESTBED = Environment(
 _JOINTS = replace(
     _TESTBED,
     default_reference="multisine",
-    draws=lambda reference: make_arm_reference(reference).is_random,  # pyright: ignore[reportArgumentType]
+    make_reference=make_arm_reference,
     columns=tuple(column for column in _TESTBED.columns if not column.title.startswith("IMU")),
     traced=("time_s", "link_error", "deflection", "joint_torque", "command_rate"),
     figures=(),
-    curves=(
-        TracedSignal("link error", "link_error", "mrad", 1e3),
-        TracedSignal("deflection", "deflection", "mrad", 1e3),
-    ),
+    curves=(_TESTBED.curves[1], TracedSignal("deflection", "deflection", "mrad")),
     watched_reference=None,
     on_hardware="",
 )
 """Several joints on a fixed base: the figures are those of all joints together."""
 
 _TOOL = Column("end effector error rms", "end_effector_error_rms_m")
+_DISTANCE = "rms distance from where the reference has it"
+_ANGLE = "rms angle of the end effector from the reference"
 _WITH_END_EFFECTOR = replace(
     _JOINTS,
     columns=(
-        Column(
-            "end effector",
-            "end_effector_error_rms_m",
-            note="rms distance from where the reference has it",
-        ),
-        Column(
-            "tilt",
-            "end_effector_tilt_rms_rad",
-            note="rms angle of the end effector from the reference",
-        ),
+        Column("end effector", "end_effector_error_rms_m", note=_DISTANCE),
+        Column("tilt", "end_effector_tilt_rms_rad", note=_ANGLE),
         *_JOINTS.columns,
     ),
     traced=("time_s", "end_effector_error", "end_effector_tilt", *_JOINTS.traced[1:]),
@@ -356,22 +341,29 @@ _WITH_END_EFFECTOR = replace(
     swept=(_TOOL, *_JOINTS.swept),
     judged=(_TOOL,),
     also=_JOINTS.judged,
-    curves=(TracedSignal("end effector error", "end_effector_error", "mm", 1e3), *_JOINTS.curves),
+    curves=(TracedSignal("end effector error", "end_effector_error", "mm"), *_JOINTS.curves),
 )
 """The same robots where what counts is the place of an end effector."""
 
-_ROLL = Column("roll rms", "pelvis_roll_rms_rad")
-_ZMP = Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
+_ROLL = Column("pelvis roll rms", "pelvis_roll_rms_rad")
+_ZMP = Column("ZMP deviation rms", "zmp_deviation_rms_m")
+_EARLY = "swing foot down before its time"
+_TILT = "error of its attitude, roll and pitch together"
+_BY_PHASE = tuple(
+    Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
+    for title, metric, unit in (
+        ("roll", "pelvis_roll", "rad"),
+        ("pitch", "pelvis_pitch", "rad"),
+        ("ZMP", "zmp_deviation", "m"),
+    )
+    for phase in ("double", "single", "transition")
+)
 
-_WALKER = Environment(
+_WALKER = _Walker(
     id=IDS["walker"],
     robot="walker",
     motion="step_period",
     default_reference=3,
-    arguments=_walk_arguments,
-    label=_walk_label,
-    draws=lambda _: False,
-    abscissa=_walk_abscissa,
     traced=(
         "time_s",
         "pelvis_roll",
@@ -387,59 +379,32 @@ _WALKER = Environment(
         "force_right",
     ),
     columns=(
-        _ROLL,
+        Column("roll rms", "pelvis_roll_rms_rad"),
         Column("roll peak", "pelvis_roll_peak_rad"),
         Column("pitch rms", "pelvis_pitch_rms_rad"),
         Column("pitch peak", "pelvis_pitch_peak_rad", on_console=False),
-        _ZMP,
+        Column("ZMP rms", "zmp_deviation_rms_m", decimals=1),
         Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
         Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
-        Column(
-            "IMU",
-            "imu_error_rms_rad",
-            on_console=False,
-            note="error of its attitude, roll and pitch together",
-        ),
+        Column("IMU", "imu_error_rms_rad", on_console=False, note=_TILT),
         Column(
             "early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"
         ),
         Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
         Column("COM jump", "com_jump_mean_m", decimals=1),
     ),
-    splits=(
-        (
-            "By phase, rms",
-            tuple(
-                Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
-                for title, metric, unit in (
-                    ("roll", "pelvis_roll", "rad"),
-                    ("pitch", "pelvis_pitch", "rad"),
-                    ("ZMP", "zmp_deviation", "m"),
-                )
-                for phase in ("double", "single", "transition")
-            ),
-        ),
-    ),
+    splits=(("By phase, rms", _BY_PHASE),),
     subject="pelvis and ZMP of the walk",
     figures=("pelvis", "zmp"),
-    overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
-    swept=(
-        Column("pelvis roll rms", "pelvis_roll_rms_rad"),
-        Column("ZMP deviation rms", "zmp_deviation_rms_m"),
-    ),
-    judged=(
-        Column("pelvis error rms", "pelvis_error_rms_rad"),
-        Column("ZMP deviation rms", "zmp_deviation_rms_m"),
-    ),
+    overview=_ROLL,
+    swept=(_ROLL, _ZMP),
+    judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), _ZMP),
     learned_from={"bank": 1},
-    also=(
-        Column("pelvis roll rms", "pelvis_roll_rms_rad"),
-        Column("pelvis pitch rms", "pelvis_pitch_rms_rad"),
-    ),
+    also=(_ROLL, Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
     curves=(
-        TracedSignal("pelvis roll", "pelvis_roll", "mrad", 1e3),
-        TracedSignal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
-        TracedSignal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+        TracedSignal("pelvis roll", "pelvis_roll", "mrad"),
+        TracedSignal("pelvis pitch", "pelvis_pitch", "mrad"),
+        TracedSignal("ZMP to the left", "zmp_y", "mm", reference="zmp_reference_y"),
     ),
     quantity="step period",
     failure="falls",

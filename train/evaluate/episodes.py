@@ -1,6 +1,4 @@
-"""Episodes of a policy under a condition: metrics of each, one time series, and the static
-points.
-"""
+"""Episodes of a policy under a condition: metrics, one time series, and static points."""
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import closing
@@ -49,15 +47,10 @@ class Evaluation:
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
     def values(self, metric: str, failed: bool = False) -> Array:
-        """A metric over the episodes that did not fail, or over those that did, (n,); empty
-        where none has it.
-        """
-        found = [
-            episode.get(metric)
-            for episode in self.episodes
-            if bool(episode["termination"]) == failed
-        ]
-        return np.array([value for value in found if value is not None], dtype=np.float64)
+        """A metric over the episodes that did not fail, or over those that did, (n,)."""
+        shown = [own for own in self.episodes if bool(own["termination"]) == failed]
+        found = [own[metric] for own in shown if own.get(metric) is not None]
+        return np.array(found, dtype=np.float64)
 
     @property
     def num_failed(self) -> int:
@@ -71,17 +64,14 @@ class Evaluation:
 
     @property
     def is_steady(self) -> BoolArray:
-        """Samples of the trace that a figure's range goes by: all but those shortly before a
-        fall.
-        """
+        """Samples of the trace that set a figure's range: all but those shortly before a fall."""
         time_s = self.trace["time_s"]
-        return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
+        end = time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0)
+        return time_s <= max(end, 0.0)
 
 
 def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
-    """Items such as evaluations by what they have in common, in the order in which it first
-    occurs.
-    """
+    """Items by a key, in the order in which it first occurs."""
     groups: dict[KeyT, list[ItemT]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
@@ -111,8 +101,7 @@ def evaluate(
 def evaluate_together(
     conditions: Sequence[Condition], progress: Progress | None = None, num_threads: int = 0
 ) -> list[Evaluation]:
-    """Play conditions of one policy side by side, which costs less; their results are those of
-    `evaluate`.
+    """Play conditions of one policy side by side, which is faster; results are those of `evaluate`.
 
     Args:
         conditions: What to play: one, or several with the same `shared_settings` that can share
@@ -121,23 +110,18 @@ def evaluate_together(
         num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
-    episodes = [
-        (result, number) for result in results for number in range(result.condition.episodes)
-    ]
+    episodes = [(own, number) for own in results for number in range(own.condition.episodes)]
     at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), at_once):
         batch = episodes[first : first + at_once]
-        with closing(
-            make_shared_env([result.condition for result, _ in batch], num_threads)
-        ) as env:
+        conditions = [result.condition for result, _ in batch]
+        with closing(make_shared_env(conditions, num_threads)) as env:
             _play(env, batch, progress or (lambda _: None))
     return results
 
 
 def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress) -> None:
-    """Episodes of conditions, by their numbers, a world each; in every world the first episode
-    counts.
-    """
+    """Play numbered episodes of conditions, a world each; the first episode of a world counts."""
     condition = episodes[0][0].condition
     seeds = [result.condition.seed + number for result, number in episodes]
     policy = make_policy(condition.policy, env, condition.policy_options)
@@ -151,14 +135,11 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
         for world in np.flatnonzero(step.is_over).tolist():
             if world not in records:
                 result, number = episodes[world]
-                metrics = {
-                    name: values[world].item()
-                    for name, values in step.info["episode_metrics"].items()
-                }
+                metrics = step.info["episode_metrics"]
                 records[world] = {
                     **episode_labels(result.condition, number),
                     "termination": str(step.info["termination"][world]),
-                    **metrics,
+                    **{name: values[world].item() for name, values in metrics.items()},
                     **observers.metrics(world),
                 }
                 observers.end(world, step.observation, step.info)
@@ -174,9 +155,7 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
 
 
 def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
-    """The part of a record that is known before the episode: cell, training seed, and seed of
-    the episode.
-    """
+    """The part of a record that is known before the episode: cell, training seed, seed."""
     member = condition.member
     seed = None if member is None else member.training_seed
     return {
@@ -192,9 +171,7 @@ def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
 
 
 class _Observers:
-    """Figures that no environment keeps: of the IMU, of a policy's estimate, and the trace of
-    first episodes.
-    """
+    """Figures that no environment keeps: of the IMU, of a policy's estimate, and traces."""
 
     def __init__(self, env: Any, policy: Any, episodes: Sequence[tuple[Evaluation, int]]) -> None:
         task = env.unwrapped.task
@@ -204,8 +181,9 @@ class _Observers:
         self._env = env
         self._policy = policy
         self._task = task
-        self._estimates = _Estimates(task, len(episodes)) if has_estimate else None
-        self._imu = _ImuError(task, len(episodes)) if walks else None
+        self._estimate = _Rms(task, len(episodes)) if has_estimate else None
+        self._changes = SupportChanges(task.assumed_model) if has_estimate and walks else None
+        self._imu = _Rms(task, len(episodes)) if walks else None
         self._traces = {
             world: _Trace(task, environment.traced, world)
             for world, (_, number) in enumerate(episodes)
@@ -219,17 +197,28 @@ class _Observers:
             if world not in self._ended:
                 trace.take(observation, info)
         if self._imu is not None:
-            self._imu.take(observation, info)
-        if self._estimates is not None:
+            shown = self._task.observation_table.group("imu_attitude")
+            attitude = observation[:, shown]
+            truth = np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+            self._imu.take(np.square(attitude - truth).sum(axis=1))
+        if self._estimate is not None:
             estimate = self._policy.link_estimate(observation, memory)
-            self._estimates.take(step, estimate, observation, self._env.unwrapped.truth())
+            truth = self._env.unwrapped.truth()
+            self._estimate.take(np.square(estimate - truth.q).mean(axis=1))
+            if self._changes is not None:
+                self._changes.take(step, estimate, observation, truth)
 
     def metrics(self, world: int) -> dict[str, float]:
         """Figures of a world over its episode so far."""
         found: dict[str, float] = {}
-        for observer in (self._estimates, self._imu):
-            found |= {} if observer is None else observer.metrics(world)
-        if hasattr(self._task, "robot_record"):  # of the robots that a walker draws from ranges
+        if self._estimate is not None:
+            found["link_estimate_error_rms_rad"] = self._estimate.of(world)
+        if self._changes is not None:
+            found |= self._changes.metrics(world)
+        if self._imu is not None:
+            found["imu_error_rms_rad"] = self._imu.of(world)
+        # of the robots that a walker draws from ranges
+        if hasattr(self._task, "robot_record"):
             found |= self._task.robot_record(world)
         return found
 
@@ -266,48 +255,6 @@ class _Rms:
         return float(np.sqrt(self._sum[world] / count)) if count else float("nan")
 
 
-class _ImuError:
-    """Roll and pitch by a walker's IMU, as old as they are shown, against the truth."""
-
-    def __init__(self, task: Any, worlds: int) -> None:
-        self._rms = _Rms(task, worlds)
-        self._attitude = task.observation_table.group("imu_attitude")
-
-    def take(self, observation: Array, info: dict[str, Any]) -> None:
-        error = observation[:, self._attitude] - np.stack(
-            [info["pelvis_roll"], info["pelvis_pitch"]], axis=1
-        )
-        self._rms.take(np.square(error).sum(axis=1))
-
-    def metrics(self, world: int) -> dict[str, float]:
-        """RMS of the angle by which the shown vertical is off."""
-        return {"imu_error_rms_rad": self._rms.of(world)}
-
-
-class _Estimates:
-    """A policy's estimate of the link angles against the truth, and on a walker what it makes of
-    the local frame.
-    """
-
-    def __init__(self, task: Any, worlds: int) -> None:
-        self._rms = _Rms(task, worlds)
-        self._changes = (
-            SupportChanges(task.assumed_model)
-            if isinstance(task.assumed_model, WalkerModel)
-            else None
-        )
-
-    def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
-        self._rms.take(np.square(estimate - truth.q).mean(axis=1))
-        if self._changes is not None:
-            self._changes.take(step, estimate, observation, truth)
-
-    def metrics(self, world: int) -> dict[str, float]:
-        """RMS over the scored steps, and the figures of the support changes."""
-        changes = self._changes.metrics(world) if self._changes is not None else {}
-        return {"link_estimate_error_rms_rad": self._rms.of(world), **changes}
-
-
 class _Trace:
     """Time series and static points of the first episode of a condition, that of a world."""
 
@@ -318,9 +265,8 @@ class _Trace:
         self.references = np.zeros(0)
         self._recorder: HoldRecorder | None = None
         visits = getattr(getattr(task.config, "reference", None), "visits", None)
-        if (
-            visits is not None and "link_angle_imu" in traced
-        ):  # static points need the IMU of the only link
+        # static points need the IMU of the only link
+        if visits is not None and "link_angle_imu" in traced:
             self.references, directions = visits
             self._recorder = HoldRecorder(directions)
         self._rows: list[tuple[float, ...]] = []
@@ -331,9 +277,8 @@ class _Trace:
         self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
         if self._recorder is not None:
             encoder = observation[own, self._encoder][:, 0]
-            self._recorder.take(
-                encoder, info["link_angle_imu"][own], int(info["rest"][self._world])
-            )
+            rest = int(info["rest"][self._world])
+            self._recorder.take(encoder, info["link_angle_imu"][own], rest)
 
     def signals(self) -> dict[str, Array]:
         """Time series by name."""

@@ -1,5 +1,4 @@
-"""Policies of a comparison with all training seeds of a residual, and with whom each residual is
-compared.
+"""Policies of a comparison with all training seeds of each residual, and their opponents.
 
 A residual is compared with its base, and with the best policy without learning that reads the same
 sensors.
@@ -16,7 +15,8 @@ from typing import Any
 
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
-from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
+from baselines.residual.residual_policy import DESCRIPTION, read_description, shipped_names
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
@@ -62,8 +62,7 @@ class Origin:
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
-    """All who play: a residual's pattern as one entrant per folder, and bases and rivals that
-    nobody named.
+    """All who play: residuals with a folder each, and bases and rivals that nobody named.
 
     Args:
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
@@ -75,31 +74,36 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
     """
     entrants: list[Entrant] = []
     bases = [policy for policy in policies if not is_residual(policy)]
+
+    def add(other: PolicySpec) -> None:
+        if with_bases and other not in bases:
+            bases.append(other)
+            entrants.append(Entrant(other))
+
     for policy in policies:
         if not is_residual(policy):
             entrants.append(Entrant(policy))
             continue
         members = _members(policy.name.removeprefix(RESIDUAL))
-        for folder, _, said in members:
-            _require_motion(folder, said)
-        description = members[0][2]
-        base = next((known for known in bases if _plays(known, description, policy)), None)
-        if base is None:
-            base = _base(description, policy, [*policies, *bases])
-            if with_bases:
-                bases.append(base)
-                entrants.append(Entrant(base))
-        rival = _rival(description, policy, [*policies, *bases])
-        if rival is not None and with_bases and rival not in bases:
-            bases.append(rival)
-            entrants.append(Entrant(rival))
-        others = None if rival is None or rival not in bases else rival.title
+        for member in members:
+            _require_motion(member)
+        pairing = _Opponents(members[0].description, policy)
+        base = pairing.base([*policies, *bases])
+        add(base)
+        rival = pairing.rival([*policies, *bases])
+        if rival is not None:
+            add(rival)
         entrants += [
             Entrant(
-                policy.replace(name=f"{RESIDUAL}{folder}", label=policy.title),
-                Member(folder=str(folder), training_seed=seed, base=base.title, rival=others),
+                policy.replace(name=f"{RESIDUAL}{own.folder}", label=policy.title),
+                Member(
+                    folder=str(own.folder),
+                    training_seed=own.seed,
+                    base=base.title,
+                    rival=rival.title if rival in bases else None,
+                ),
             )
-            for folder, seed, _ in members
+            for own in members
         ]
     return entrants
 
@@ -126,26 +130,31 @@ def origin(members: Sequence[Member]) -> Origin:
     )
 
 
-def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
-    """Folders of a pattern in natural order, with training seed and description; shipped ones
-    where none lie there.
-    """
-    is_family = bool(_WILD.search(pattern))
-    folders = [Path(pattern)]
-    if is_family:
-        folders = sorted(
-            _matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural
-        )
-        if not folders:
-            raise ConfigurationError(
-                f"no folder matches {quote(pattern)}; {_nearest(Path(pattern))}"
-            )
-    descriptions = [read_description(folder) for folder in folders]
-    members = [
-        (f, _training_seed(f, said), said) for f, said in zip(folders, descriptions, strict=True)
-    ]
-    if is_family:
-        _require_one_family(pattern, members)
+@dataclass(frozen=True)
+class _Folder:
+    """A residual's folder with its description and training seed; None where nothing says it."""
+
+    folder: Path
+    description: ResidualDescription
+
+    @property
+    def seed(self) -> int | None:
+        """As the residual says it, or the name of its folder."""
+        if self.description.origin.seed is not None:
+            return self.description.origin.seed
+        found = _SEED.findall(str(self.folder))
+        return int(found[-1]) if found else None
+
+
+def _members(pattern: str) -> list[_Folder]:
+    """Folders of a pattern in natural order; shipped ones where none lie there."""
+    if not _WILD.search(pattern):
+        return [_Folder(Path(pattern), read_description(Path(pattern)))]
+    folders = _matching(pattern) or map(Path, fnmatch.filter(shipped_names(), pattern))
+    members = [_Folder(own, read_description(own)) for own in sorted(folders, key=_natural)]
+    if not members:
+        raise ConfigurationError(f"no folder matches {quote(pattern)}; {_nearest(Path(pattern))}")
+    _require_one_family(pattern, members)
     return members
 
 
@@ -162,47 +171,37 @@ def _matching(pattern: str) -> list[Path]:
         )
     anchor = Path(pattern).anchor
     try:
-        return [
-            path
-            for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
-            if path.is_dir()
-        ]
+        found = Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
+        return [path for path in found if path.is_dir()]
     except OSError:  # a name that is too long
         return []
 
 
-def _require_motion(folder: Path, description: ResidualDescription) -> None:
-    """Refuse a residual whose training names a motion that its environment cannot read: the
-    report would need it.
-    """
-    known = ENVIRONMENTS.get(description.robot)
-    reference = description.origin.config.reference
+def _require_motion(member: _Folder) -> None:
+    """Refuse a residual trained on a motion that its environment cannot read."""
+    known = ENVIRONMENTS.get(member.description.robot)
+    reference = member.description.origin.config.reference
     if known is None or reference is None:
         return
     try:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
-        raise ConfigurationError(
-            f"{shorten(folder / DESCRIPTION)}: training.config.reference: {error}"
-        ) from None
+        file = shorten(member.folder / DESCRIPTION)
+        raise ConfigurationError(f"{file}: training.config.reference: {error}") from None
 
 
 def _nearest(pattern: Path) -> str:
-    """The folders beside a pattern that matches none, the most similar names first, and those
-    that are shipped.
-    """
+    """The folders beside a pattern that matches none, the most similar first, and shipped ones."""
     there = next(
         path
         for path in pattern.parents
         if os.path.isdir(path) and not _WILD.search(str(path))  # noqa: PTH112
     )
-    names = [
-        path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")
-    ]
-    near = difflib.get_close_matches(
-        pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0
-    )
-    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())
+    folders = (path.name for path in there.iterdir() if path.is_dir())
+    names = [name for name in folders if not name.startswith(".")]
+    wanted = pattern.relative_to(there).parts[0]
+    near = difflib.get_close_matches(wanted, names, n=_NEAREST, cutoff=0.0)
+    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped_names())
     where = "this folder" if there == Path() else str(there)
     return (
         f"{where} has {', '.join(near) or 'no folders'}; with the package come"
@@ -210,41 +209,31 @@ def _nearest(pattern: Path) -> str:
     )
 
 
-def _training_seed(folder: Path, description: ResidualDescription) -> int | None:
-    """As the residual says it, or the name of its folder; None where neither does."""
-    if description.origin.seed is not None:
-        return description.origin.seed
-    found = _SEED.findall(str(folder))
-    return int(found[-1]) if found else None
-
-
-def _require_one_family(
-    pattern: str, members: Sequence[tuple[Path, int | None, ResidualDescription]]
-) -> None:
+def _require_one_family(pattern: str, members: Sequence[_Folder]) -> None:
     """Refuse folders that are no training seeds of one configuration."""
-    first, _, expected = members[0]
+    theirs = _kin(members[0].description)
     seen: dict[int, Path] = {}
-    for folder, seed, description in members:
-        mine = _kin(description)
-        theirs = _kin(expected)
+    for member in members:
+        mine = _kin(member.description)
+        folder = member.folder
         for what in {**mine, **theirs}:
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
                     f"{pattern!r} must match training seeds of one configuration, but {what} of"
-                    f" {shorten(folder)} is {mine.get(what)!r} and of {first}"
+                    f" {shorten(folder)} is {mine.get(what)!r} and of {members[0].folder}"
                     f" {theirs.get(what)!r}; give each an entry of its own"
                 )
-        if seed is None:
+        if member.seed is None:
             raise ConfigurationError(
                 f"{folder} does not say its training seed: residual.json has no training.seed and"
                 " the path no seed_N"
             )
-        if seed in seen:
+        if member.seed in seen:
             raise ConfigurationError(
-                f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and"
+                f"{pattern!r} matches training seed {member.seed} twice: {seen[member.seed]} and"
                 f" {shorten(folder)}"
             )
-        seen[seed] = folder
+        seen[member.seed] = folder
 
 
 _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every")
@@ -254,85 +243,71 @@ _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_ev
 def _kin(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
-    trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
-    return trained | {
-        name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")
-    }
+    trained = {f"the trained {name}": config[name] for name in config if name not in _OWN}
+    names = ("robot", "base", "base_options", "settings")
+    return trained | {name: getattr(description, name) for name in names}
 
 
-def _plays(known: PolicySpec, description: ResidualDescription, residual: PolicySpec) -> bool:
-    """True if a policy is the base of a residual, with the same options, in the same
-    environment.
+@dataclass(frozen=True)
+class _Opponents:
+    """The policies that a residual is compared with.
+
+    Attributes:
+        description: Of the residual.
+        residual: Its entry in the comparison, whose options go over those of its base.
     """
-    return (
-        known.name == description.base
-        and _set_options(known.options) == _base_options(description, residual)
-        and known.env_options == residual.env_options
-        and known.level == residual.level
-    )
+
+    description: ResidualDescription
+    residual: PolicySpec
+
+    def base(self, taken: Sequence[PolicySpec]) -> PolicySpec:
+        """The base: one of the policies with the same options, or one of its own."""
+        name = self.description.base
+        beside = [known for known in taken if self._is_beside(known, name)]
+        for known in beside:
+            if _set_options(known.options) == self._options:
+                return known
+        return self._new(name, f"base of {self.residual.title}", self._options, taken)
+
+    def rival(self, taken: Sequence[PolicySpec]) -> PolicySpec | None:
+        """The best policy without learning that has the same sensors; None where that is the base.
+
+        One that is among the policies counts if it assumes the same stiffness, whatever its other
+        options. Where the base is that policy with options, it is compared with the plain one if
+        that is among the policies.
+        """
+        environment = ENVIRONMENTS.get(self.description.robot)
+        name = best_analytic(environment is not None and environment.walks)
+        if name is None:
+            return None
+        is_base = name == self.description.base
+        assumed = _assumed(self._options)
+        for known in (known for known in taken if self._is_beside(known, name)):
+            own = _set_options(known.options)
+            if (own if is_base else _assumed(own)) == assumed:
+                return None if is_base and self._options == assumed else known
+        return None if is_base else self._new(name, "best analytic", assumed, taken)
+
+    @property
+    def _options(self) -> dict[str, object]:
+        return _set_options({**self.description.base_options, **self.residual.options})
+
+    def _is_beside(self, known: PolicySpec, name: str) -> bool:
+        """True if a policy has a name and plays in the environment of the residual."""
+        mine = (known.name, known.env_options, known.level)
+        return mine == (name, self.residual.env_options, self.residual.level)
+
+    def _new(
+        self, name: str, role: str, options: dict[str, object], taken: Sequence[PolicySpec]
+    ) -> PolicySpec:
+        """A policy under its name or, where a policy is called so, under one that says its role."""
+        is_taken = name in {policy.title for policy in taken}
+        label = f"{name} ({role})" if is_taken else None
+        return self.residual.replace(name=name, label=label, options=options, track=None)
 
 
-def _base(
-    description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]
-) -> PolicySpec:
-    """The base of a residual as a policy of its own, under a title that nobody has."""
-    options = _base_options(description, residual)
-    return _beside(residual, taken, description.base, f"base of {residual.title}", options)
-
-
-def _beside(
-    residual: PolicySpec,
-    taken: Sequence[PolicySpec],
-    name: str,
-    role: str,
-    options: dict[str, object],
-) -> PolicySpec:
-    """Whom a residual is compared with, under its name, or where a policy is called so under one
-    that says its role.
-    """
-    label = f"{name} ({role})" if name in {policy.title for policy in taken} else None
-    return PolicySpec(
-        name=name,
-        label=label,
-        options=options,
-        env_options=residual.env_options,
-        level=residual.level,
-    )
-
-
-def _rival(
-    description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]
-) -> PolicySpec | None:
-    """The best policy without learning, with the same sensors, in the same environment; None where
-    that is the base.
-
-    One that is among the policies counts if it assumes the same stiffness, whatever its other
-    options. Where the base is that policy with options, it is compared with the plain one if that
-    is among the policies.
-    """
-    known = ENVIRONMENTS.get(description.robot)
-    name = best_analytic(known is not None and known.walks)
-    if name is None:
-        return None
-    options = _base_options(description, residual)
-    is_base = name == description.base
-    assumed = {option: value for option, value in options.items() if option in ASSUMED_OPTIONS}
-    for policy in taken:
-        given = _set_options(policy.options)
-        mine = (
-            given
-            if is_base
-            else {option: v for option, v in given.items() if option in ASSUMED_OPTIONS}
-        )
-        same = policy.env_options == residual.env_options and policy.level == residual.level
-        if policy.name == name and mine == assumed and same:
-            return policy if not is_base or options != assumed else None
-    return None if is_base else _beside(residual, taken, name, "best analytic", assumed)
-
-
-def _base_options(description: ResidualDescription, residual: PolicySpec) -> dict[str, object]:
-    """Options of the base: its own, and over them those that the comparison gives the residual."""
-    return _set_options({**description.base_options, **residual.options})
+def _assumed(options: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in options.items() if name in ASSUMED_OPTIONS}
 
 
 def _set_options(options: dict[str, object]) -> dict[str, object]:

@@ -1,11 +1,11 @@
-"""Maps over two axes: which policy is best where, and how far learning is ahead of the best policy
-without it.
+"""Maps over two axes: which policy is best where, and what learning adds to the best.
 
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Self
 
 from pydantic import Field, model_validator
@@ -16,7 +16,7 @@ from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, Pairings
-from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
+from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, vary_scenario
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
@@ -49,33 +49,27 @@ class Axis(Model):
         if self.label is not None:
             return self.label
         if self.is_motion:
-            return self.what.replace("_", " ") + (" [s]" if self.what == "step_period" else "")
+            unit = " [s]" if self.what == "step_period" else ""
+            return f"{self.what.replace('_', ' ')}{unit}"
         description, unit = scenario_fields()[self.what]
         return f"{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
 
     def ticks(self, known: Environment) -> list[str]:
         """Its values as they are shown."""
         if self.is_motion:
-            numbers = [
-                f"{number:g}" for value in self.values for number in known.abscissa(value).values()
-            ]
-            return numbers or [
-                known.label(known.arguments(value)[known.motion]) for value in self.values
-            ]
+            numbers = [n for value in self.values for n in known.abscissa(value).values()]
+            motions = [known.arguments(value)[known.motion] for value in self.values]
+            return [f"{number:g}" for number in numbers] or list(map(known.label, motions))
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
 
     def place(self, condition: Condition) -> int:
         """Which of its values a condition has."""
-        values: list[Any] = self.values
-        if self.is_motion:
-            values = [condition.environment.arguments(value) for value in values]
-        mine = (
-            condition.environment.arguments(condition.reference)
-            if self.is_motion
-            else condition.swept[self.what]
-        )
-        return values.index(mine)
+        if not self.is_motion:
+            return self.values.index(condition.swept[self.what])
+        arguments = condition.environment.arguments
+        values = [arguments(value) for value in self.values]
+        return values.index(arguments(condition.reference))
 
 
 class MapConfig(Model):
@@ -122,26 +116,22 @@ class MapConfig(Model):
                     raise ConfigurationError(
                         f"values of map.{name} must be numbers, got {quote(value)}"
                     )
-                varied(GROUNDS["nominal"], {axis.what: value})
+                vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
         """Fields of the scenario in every cell, for one motion."""
-        found: list[dict[str, float]] = [{}]
-        for axis in self.axes:
-            if not axis.is_motion:
-                found = [
-                    {**fields, axis.what: float(value)} for fields in found for value in axis.values
-                ]
-        return found
+        fields = [axis for axis in self.axes if not axis.is_motion]
+        names = [axis.what for axis in fields]
+        return [
+            dict(zip(names, map(float, values), strict=True))
+            for values in product(*(axis.values for axis in fields))
+        ]
 
 
 def _choices(what: str, known: Environment) -> str:
     """Names that an axis can have."""
-    hint = (
-        "; an option of the policies is varied by sweep, not by a map"
-        if what in PolicyOptions.model_fields
-        else ""
-    )
+    is_option = what in PolicyOptions.model_fields
+    hint = "; an option of the policies is varied by sweep, not by a map" if is_option else ""
     return choices_listed(what, [known.motion, *scenario_fields()]) + hint
 
 
@@ -203,10 +193,8 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        motion = (
-            [] if config.motion else [e.condition.environment.title(e.condition.reference_name)]
-        )
-        return ", ".join([*motion, e.condition.scenario])
+        motion = e.condition.environment.title(e.condition.reference_name)
+        return e.condition.scenario if config.motion else f"{motion}, {e.condition.scenario}"
 
     return [
         heat_map
@@ -215,9 +203,12 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     ]
 
 
-def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | None:
-    """The policy with the lowest score among those with the smallest share of failures; None where
-    nobody has a score.
+Scores = Mapping[str, tuple[Estimate, tuple[int, int]]]
+"""Score of every policy, and how many of its episodes failed, of how many."""
+
+
+def ranking(scores: Scores) -> list[str]:
+    """The policies that have a score, the best first: fewer failures go before a lower score.
 
     A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures
     count first.
@@ -227,16 +218,21 @@ def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | Non
         estimate, (failed, played) = scores[title]
         return failed / max(played, 1), estimate.value
 
-    return min((title for title in scores if scores[title][0].is_known), key=rank, default=None)
+    return sorted((title for title in scores if scores[title][0].is_known), key=rank)
+
+
+def best_of(scores: Scores) -> str | None:
+    """The best policy of a `ranking`; None where nobody has a score."""
+    return next(iter(ranking(scores)), None)
 
 
 def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatMap]:
     """A map per judged metric."""
-    places = {
-        cell: (config.y.place(condition), config.x.place(condition))
+    cells = {
+        (config.y.place(condition), config.x.place(condition)): cell
         for (_, cell), condition in table.conditions.items()
     }
-    cells = {place: cell for cell, place in places.items()}
+    rows = [[cells[y, x] for x in range(len(config.x.values))] for y in range(len(config.y.values))]
     pairings = Pairings(table)
     return [
         HeatMap(
@@ -247,13 +243,7 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
             known=table.environment,
             policies=tuple(table.policies),
             families=tuple(table.members),
-            cells=tuple(
-                tuple(
-                    _cell(pairings, cells[row, place], column)
-                    for place in range(len(config.x.values))
-                )
-                for row in range(len(config.y.values))
-            ),
+            cells=tuple(tuple(_cell(pairings, cell, column) for cell in row) for row in rows),
         )
         for column in table.environment.judged
     ]
@@ -262,29 +252,22 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
 def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
     table = pairings.table
-    played = {
-        title: table.of(title, cell)
-        for title in table.policies
-        if (title, cell) in table.conditions
-    }
-    scores = {title: (score(rows, column), failures(rows)) for title, rows in played.items()}
+    played = [title for title in table.policies if (title, cell) in table.conditions]
+    rows = {title: table.of(title, cell) for title in played}
+    scores = {title: (score(own, column), failures(own)) for title, own in rows.items()}
     tracks = {title: table.conditions[title, cell].track for title in played}
-    analytic = best_of(
-        {title: own for title, own in scores.items() if tracks[title] is Track.STANDARD}
-    )
-    learned = [title for title in played if title in table.members and analytic is not None]
-    scenario = table.conditions[next(iter(played)), cell].scenario
+    standard = [title for title in played if tracks[title] is Track.STANDARD]
+    without_truth = [title for title in played if tracks[title] is not Track.TRUTH]
+    analytic = best_of({title: scores[title] for title in standard})
+    learned = [title for title in played if title in table.members] if analytic else []
+    scenario = table.conditions[played[0], cell].scenario
     return MapCell(
         levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},
-        best=best_of(
-            {title: own for title, own in scores.items() if tracks[title] is not Track.TRUTH}
-        ),
+        best=best_of({title: scores[title] for title in without_truth}),
         best_analytic=analytic,
         learned={
-            title: (
-                pairings.of(title, str(analytic)).change(column, [cell], scenario, is_group=False)
-            )
+            title: pairings.change(title, str(analytic), column, [cell], scenario)
             for title in learned
         },
     )

@@ -72,30 +72,29 @@ def _evaluation(row: Mapping[str, str], columns: Sequence[str]) -> dict[str, Any
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:
-    """Curves of policies that lie in their training runs, beside a whole `progress.csv`; None where
-    one does not.
+    """Curves of policies that lie beside a whole `progress.csv`; None where one does not.
 
     Args:
         folders: Folders of the policies, such as runs/NAME/seed_0/last.
         columns: Metrics that training was evaluated by.
     """
+    metrics = [column.metric for column in columns]
     runs = [Path(folder).resolve().parent for folder in folders]
     try:
-        tables = [read_progress(run, [column.metric for column in columns]) for run in runs]
+        tables = [read_progress(run, metrics) for run in runs]
     except ConfigurationError:
         return None
-    decisions = sorted(set.intersection(*({row["decisions"] for row in table} for table in tables)))
+    common = set.intersection(*({row["decisions"] for row in table} for table in tables))
+    decisions = sorted(common)
     if not decisions:
         return None
     ratios = {
-        column.metric: np.array(
-            [[_ratio(table, at, column.metric) for at in decisions] for table in tables]
-        )
-        for column in columns
+        metric: np.array([[_ratio(table, at, metric) for at in decisions] for table in tables])
+        for metric in metrics
     }
     return Curves(np.array(decisions), ratios)
 
 
 def _ratio(table: Sequence[dict[str, Any]], decisions: float, metric: str) -> float:
-    found = [row[metric] / row[f"base_{metric}"] for row in table if row["decisions"] == decisions]
-    return float(np.mean(found))
+    rows = [row for row in table if row["decisions"] == decisions]
+    return float(np.mean([row[metric] / row[f"base_{metric}"] for row in rows]))

@@ -1,5 +1,4 @@
-"""A robot as a file of YAML: what `--env arm.robot.yaml` names, so that no Python has to be
-written.
+"""A robot as a YAML file, which `--env arm.robot.yaml` names instead of Python code.
 
     model: arm.xml
     joints: arm.yaml

@@ -1,6 +1,4 @@
-"""Scores over drawn robots: how a policy does on the middle half of them, on the worst tenth,
-and against its base.
-"""
+"""Scores over drawn robots: the middle half of them, the worst tenth, and against the base."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +20,7 @@ FEWEST_ROBOTS = 4
 
 @dataclass(frozen=True)
 class RobotScores:
-    """A policy in one metric over the drawn robots of a cell; of residuals over training seeds,
-    with intervals.
+    """A policy in one metric over the drawn robots of a cell; of residuals with intervals.
 
     Attributes:
         policy, reference, scenario: Titles of the cell.
@@ -62,59 +59,47 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
         for cell in table.cells_of(policy):
             condition = table.conditions[policy, cell]
             rows = table.of(policy, cell)
-            if (
-                condition.swept
-                or len(set(rows["seed"])) < FEWEST_ROBOTS
-                or not _draws_robots(condition)
-            ):
+            is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
+            if condition.swept or is_small or not _draws_robots(condition):
                 continue
-            failed, episodes = failures(rows)
-            against = {
-                other: table.of(other, cell)
-                for other in others
-                if (other, cell) in table.conditions
-            }
+            against = [other for other in others if (other, cell) in table.conditions]
             found += [
-                RobotScores(
-                    policy=policy,
-                    reference=condition.reference_name,
-                    scenario=condition.scenario,
-                    column=column,
-                    mean=score(rows, column),
-                    middle=score(rows, column, _middle),
-                    worst=score(
-                        rows, column, lambda values: worst_share_mean(values.dropna().to_numpy())
-                    ),
-                    failed=failed,
-                    episodes=episodes,
-                    better={
-                        other: _better(rows, theirs, column) for other, theirs in against.items()
-                    },
-                    failure=table.environment.failures,
-                )
+                _robot_scores(table, cell, policy, against, column)
                 for column in table.environment.judged
             ]
     return found
 
 
-def _middle(values: pd.Series) -> float:
-    known = values.dropna().to_numpy()
-    return float(interquartile_mean(known)) if len(known) else float("nan")
+def _robot_scores(
+    table: EpisodeTable, cell: int, policy: str, others: Sequence[str], column: Column
+) -> RobotScores:
+    condition = table.conditions[policy, cell]
+    rows = table.of(policy, cell)
+    failed, episodes = failures(rows)
+    return RobotScores(
+        policy=policy,
+        reference=condition.reference_name,
+        scenario=condition.scenario,
+        column=column,
+        mean=score(rows, column),
+        middle=score(rows, column, interquartile_mean),
+        worst=score(rows, column, worst_share_mean),
+        failed=failed,
+        episodes=episodes,
+        better={other: _better(rows, table.of(other, cell), column) for other in others},
+        failure=table.environment.failures,
+    )
 
 
 def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
-    """Share of the robots for which a policy is better than another one, over its training
-    seeds.
-    """
-    shares = [
-        share_better(own, base, column.metric) for _, own in mine.groupby("member", sort=False)
-    ]
+    """Share of the robots for which a policy is better than another one."""
+    members = mine.groupby("member", sort=False)
+    shares = [share_better(own, base, column.metric) for _, own in members]
     return estimate(mine, np.array(shares))
 
 
 def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
-    """Share of the episodes of both in which the policy is better (lower) than the base; ties count
-    half.
+    """Share of common episodes in which the policy is better (lower); ties count half.
 
     To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
     in common. An episode that reached its end without a figure, such as a ZMP of feet that never
@@ -133,4 +118,5 @@ def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
 
 def _draws_robots(condition: Condition) -> bool:
     known = condition.environment
-    return not known.is_real and make_scenario(condition.scenario, known.walks).draws_robots
+    scenario = condition.scenario
+    return not known.is_real and make_scenario(scenario, known.walks).draws_robots

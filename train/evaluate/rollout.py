@@ -1,6 +1,4 @@
-"""The rollout of a policy: how its environment and the policy are made, and one generator of
-control steps.
-"""
+"""The rollout of a policy: its environment, the policy, and one generator of control steps."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -181,8 +179,16 @@ def make_vector_env(
     num_envs: int,
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+    **others: Any,
 ) -> Any:
     """The vector environment of a condition.
+
+    Args:
+        condition: The condition.
+        num_envs: Worlds.
+        num_threads: Threads of the physics, 0 for all cores.
+        autoreset_mode: When worlds begin anew.
+        **others: Arguments of the environment in place of the condition's.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
@@ -193,7 +199,7 @@ def make_vector_env(
         vectorization_mode="vector_entry_point",
         num_threads=num_threads,
         autoreset_mode=autoreset_mode,
-        **condition.arguments,
+        **{**condition.arguments, **others},
     )
 
 
@@ -202,24 +208,16 @@ def make_shared_env(
     num_threads: int = 0,
     autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> Any:
-    """A vector environment with a world of each condition, whose scenarios may differ, see
-    `shared_settings`.
+    """A vector environment with a world of each condition, see `shared_settings`.
 
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
     """
-    first = conditions[0]
-    scenarios = [condition.scenario_played for condition in conditions]
-    if all(scenario == scenarios[0] for scenario in scenarios):
-        return make_vector_env(first, len(conditions), num_threads, autoreset_mode)
-    return gymnasium.make_vec(
-        first.environment.id,
-        num_envs=len(conditions),
-        vectorization_mode="vector_entry_point",
-        num_threads=num_threads,
-        autoreset_mode=autoreset_mode,
-        **{**first.arguments, "scenario": scenarios},
-    )
+    scenarios: list[Any] = [condition.scenario_played for condition in conditions]
+    is_one = all(scenario == scenarios[0] for scenario in scenarios)
+    scenario = scenarios[0] if is_one else scenarios
+    count = len(conditions)
+    return make_vector_env(conditions[0], count, num_threads, autoreset_mode, scenario=scenario)
 
 
 def shared_settings(condition: Condition) -> str:
@@ -229,8 +227,9 @@ def shared_settings(condition: Condition) -> str:
     rate of the IMU.
     """
     scenario = make_scenario(condition.scenario_played)
-    walks = condition.environment.walks
-    known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz) if walks else scenario
+    known: Any = scenario
+    if condition.environment.walks:
+        known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz)
     return repr((condition.env, {**condition.arguments, "scenario": known}))
 
 
@@ -247,9 +246,7 @@ def can_share_worlds(condition: Condition) -> bool:
 
 
 def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
-    """Conditions, each with an environment of one world, which those that differ by their policy
-    share.
-    """
+    """Conditions with an environment of one world, shared by those that differ by the policy."""
     made: dict[str, Any] = {}
     for condition in conditions:
         key = repr((condition.env, condition.arguments))

@@ -1,6 +1,4 @@
-"""The leaderboard of a comparison: scores of policies over groups of scenarios, in tracks by
-what a policy needs.
-"""
+"""The leaderboard of a comparison: scores over groups of scenarios, in tracks by needs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -98,10 +96,8 @@ def standings(
     table = EpisodeTable(evaluations)
     pairings = Pairings(table)
     scopes = _scopes(table, groups)
-    rivals = group_by(
-        [scope for scope in scopes if table.condition(scope.policy).track is Track.STANDARD],
-        lambda scope: scope.name,
-    )
+    standard = [scope for scope in scopes if table.condition(scope.policy).track is Track.STANDARD]
+    rivals = group_by(standard, lambda scope: scope.name)
     against_base = {
         (row.policy, row.reference, row.scope, row.is_group, row.column): Paired.of(row)
         for row in reversed(changes)
@@ -109,19 +105,16 @@ def standings(
     }
     found = []
     for scope in scopes:
-        condition = table.condition(scope.policy)
         members = table.members.get(scope.policy, {})
         rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            rival = (
-                _against_the_best(pairings, scope, column, rivals.get(scope.name, []))
-                if members
-                else None
-            )
+            rival = None
+            if members:
+                rival = _against_the_best(pairings, scope, column, rivals.get(scope.name, []))
             found.append(
                 Standing(
-                    track=condition.track,
+                    track=table.condition(scope.policy).track,
                     policy=scope.policy,
                     reference=scope.reference,
                     scope=scope.scope,
@@ -168,44 +161,30 @@ class _Scope:
 
 
 def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
-    """Scenarios and whole groups of every policy and motion, in the order of policies and
-    motions.
-    """
+    """Scenarios and whole groups of every policy and motion, in their order."""
     found = []
     for policy in table.policies:
         for reference in table.references:
-            own = {
-                table.conditions[policy, cell].scenario: cell
-                for cell in table.cells_of(policy, reference)
-            }
-            whole = {
-                name: parts for name, parts in groups.items() if all(part in own for part in parts)
-            }
-            in_groups = {part for parts in whole.values() for part in parts}
-            for name, parts in whole.items():
-                cells = [own[part] for part in parts]
-                found.append(
-                    _Scope(policy, reference, name, is_group=True, is_column=True, cells=cells)
-                )
+            cells = table.cells_of(policy, reference)
+            own = {table.conditions[policy, cell].scenario: cell for cell in cells}
+            grouped = set[str]()
+            for name, parts in groups.items():
+                if all(part in own for part in parts):
+                    grouped.update(parts)
+                    members = [own[part] for part in parts]
+                    found.append(_Scope(policy, reference, name, True, True, members))
             for name, cell in own.items():
-                is_column = name not in in_groups
-                found.append(
-                    _Scope(
-                        policy, reference, name, is_group=False, is_column=is_column, cells=[cell]
-                    )
-                )
+                found.append(_Scope(policy, reference, name, False, name not in grouped, [cell]))
     return found
 
 
 def _against_the_best(
     pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]
 ) -> Paired | None:
-    """A residual against the best of some policies in this scope and metric; None where none has
-    a score.
-    """
+    """A residual against the best of some policies; None where none has a score."""
     played = {rival.policy: pairings.table.of(rival.policy, *rival.cells) for rival in rivals}
     best = best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
     if best is None:
         return None
-    pairing = pairings.of(scope.policy, best)
-    return Paired.of(pairing.change(column, scope.cells, scope.scope, scope.is_group))
+    own = (scope.cells, scope.scope, scope.is_group)
+    return Paired.of(pairings.change(scope.policy, best, column, *own))

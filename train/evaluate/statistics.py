@@ -1,5 +1,4 @@
-"""Statistics over training seeds: paired changes, interquartile means, bootstrap intervals,
-probability of improvement.
+"""Statistics over training seeds: changes, interquartile means, bootstrap intervals.
 
 What is drawn at random in learning is the training seed, so intervals are over training seeds and
 never over the episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its
@@ -57,14 +56,11 @@ class Estimate:
             return self.value, self.value
         return self.low, self.high
 
-    @property
-    def cells(self) -> tuple[object, object, object]:
-        """Value and ends of the interval for a CSV file; empty where there is none."""
-        return (
-            self.value,
-            "" if self.low is None else self.low,
-            "" if self.high is None else self.high,
-        )
+    def record(self, name: str) -> dict[str, object]:
+        """Columns of a CSV file: the value, and the ends of the interval, empty without one."""
+        low = "" if self.low is None else self.low
+        high = "" if self.high is None else self.high
+        return {name: self.value, f"{name}_low": low, f"{name}_high": high}
 
     def times(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""
@@ -137,8 +133,7 @@ def over_seeds(values: Sequence[float] | Array) -> Estimate:
 
 
 def improvement(won: Array, played: Array) -> Estimate:
-    """Probability that an episode with the policy is better (lower) than the same with the base;
-    ties count half.
+    """Probability that an episode is better (lower) than the same with the base; ties count half.
 
     Args:
         won: Pairs of episodes in which the policy is better, (seeds, scenarios).
@@ -162,9 +157,7 @@ def improvement(won: Array, played: Array) -> Estimate:
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Percentile bootstrap over training seeds; the same samples, sorted, give the same
-    interval.
-    """
+    """Percentile bootstrap over training seeds; the same sorted samples give the same interval."""
     from scipy import (
         stats,
     )  # here: it takes half a second to load, and most programs need none of it

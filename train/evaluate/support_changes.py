@@ -36,15 +36,12 @@ def tilt(R: Array) -> Array:
 
 
 def frame_error(estimate: LocalFrame, true: LocalFrame, foot: int) -> Array:
-    """e: where a foot's sole seems to be, relative to the pelvis, minus where it is,
-    (num_worlds, 3) [m].
-    """
+    """e: the place of a foot's sole by the estimate, minus the true one, (num_worlds, 3) [m]."""
     return estimate.soles[:, foot] - true.soles[:, foot]
 
 
 def com_jump(estimate: LocalFrame, footholds: Array, old: int, new: int) -> Array:
-    """Jump of the estimated center of mass where the frame goes from one foot to the other,
-    (num_worlds, 3) [m].
+    """Jump of the estimated center of mass at a change of feet, (num_worlds, 3) [m].
 
     Args:
         estimate: Local frame by the policy's joint angles.

@@ -60,18 +60,14 @@ class EpisodeTable:
                 for episode in e.episodes
             ]
         self.rows = pd.DataFrame(records)
-        for metric in self._metrics:
+        known = self.environment
+        columns = [*known.columns, *known.judged, *known.also]
+        columns += [column for _, split in known.splits for column in split]
+        for metric in {column.metric for column in columns}:
             values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
             self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(
                 ~self.rows["failed"]
             )
-
-    @property
-    def _metrics(self) -> set[str]:
-        known = self.environment
-        columns = [*known.columns, *known.judged, *known.also]
-        columns += [column for _, split in known.splits for column in split]
-        return {column.metric for column in columns}
 
     @cached_property
     def policies(self) -> list[str]:
@@ -105,9 +101,7 @@ class EpisodeTable:
     def cells_of(
         self, policy: str, reference: str | None = None, scenario: str | None = None
     ) -> list[int]:
-        """Numbers of the cells that a policy plays, with a motion and in a scenario where these
-        are given.
-        """
+        """Numbers of the cells of a policy, of one motion or scenario where these are given."""
         return [
             cell
             for (title, cell), c in self.conditions.items()
@@ -127,43 +121,33 @@ class EpisodeTable:
         return dict(iter(parts))
 
 
-def means(values: pd.Series) -> float:
-    """Mean of the episodes that have a figure; nan where none has one."""
-    known = values.dropna().to_numpy()
-    return float(known.mean()) if len(known) else float("nan")
-
-
 def per_seed(
-    rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], float] = means
+    rows: pd.DataFrame, metric: str, statistic: Callable[[Array], float] = np.mean
 ) -> Array:
-    """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of
-    the rows.
-    """
+    """A statistic for each training seed and cell, (seeds, cells); nan without a figure."""
     parts: Any = rows.groupby(["member", "cell"])[metric]
-    found = {key: statistic(own) for key, own in parts}
+    known = {key: own.dropna().to_numpy() for key, own in parts}
+    found = {key: float(statistic(values)) for key, values in known.items() if len(values)}
     members = rows["member"].unique()
     cells = rows["cell"].unique()
     return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
 
 
 def score(
-    rows: pd.DataFrame, column: Column, statistic: Callable[[pd.Series], float] = means
+    rows: pd.DataFrame, column: Column, statistic: Callable[[Array], float] = np.mean
 ) -> Estimate:
-    """Mean over cells of a metric of one policy [SI]; of several training seeds the interquartile
-    mean.
+    """Mean over cells of a metric of one policy [SI]; over training seeds the interquartile mean.
 
     Args:
         rows: Rows of one policy in one or several cells.
         column: The metric.
-        statistic: Over the episodes of a cell; the mean, over those that did not fail.
+        statistic: Over the episodes of a cell that have a figure.
     """
     return estimate(rows, per_seed(rows, column.metric, statistic).mean(axis=-1))
 
 
 def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
-    """An estimate from one value per training seed; of a policy that was not trained it is the
-    value.
-    """
+    """An estimate from one value per training seed; without training the value itself."""
     return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
 
 

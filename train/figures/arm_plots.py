@@ -1,6 +1,4 @@
-"""Figure of an arm's identification: measured and predicted deflections, joint by joint, and the
-residuals.
-"""
+"""Figure of an arm's identification: measured and predicted deflections, and residuals."""
 
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,7 @@ _LINE = "#888888"
 
 
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
-    """A panel per joint with measured against predicted deflection, and one with the residual of
-    every pose.
+    """A panel per joint with measured against predicted deflection, and one with the residuals.
 
     Measured is the predicted deflection and the part of the residual that a deflection of this
     joint alone explains.
@@ -46,16 +43,14 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
 
 
 def deflections(fit: ArmFit) -> tuple[Array, Array]:
-    """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose
-    does not show one.
-    """
+    """Deflections of the joints, predicted and measured, (N, k) [rad]; nan where not seen."""
     model = fit.model
     elastic = fit.model.unknowns.elastic
     compliance, _ = fit.estimate("compliance")
     predicted = compliance * model.torque(fit.unknowns, fit.q)[:, elastic]
     # an offset turns a joint as a deflection does, so that its derivative is the lever of the
     # deflection
-    lever = model.predicted(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
+    lever = model.predict(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
     size = np.sum(lever**2, axis=1)
     largest = size.max(axis=0)
     seen = size > np.maximum(_LEAST_LEVER**2 * largest, _LEAST_SEEN**2 * largest.max())
@@ -65,19 +60,12 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
 
 def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
     if np.isnan(measured).all():
-        axis.text(
-            0.5,
-            0.5,
-            "the measurement\ndoes not show it",
-            ha="center",
-            transform=axis.transAxes,
-            fontsize=9,
-        )
+        where = {"ha": "center", "transform": axis.transAxes, "fontsize": 9}
+        axis.text(0.5, 0.5, "the measurement\ndoes not show it", **where)
         return
     axis.axline((0.0, 0.0), slope=1.0, color=_LINE, lw=0.9)
-    axis.scatter(
-        MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3
-    )
+    dots = {"s": 14, "color": _DOTS, "alpha": 0.8, "linewidths": 0, "zorder": 3}
+    axis.scatter(MRAD * predicted, MRAD * measured, **dots)
 
 
 def _draw_residuals(axis: Any, fit: ArmFit) -> None:
@@ -87,9 +75,8 @@ def _draw_residuals(axis: Any, fit: ArmFit) -> None:
     for column, name in zip(fit.residual.T, _names(fit), strict=True):
         axis.plot(poses, factor * column, ".", ms=4, label=label_text(name))
     axis.axhline(0.0, color=_LINE, lw=0.8)
-    axis.set_title(
-        f"residual [{shown}] by pose\nspread {factor * fit.spread:.3g} {shown}", fontsize=9
-    )
+    spread = f"spread {factor * fit.spread:.3g} {shown}"
+    axis.set_title(f"residual [{shown}] by pose\n{spread}", fontsize=9)
     if len(_names(fit)) <= _MOST_NAMED:
         axis.legend(fontsize=7, ncols=3, handletextpad=0.1, columnspacing=0.6, loc="upper right")
     else:

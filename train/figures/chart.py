@@ -5,7 +5,7 @@ Pictures and the page of a report draw the same charts.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation
 from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
-from train.figures.colours import REFERENCE, is_dashed
+from train.figures.colours import REFERENCE, dash_of
 
 Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
@@ -112,8 +112,7 @@ def time_chart(
     colours: Mapping[str, str],
     most_points: int | None = None,
 ) -> Chart:
-    """Signals of the first episodes over time; of several training seeds the median and the band
-    around all.
+    """Signals of the first episodes over time; over training seeds the median with its band.
 
     The scale is that of the walks that go on: what happens shortly before a fall leaves the chart.
 
@@ -134,12 +133,12 @@ def time_chart(
             curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
         if signal.reference is not None:
             reference = signal.scale * longest[signal.reference][::stride]
-            curves.append(
-                Curve("reference", REFERENCE, time_s[::stride], reference, dash="dash", width=1.1)
-            )
+            style = {"dash": "dash", "width": 1.1}
+            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, **style))
         limits = _limits([e for own in policies.values() for e in own], signal)
         panels.append(Panel(signal.label, curves, limits))
-    shaded = intervals(longest["single_support"], time_s) if "single_support" in longest else []
+    single = longest.get("single_support", np.zeros(len(time_s)))
+    shaded = intervals(single, time_s)
     return Chart("", "time [s]", panels, shaded=shaded)
 
 
@@ -161,7 +160,7 @@ def _median_curve(
         colour,
         time_s[:length:stride],
         middle,
-        dash="dash" if is_dashed(title) else "solid",
+        dash=dash_of(title),
         band=(low, high) if len(own) > 1 else None,
         fails=len(own) == 1 and own[0].first_failed,
     )
@@ -181,7 +180,8 @@ def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[fl
 def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
     """Beginnings and ends of the times in which a mask is true, (n,) each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0.0], mask > 0.5, [0.0]])))
-    return [(float(time[begin]), float(time[end - 1])) for begin, end in edges.reshape(-1, 2)]
+    pairs = edges.reshape(-1, 2)
+    return [(float(time[begin]), float(time[end - 1])) for begin, end in pairs]
 
 
 def spread(values: Array) -> tuple[Array, Array, Array]:
@@ -204,8 +204,7 @@ def sweep_chart(
     colours: Mapping[str, str],
     statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
 ) -> Chart:
-    """Scores over what is swept, a curve per policy with its interval, or a level; on top, who
-    fails where.
+    """Scores over a swept value, a curve or a level per policy; on top, who fails where.
 
     Args:
         cells: Evaluations by policy and value.
@@ -220,27 +219,22 @@ def sweep_chart(
         curves = []
         for title, own in cells.items():
             is_level = None in own
-            x = np.array(
-                [values[0], values[-1]] if is_level else [value for value in values if value in own]
-            )
-            found = [
-                statistic(own[None if is_level else value], column).times(column.scale)
-                for value in x.tolist()
-            ]
-            ends = np.array([estimate.ends for estimate in found]).T
+            x = [values[0], values[-1]] if is_level else [value for value in values if value in own]
+            keys = [None, None] if is_level else x
+            found = [statistic(own[key], column).times(column.scale) for key in keys]
+            low, high = np.array([estimate.ends for estimate in found]).T
+            has_band = not is_level and any(estimate.has_interval for estimate in found)
             curve = Curve(
                 title,
                 colours[title],
-                x,
+                np.array(x),
                 np.array([estimate.value for estimate in found]),
+                dash="dot" if is_level else dash_of(title),
+                band=(low, high) if has_band else None,
                 width=1.6,
+                has_points=not is_level,
             )
-            if is_level:
-                curves.append(replace(curve, dash="dot"))
-                continue
-            band = (ends[0], ends[1]) if any(estimate.has_interval for estimate in found) else None
-            dash = "dash" if is_dashed(title) else "solid"
-            curves.append(replace(curve, dash=dash, band=band, has_points=True))
+            curves.append(curve)
         panels.append(Panel(column.label, curves, is_log=True, height=2.2))
     failing = [_failing(title, colours[title], own, values) for title, own in cells.items()]
     failing = [policy for policy in failing if policy.x]
@@ -278,34 +272,29 @@ def _failing(
 def learning_chart(
     learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]
 ) -> Chart:
-    """Share of the base's score on the way of a training: median over training seeds, band from
-    least to most.
-    """
+    """Share of the base's score during a training: median over training seeds with its band."""
     panels = []
     for column in columns:
         curves = []
         for title, found in learning.items():
-            low, middle, high = spread(found.ratios[column.metric])
-            x = found.decisions
-            band = (low, high) if len(found.ratios[column.metric]) > 1 else None
-            curves.append(
-                Curve(title, colours[title], x, middle, band=band, width=2.0, has_points=True)
-            )
+            ratios = found.ratios[column.metric]
+            low, middle, high = spread(ratios)
+            band = (low, high) if len(ratios) > 1 else None
+            line = {"band": band, "width": 2.0, "has_points": True}
+            curves.append(Curve(title, colours[title], found.decisions, middle, **line))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
-        top = max(
-            float(np.nanmax(found.ratios[column.metric], initial=1.0))
-            for found in learning.values()
+        all_ratios = np.concatenate(
+            [own.ratios[column.metric].ravel() for own in learning.values()]
         )
+        top = float(np.nanmax(all_ratios, initial=1.0))
         curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
-        panels.append(
-            Panel(f"{column.title}, share of the base's", curves, (0.0, 1.08 * min(top, 2.0)))
-        )
+        limits = (0.0, 1.08 * min(float(top), 2.0))
+        panels.append(Panel(f"{column.title}, share of the base's", curves, limits))
     return Chart("", "decisions of all worlds", panels, panel_height=260)
 
 
 def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
-    """Metrics over the trials of a policy that learns on the robot: a thin line per robot, and
-    their mean.
+    """Metrics over the trials of a policy that learns on the robot: each robot, and the mean.
 
     Args:
         trials: `baselines.adaptation.iterative.Trial`, in order, the first without offsets.
@@ -316,15 +305,13 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
     failed = np.array([trial.failed for trial in trials])
     panels = []
     for column in columns:
-        values = column.scale * np.array(
-            [[own[column.metric] for own in trial.metrics] for trial in trials]
-        )
+        found = [[own[column.metric] for own in trial.metrics] for trial in trials]
+        values = column.scale * np.array(found)
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
         means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
         curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
-        panels.append(
-            Panel(column.label, curves, (0.0, 1.05 * float(np.nanmax(values, initial=1e-9))))
-        )
+        limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
+        panels.append(Panel(column.label, curves, limits))
     return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))

@@ -1,6 +1,4 @@
-"""Colours of policies and of the parts of charts, the same in pictures and on the page of a
-report.
-"""
+"""Colours of policies and of the parts of charts, for pictures and for the page of a report."""
 
 from collections.abc import Sequence
 
@@ -55,9 +53,7 @@ _DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
-    """A colour for every policy of a comparison: those that have none of their own take the
-    others in turn.
-    """
+    """A colour for every policy: those without one of their own take the others in turn."""
     unnamed = [policy for policy in policies if policy not in COLOURS]
     return {
         policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)]
@@ -65,6 +61,6 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
     }
 
 
-def is_dashed(policy: str) -> bool:
-    """True if the line of a policy is dashed: no center of mass is fed back."""
-    return policy in _DASHED
+def dash_of(policy: str) -> str:
+    """Dash of a policy's line: no center of mass is fed back where it is not solid."""
+    return "dash" if policy in _DASHED else "solid"

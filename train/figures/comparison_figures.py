@@ -1,6 +1,4 @@
-"""The pictures of a comparison: which are drawn, what they show, and what their files are
-called.
-"""
+"""The pictures of a comparison: which are drawn, what they show, and names of their files."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -24,21 +22,16 @@ _MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
 _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
-_PAPER_FIGURES = {
-    ("pelvis", "24 s"): 7,
-    ("pelvis", "3 s"): 8,
-    ("zmp", "24 s"): 9,
-    ("zmp", "3 s"): 10,
-}
+_PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
-_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad", 1e3) for name in ("roll", "pitch"))
+_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad") for name in ("roll", "pitch"))
 _ZMP = (
-    TracedSignal("x, forward", "zmp_x", "mm", 1e3, reference="zmp_reference_x"),
-    TracedSignal("y, to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+    TracedSignal("x, forward", "zmp_x", "mm", reference="zmp_reference_x"),
+    TracedSignal("y, to the left", "zmp_y", "mm", reference="zmp_reference_y"),
 )
 _LINK = (
-    TracedSignal("q_ref", "reference_angle", "rad", 1.0),
-    TracedSignal("link error q_ref − q", "link_error", "mrad", 1e3),
+    TracedSignal("q_ref", "reference_angle", "rad"),
+    TracedSignal("link error q_ref − q", "link_error", "mrad"),
 )
 
 
@@ -58,10 +51,8 @@ def draw_figures(
     """
     cells = cells_together(evaluations)
     if swept is not None:
-        return [
-            draw_sweep(own, by_option(own), swept, folder / f"sweep_{_stem(own[0])}.png")
-            for own in cells
-        ]
+        paths = {folder / f"sweep_{_stem(own[0])}.png": own for own in cells}
+        return [draw_sweep(own, by_option(own), swept, path) for path, own in paths.items()]
     known = evaluations[0].condition.environment
     files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
     for scenario in swept_scenarios(evaluations):
@@ -77,10 +68,8 @@ def draw_figures(
 
 def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    return [
-        draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png")
-        for found in maps
-    ]
+    names = [_safe(f"{found.title}_{found.column.metric}") for found in maps]
+    return [draw_map(m, folder / f"map_{name}.png") for m, name in zip(maps, names, strict=True)]
 
 
 def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
@@ -93,7 +82,8 @@ def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> l
     """
     if not evaluations or (name == "static" and evaluations[0].points is None):
         return []
-    return [_FIGURES[name](evaluations, folder / f"{figure_name(name, evaluations[0])}.png")]
+    path = folder / f"{figure_name(name, evaluations[0])}.png"
+    return [_FIGURES[name](evaluations, path)]
 
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
@@ -105,33 +95,32 @@ def figure_name(name: str, evaluation: Evaluation) -> str:
 def paper_figure(name: str, condition: Condition) -> int | None:
     """Number of the paper's figure that a picture of a condition stands beside, if there is one."""
     is_like_the_paper = condition.scenario in _PAPER_SCENARIOS
-    return _PAPER_FIGURES.get((name, condition.reference_name)) if is_like_the_paper else None
+    numbers = _PAPER_FIGURES.get(name, {}) if is_like_the_paper else {}
+    return numbers.get(condition.reference_name)
 
 
 def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    return list(
-        group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values()
-    )
+    cells = group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario))
+    return list(cells.values())
 
 
 def by_option(evaluations: Sequence[Evaluation]) -> Cells:
-    """Evaluations of every policy by the value of the swept option; None for a policy that was
-    not swept.
-    """
-    return {
-        title: group_by(own, lambda e: next(iter(e.condition.swept.values()), None))
-        for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()
-    }
+    """Evaluations of every policy by the swept value; None for a policy that was not swept."""
+    return _by_policy(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
 def by_reference(evaluations: Sequence[Evaluation]) -> Cells:
     """Evaluations of every policy by the number of the reference, such as the step period [s]."""
     numbered = [e for e in evaluations if e.condition.number is not None]
-    return {
-        title: group_by(own, lambda e: e.condition.number)
-        for title, own in group_by(numbered, lambda e: e.condition.policy.title).items()
-    }
+    return _by_policy(numbered, lambda e: e.condition.number)
+
+
+def _by_policy(
+    evaluations: Sequence[Evaluation], key: Callable[[Evaluation], float | None]
+) -> Cells:
+    policies = group_by(evaluations, lambda e: e.condition.policy.title)
+    return {title: group_by(own, key) for title, own in policies.items()}
 
 
 def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
@@ -141,9 +130,7 @@ def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
-    """True if the references are points of one axis: enough of them have a number, and each one
-    of its own.
-    """
+    """True if enough references have a number, and each one of its own: points of one axis."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
@@ -172,10 +159,9 @@ def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 
 def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Roll and pitch of the pelvis, which should be level, one line per policy, as Figs. 7 and 8
-    of the paper.
-    """
-    chart = _over_time(evaluations, _PELVIS, _walk_title(evaluations, "pelvis", "Pelvis error"))
+    """Roll and pitch of the pelvis, one line per policy, as Figs. 7 and 8 of the paper."""
+    title = _walk_title(evaluations, "pelvis", "Pelvis error")
+    chart = _over_time(evaluations, _PELVIS, title)
     if paper_figure("pelvis", evaluations[0].condition) is None:
         return draw_chart(chart, path)
     panels = []
@@ -196,16 +182,16 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
-    return draw_chart(
-        _over_time(evaluations, _ZMP, _walk_title(evaluations, "zmp", "Zero moment point")), path
-    )
+    title = _walk_title(evaluations, "zmp", "Zero moment point")
+    return draw_chart(_over_time(evaluations, _ZMP, title), path)
 
 
 def _over_time(
     evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = ""
 ) -> Chart:
     policies = {e.condition.policy.title: [e] for e in evaluations}
-    return replace(time_chart(policies, signals, policy_colours(list(policies))), title=title)
+    chart = time_chart(policies, signals, policy_colours(list(policies)))
+    return replace(chart, title=title)
 
 
 def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> str:
@@ -217,7 +203,8 @@ def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> s
 
 
 def _stem(evaluation: Evaluation) -> str:
-    return _safe(f"{evaluation.condition.reference_name}_{evaluation.condition.scenario}")
+    condition = evaluation.condition
+    return _safe(f"{condition.reference_name}_{condition.scenario}")
 
 
 def _safe(text: str) -> str:

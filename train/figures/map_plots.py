@@ -1,17 +1,17 @@
-"""Heat maps as panels of coloured squares with text: the same for the report's page and for
-pictures.
-"""
+"""Heat maps as panels of coloured squares with text, for the page and for pictures."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
 
-from train.evaluate.changes import BEST_ANALYTIC, SIGNS, Change, percent
+from train.evaluate.changes import BEST_ANALYTIC, SIGNS, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
 from train.figures.colours import INK, policy_colours
@@ -73,49 +73,39 @@ class Panel:
 
 
 def panels(heat_map: HeatMap) -> list[Panel]:
-    """Who is best, every residual against the best policy without learning, and the score of
-    every policy.
-    """
+    """Who is best, every residual against the best without learning, and every policy's score."""
     column = heat_map.column
-    shades = policy_colours(heat_map.policies)
-    letters = dict(
-        zip(heat_map.policies, ascii_uppercase, strict=False)
-    )  # a map with more would not be readable
-    key = tuple((letters.get(title, "?"), title, shades[title]) for title in heat_map.policies)
-    many = len({cell.best_analytic for cell in heat_map.flat} - {None}) > 1
-    found = [
-        _panel(
-            heat_map,
-            f"Best policy, and its {column.label}",
-            lambda c: _best_square(c, column, letters, shades),
-            key=key,
+    policies = heat_map.policies
+    shades = policy_colours(policies)
+    # a map with more policies than letters would not be readable
+    letters = dict(zip(policies, ascii_uppercase, strict=False))
+    key = tuple((letters.get(title, "?"), title, shades[title]) for title in policies)
+    rivals = {cell.best_analytic for cell in heat_map.flat} - {None}
+    rival_letters = letters if len(rivals) > 1 else {}
+    levels = [level.value for cell in heat_map.flat for level in cell.levels.values()]
+    positive = [level for level in levels if np.isfinite(level) and level > 0.0]
+    ends = (min(positive, default=1.0), max(positive, default=1.0))
+
+    def panel(title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
+        return Panel(
+            title=title,
+            x_label=heat_map.x.title,
+            y_label=heat_map.y.title,
+            x_ticks=tuple(heat_map.x.ticks(heat_map.known)),
+            y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
+            squares=tuple(tuple(map(square, row)) for row in heat_map.cells),
+            **more,
         )
-    ]
+
+    best = partial(_best_square, column=column, letters=letters, shades=shades)
+    found = [panel(f"Best policy, and its {column.label}", best, key=key)]
     for title in heat_map.families:
+        change = partial(_change_square, title=title, letters=rival_letters)
         what = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
-        found.append(
-            _panel(
-                heat_map,
-                what,
-                lambda c, t=title: _change_square(c.learned.get(t), letters if many else {}),
-            )
-        )
-    levels = [
-        e.value
-        for cell in heat_map.flat
-        for e in cell.levels.values()
-        if np.isfinite(e.value) and e.value > 0.0
-    ]
-    ends = (min(levels), max(levels)) if levels else (1.0, 1.0)
-    for title in heat_map.policies:
-        found.append(
-            _panel(
-                heat_map,
-                f"{title}, {column.label}",
-                lambda c, t=title: _score_square(c, t, column, ends),
-                is_main=False,
-            )
-        )
+        found.append(panel(what, change))
+    for title in policies:
+        score = partial(_score_square, title=title, column=column, ends=ends)
+        found.append(panel(f"{title}, {column.label}", score, is_main=False))
     return found
 
 
@@ -133,46 +123,28 @@ def draw_map(heat_map: HeatMap, path: Path) -> Path:
     return save(figure, path)
 
 
-def _panel(
-    heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], **more: Any
-) -> Panel:
-    return Panel(
-        title=title,
-        x_label=heat_map.x.title,
-        y_label=heat_map.y.title,
-        x_ticks=tuple(heat_map.x.ticks(heat_map.known)),
-        y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
-        squares=tuple(tuple(map(square, row)) for row in heat_map.cells),
-        **more,
-    )
-
-
 def _best_square(
     cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]
 ) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
     value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
-    return Square(
-        letters.get(cell.best, "?"),
-        f"{value}{_falls(cell.failed[cell.best])}",
-        blend(shades[cell.best], _BEST_SHARE),
-    )
+    small = f"{value}{_falls(cell.failed[cell.best])}"
+    return Square(letters.get(cell.best, "?"), small, blend(shades[cell.best], _BEST_SHARE))
 
 
-def _change_square(change: Change | None, letters: Mapping[str, str]) -> Square:
+def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Square:
     """A change, with a sign where it is not told from chance; green below zero, red above."""
+    change = cell.learned.get(title)
     if change is None or not np.isfinite(change.relative.value):
         return Square("-", "", _EMPTY)
     value = change.relative.value
     share = _STRONGEST * min(abs(value) / _STRONGEST_CHANGE, 1.0)
     small = f"to {letters[change.base]}" if change.base in letters else ""
     falls = f" ✕{change.falls}/{change.episodes}" if change.falls_more else ""
-    return Square(
-        percent(value).removesuffix(" %") + SIGNS.get(change.verdict, ""),
-        f"{small}{falls}".strip(),
-        blend(_AHEAD if value < 0.0 else _BEHIND, share),
-    )
+    text = percent(value).removesuffix(" %") + SIGNS.get(change.verdict, "")
+    colour = blend(_AHEAD if value < 0.0 else _BEHIND, share)
+    return Square(text, f"{small}{falls}".strip(), colour)
 
 
 def _score_square(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
@@ -209,19 +181,14 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 def _draw_panel(axis: Any, panel: Panel) -> None:
-    pixels = np.array(
-        [[_rgb(square.colour) for square in row] for row in panel.squares], dtype=np.uint8
-    )
-    axis.imshow(pixels, origin="lower", aspect="auto")
+    pixels = [[_rgb(square.colour) for square in row] for row in panel.squares]
+    axis.imshow(np.array(pixels, dtype=np.uint8), origin="lower", aspect="auto")
     for y, row in enumerate(panel.squares):
         for x, square in enumerate(row):
+            style = {"ha": "center", "va": "center", "color": square.ink}
             lift = 0.16 if square.small else 0.0
-            axis.text(
-                x, y + lift, square.text, ha="center", va="center", color=square.ink, fontsize=10
-            )
-            axis.text(
-                x, y - 0.24, square.small, ha="center", va="center", color=square.ink, fontsize=7.5
-            )
+            axis.text(x, y + lift, square.text, fontsize=10, **style)
+            axis.text(x, y - 0.24, square.small, fontsize=7.5, **style)
     axis.set_xticks(range(len(panel.x_ticks)), panel.x_ticks)
     axis.set_yticks(range(len(panel.y_ticks)), panel.y_ticks)
     axis.set_xlabel(_wrap(panel.x_label))
@@ -237,29 +204,19 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         axis.spines[side].set_visible(False)
     if panel.key:
         text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
-        axis.annotate(
-            _wrap(text, 60),
-            (0.0, 0.0),
-            (0, -34),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            fontsize=8,
-            va="top",
-        )
+        below = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "top"}
+        axis.annotate(_wrap(text, 60), (0.0, 0.0), (0, -34), fontsize=8, **below)
 
 
 def _wrap(text: str, width: int = 52) -> str:
-    import textwrap
-
     return "\n".join(textwrap.wrap(text, width))
 
 
 def panel_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
     """Head and rows of a panel as a table, the greatest y first."""
-    rows: Sequence[tuple[str, Sequence[Square]]] = list(
-        zip(panel.y_ticks, panel.squares, strict=True)
-    )[::-1]
     head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]
-    return head, [
-        [tick, *(" ".join(filter(None, (s.text, s.small))) for s in row)] for tick, row in rows
+    rows = [
+        [tick, *(f"{square.text} {square.small}".strip() for square in row)]
+        for tick, row in zip(panel.y_ticks, panel.squares, strict=True)
     ]
+    return head, rows[::-1]

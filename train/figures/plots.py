@@ -1,6 +1,4 @@
-"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a whole
-comparison.
-"""
+"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
 from collections.abc import Sequence
@@ -18,8 +16,7 @@ from train.figures.colours import FAILED, policy_colours
 from train.runs.escaping import visible
 
 MRAD = 1e3
-MM = 1e3
-"""Factors from rad and m to what figures show."""
+"""Factor from rad to what figures show."""
 
 
 def require_matplotlib() -> Any:
@@ -126,9 +123,8 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)
-    figure.legend(
-        once.values(), once.keys(), ncols=columns_of(len(once)), loc="outside lower center"
-    )
+    ncols = columns_of(len(once))
+    figure.legend(once.values(), once.keys(), ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
@@ -142,30 +138,18 @@ def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> 
     if curve.fails:
         last = curve.y[np.isfinite(curve.y)][-1:]
         y = last if limits is None else np.clip(last, *limits)
-        style = {
-            "marker": "X",
-            "s": 70,
-            "edgecolors": "white",
-            "lw": 0.8,
-            "zorder": 6,
-            "clip_on": False,
-        }
-        axis.scatter(curve.x[-1:], y, color=curve.colour, **style)
+        cross = {"marker": "X", "s": 70, "edgecolors": "white", "lw": 0.8, "zorder": 6}
+        axis.scatter(curve.x[-1:], y, color=curve.colour, clip_on=False, **cross)
 
 
 def _draw_failing(axis: Any, chart: Chart) -> None:
     """A row of crosses per policy that fails somewhere."""
     for row, policy in enumerate(reversed(chart.failing)):
         faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
-        places = np.full(len(policy.x), row)
-        axis.scatter(
-            policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0
-        )
-    axis.set_yticks(
-        range(len(chart.failing)),
-        [label_text(policy.name) for policy in reversed(chart.failing)],
-        fontsize=8,
-    )
+        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": policy.colour}
+        axis.scatter(policy.x, np.full(len(policy.x), row), lw=1.0, **style)
+    names = [label_text(policy.name) for policy in reversed(chart.failing)]
+    axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.set_ylim(-0.7, len(chart.failing) - 0.3)
     axis.set_ylabel(chart.failure)
     axis.tick_params(axis="x", length=0)
@@ -182,27 +166,27 @@ def _show_numbers(axis: Any) -> None:
 
 
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
-    """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel
-    with all references.
+    """A metric of every policy: a panel per reference, or of one scenario one with all of them.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
     failed.
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
-    policies = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    shades = policy_colours(titles)
+    is_one_scenario = len({e.condition.scenario for e in evaluations}) == 1
     panels: dict[str, dict[str, list[Evaluation]]] = {}
-    for evaluation in evaluations:
-        reference = evaluation.condition.reference_name
-        scenario = evaluation.condition.scenario
-        outer, inner = (
-            (f"scenario {scenario}", reference)
-            if len(scenarios) == 1
-            else (known.title(reference), scenario)
-        )
-        panels.setdefault(outer, {}).setdefault(inner, []).append(evaluation)
-    width = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * max(map(len, panels.values())))
+    for e in evaluations:
+        reference = e.condition.reference_name
+        outer = known.title(reference)
+        inner = e.condition.scenario
+        if is_one_scenario:
+            outer = f"scenario {inner}"
+            inner = reference
+        panels.setdefault(outer, {}).setdefault(inner, []).append(e)
+    group_width = 0.35 + 0.14 * len(titles)
+    width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     figure, axes = plt.subplots(
@@ -215,13 +199,21 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
         layout="constrained",
     )
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
-        _draw_bars(axis, groups, column, policies)
+        _draw_bars(axis, groups, column, shades)
         axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
-    if len(scenarios) == 1 and known.quantity:
+    if is_one_scenario and known.quantity:
         axes[-1][0].set_xlabel(known.quantity)
-    _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * width / 1.7), 2))
+    bar = axes.flat[0].bar
+    labels = [label_text(title) for title in shades]
+    bars = zip(shades.values(), labels, strict=True)
+    handles = [bar(np.nan, 0.0, color=shade, label=label) for shade, label in bars]
+    if any(evaluation.num_failed for evaluation in evaluations):
+        cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
+        handles.append(axes.flat[0].scatter([], [], **cross))
+    ncols = columns_of(len(handles), max(int(columns * width / 1.7), 2))
+    figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
@@ -232,49 +224,29 @@ _ROOMY = 7
 
 
 def _draw_bars(
-    axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]
+    axis: Any, groups: dict[str, list[Evaluation]], column: Column, shades: dict[str, str]
 ) -> None:
     """A bar per policy in every group."""
+    policies = list(shades)
     width = 0.84 / len(policies)
-    shades = policy_colours(policies)
-    for place, evaluation in (
-        (place, e) for place, group in enumerate(groups.values()) for e in group
-    ):
-        policy = evaluation.condition.policy.title
-        index = policies.index(policy)
-        x = place + (index - (len(policies) - 1) / 2) * width
-        values = column.scale * evaluation.values(column.metric)
-        shade = shades[policy]
-        axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
-        if len(evaluation.episodes) > 1:
-            axis.scatter(
-                np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3
-            )
-        if evaluation.num_failed:
-            shown = {
-                "color": shade if len(values) == 0 else FAILED,
-                "zorder": 4,
-                "transform": axis.get_xaxis_transform(),
-            }
-            axis.scatter(x, 0.035, marker="X", s=26, edgecolors="white", lw=0.5, **shown)
+    for place, group in enumerate(groups.values()):
+        for e in group:
+            index = policies.index(e.condition.policy.title)
+            x = place + (index - (len(policies) - 1) / 2) * width
+            values = column.scale * e.values(column.metric)
+            shade = shades[e.condition.policy.title]
+            height = np.median(values) if len(values) else 0.0
+            axis.bar(x, height, width=0.9 * width, color=shade)
+            if len(e.episodes) > 1:
+                dots = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
+                axis.scatter(np.full(len(values), x), values, **dots)
+            if e.num_failed:
+                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5, "zorder": 4}
+                colour = FAILED if len(values) else shade
+                bottom = axis.get_xaxis_transform()
+                axis.scatter(x, 0.035, color=colour, transform=bottom, **cross)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
     axis.set_xticks(range(len(groups)), [label_text(name) for name in groups], **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)
-
-
-def _legend(
-    figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int
-) -> None:
-    """Policies, and the mark of failures if there are any."""
-    handles = [
-        axis.bar(np.nan, 0.0, color=shade, label=label_text(policy))
-        for policy, shade in policy_colours(policies).items()
-    ]
-    if any(evaluation.num_failed for evaluation in evaluations):
-        failure = evaluations[0].condition.environment.failure
-        handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
-    figure.legend(
-        handles=handles, ncols=columns_of(len(handles), per_row), loc="outside lower center"
-    )

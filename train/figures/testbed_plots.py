@@ -19,56 +19,40 @@ from train.figures.plots import MRAD, label_text, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
+_BLUE = "#2a6f97"
 
 
 def draw_identification(
     result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path
 ) -> Path:
-    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the
-    residuals.
-    """
+    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper."""
     plt = require_matplotlib()
-    torque = link_torque(
-        points, [make_gravity(model) for model in models], result.link_angles(points)
-    )
+    gravities = [make_gravity(model) for model in models]
+    torque = link_torque(points, gravities, result.link_angles(points))
     deflection = points.theta - points.q
-    figure, (top, bottom) = plt.subplots(
-        2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(3, 1.2)
-    )
+    shape = {"figsize": (7.2, 6.4), "sharex": True, "height_ratios": (3, 1.2)}
+    figure, (top, bottom) = plt.subplots(2, 1, **shape)
     line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
     for direction, marker, face, label in (
-        (1, "^", "#2a6f97", "approached from below"),
+        (1, "^", _BLUE, "approached from below"),
         (-1, "v", "none", "approached from above"),
     ):
         chosen = points.direction == direction
-        style = {
-            "marker": marker,
-            "s": 34,
-            "facecolors": face,
-            "edgecolors": "#2a6f97",
-            "linewidths": 1.2,
-        }
+        style = {"marker": marker, "facecolors": face, "edgecolors": _BLUE}
+        style |= {"s": 34, "linewidths": 1.2}
         top.scatter(torque[chosen], MRAD * deflection[chosen], label=label, zorder=3, **style)
         fitted = _fit_line(result, line, direction)
-        top.plot(line, MRAD * fitted, color="#2a6f97", lw=0.9, ls="-" if direction > 0 else "--")
+        top.plot(line, MRAD * fitted, color=_BLUE, lw=0.9, ls="-" if direction > 0 else "--")
         residual = deflection[chosen] - _fit_line(result, torque[chosen], direction)
         if result.imu_sine_error_rad is not None:
             residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
         bottom.scatter(torque[chosen], MRAD * residual, zorder=3, **style)
-    plain = line / result.line_stiffness_nm_per_rad + np.mean(
-        deflection - torque / result.line_stiffness_nm_per_rad
-    )
-    top.plot(
-        line,
-        MRAD * plain,
-        color="#888888",
-        lw=1.0,
-        ls=":",
-        label=f"plain line, K = {result.line_stiffness_nm_per_rad:.1f}",
-    )
-    top.set_title(
-        f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}"
-    )
+    slope = result.line_stiffness_nm_per_rad
+    plain = line / slope + np.mean(deflection - torque / slope)
+    label = f"plain line, K = {slope:.1f}"
+    top.plot(line, MRAD * plain, color="#888888", lw=1.0, ls=":", label=label)
+    bounds = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+    top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {bounds}")
     top.text(
         0.03,
         0.95,
@@ -98,22 +82,14 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
         if points is None:
             continue
         error = MRAD * static_errors(evaluation)
-        marker = "xosDv^"[index % 6]
-        face = None if index == 0 else "none"
         shade = shades[policy]
-        style = {"facecolors": face, "edgecolors": shade} if face else {"color": shade}
+        style = {"facecolors": "none", "edgecolors": shade} if index else {"color": shade}
+        style |= {"marker": "xosDv^"[index % 6], "s": 34, "linewidths": 1.3, "zorder": 3}
         low = error.min()
         high = error.max()
-        axis.scatter(
-            link_torque(points, gravity, points.q),
-            error,
-            marker=marker,
-            s=34,
-            linewidths=1.3,
-            zorder=3,
-            label=f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}",
-            **style,
-        )
+        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
+        torque = link_torque(points, gravity, points.q)
+        axis.scatter(torque, error, label=label, **style)
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
         for bound in _PAPER_RANGES_MRAD.get(policy, ()):
             axis.axhline(bound, color=shade, lw=0.9, ls=":")
@@ -125,9 +101,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
 
 
 def static_errors(evaluation: Evaluation) -> Array:
-    """Link error by the IMU, averaged over each window at rest of the first episode, (visits,)
-    [rad].
-    """
+    """Link error by the IMU, averaged over each window at rest, (visits,) [rad]."""
     points = evaluation.points
     assert points is not None
     references = evaluation.rest_references
@@ -141,10 +115,6 @@ def _fit_line(result: Identification, torque: Array, direction: int) -> Array:
         + np.sign(load) * result.dead_band_rad / 2.0
         + result.offset_rad
     )
-
-
-def _interval(result: Identification) -> str:
-    return f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
 
 
 def _paper(policy: str) -> str:

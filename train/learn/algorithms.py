@@ -6,14 +6,13 @@ from typing import Any
 
 import stable_baselines3
 
-from elastic_env.core.errors import ConfigurationError, quote, unknown_name
+from elastic_env.core.errors import ConfigurationError, ElasticError, quote, unknown_name
 from train.learn.algorithm_options import CONSTANTS
 from train.runs.user_code import named_object
 
 
 def algorithm_class(name: str) -> Any:
-    """Class of an algorithm: A2C, PPO or SAC of stable_baselines3, "module:Class" or
-    "FILE.py:Class".
+    """Class of an algorithm: A2C, PPO or SAC of SB3, "module:Class" or "FILE.py:Class".
 
     Raises:
         ConfigurationError: It does not exist.
@@ -29,21 +28,8 @@ def algorithm_class(name: str) -> Any:
     return getattr(stable_baselines3, name)
 
 
-_BAD_OPTIONS = (
-    TypeError,
-    ValueError,
-    AssertionError,
-    AttributeError,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    RuntimeError,
-)
-"""What algorithms raise for options that they cannot take, such as arrays beyond the memory."""
-
-
 @contextmanager
-def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
+def name_options(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """Name algorithm and options in what it raises while it is built from them.
 
     Raises:
@@ -51,9 +37,9 @@ def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """
     try:
         yield
-    except ConfigurationError:
+    except (ElasticError, OSError):
         raise
-    except _BAD_OPTIONS as error:
+    except Exception as error:
         raise ConfigurationError(
             f"{algorithm} cannot be built with algorithm_options {quote(dict(options))}: "
             f"{error or type(error).__name__}"

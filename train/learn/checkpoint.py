@@ -1,5 +1,4 @@
-"""A checkpoint: a folder of files that is written whole or not at all, and read only if it is what
-was written.
+"""A checkpoint: a folder that is written whole or not at all, and read only if it is whole.
 
 Its files are listed with their SHA-256 digests, which are checked before anything is loaded. A
 digest tells damage from a full disk or a failing one; it is no seal against somebody who writes
@@ -22,8 +21,7 @@ _DIGESTS = "sha256.json"
 
 @contextmanager
 def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
-    """A fresh folder to write files to, which takes the checkpoint's place when all of them are on
-    the disk.
+    """A fresh folder, which takes the checkpoint's place when all of its files are on the disk.
 
     A kill between its steps loses nothing, once `recover_checkpoint` was called; a failure leaves
     the old one.
@@ -33,8 +31,8 @@ def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     yield fresh
-    digests = {file.name: _digest(file) for file in sorted(fresh.iterdir())}
-    (fresh / _DIGESTS).write_text(json.dumps(digests, indent=2) + "\n", encoding="utf-8")
+    text = json.dumps(_digests(fresh), indent=2)
+    (fresh / _DIGESTS).write_text(f"{text}\n", encoding="utf-8")
     for file in fresh.iterdir():
         flush(file)
     flush(fresh)
@@ -47,9 +45,7 @@ def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
 
 
 def recover_checkpoint(checkpoint: Path) -> bool:
-    """True if there is a checkpoint, after a kill between the moves of `write_checkpoint` as
-    well.
-    """
+    """True if there is a checkpoint, also after a kill between the moves of `write_checkpoint`."""
     old = _beside(checkpoint, "old")
     if not checkpoint.exists() and old.exists():
         old.rename(checkpoint)
@@ -64,7 +60,7 @@ def require_whole(checkpoint: Path) -> None:
     """
     try:
         digests = json.loads(read_bounded(checkpoint / _DIGESTS, LARGEST_JSON))
-        found = {file.name: _digest(file) for file in checkpoint.iterdir() if file.name != _DIGESTS}
+        found = _digests(checkpoint)
     except (OSError, ValueError, RecursionError) as error:
         raise damage_error(checkpoint, f"{_DIGESTS}: {error}") from None
     if not isinstance(digests, dict):
@@ -90,6 +86,11 @@ def _beside(checkpoint: Path, ending: str) -> Path:
     return checkpoint.with_name(f"{checkpoint.name}.{ending}")
 
 
-def _digest(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+def _digests(checkpoint: Path) -> dict[str, str]:
+    """SHA-256 of every file but their table."""
+    found = {}
+    for file in sorted(checkpoint.iterdir()):
+        if file.name != _DIGESTS:
+            with file.open("rb") as content:
+                found[file.name] = hashlib.file_digest(content, "sha256").hexdigest()
+    return found

@@ -1,8 +1,8 @@
-"""The cheap rival of a learned policy: constant residuals, found by CMA-ES on the same budget of
-decisions.
+"""The cheap rival of a learned policy: constant residuals, found by CMA-ES.
 
-Constants know nothing of the phase of the walk nor of any measurement, but there is nothing to
-explore wrongly. What a policy gains over them is what it makes of what it sees.
+They have the same budget of decisions. Constants know nothing of the phase of the walk nor of any
+measurement, but there is nothing to explore wrongly. What a policy gains over them comes from what
+it sees.
 """
 
 import json
@@ -12,17 +12,11 @@ from typing import Any
 import numpy as np
 from cmaes import CMA
 
-from baselines.residual.residual import ResidualDescription
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.learn.finite import require_finite
-from train.learn.train_config import (
-    FIRST_TRAINING_SEED,
-    TRAINING_SEED_STRIDE,
-    TrainConfig,
-    joints_of,
-    training_worlds,
-)
+from train.learn.train_config import TrainConfig, first_episode, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
@@ -55,15 +49,15 @@ class ConstantSearch(Trainer):
         options = {**_DEFAULTS, **config.algorithm_options}
         super().__init__(config, seed, folder, threads)
         self._population = options["population_size"]
-        episodes = config.worlds // (len(config.scenarios) * self._population)
+        needed = len(config.scenarios) * self._population
+        episodes = config.worlds // needed
         if episodes == 0:
-            needed = len(config.scenarios) * self._population
             raise ConfigurationError(
                 f"CMA-ES needs a world for each of {self._population} candidates in each scenario,"
                 f" {needed}, got worlds: {config.worlds}"
             )
         self._episodes = episodes
-        self._first = FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
+        self._first = first_episode(seed)
         shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
         self._worlds = training_worlds(config, shares, threads)
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
@@ -91,8 +85,7 @@ class ConstantSearch(Trainer):
 
     def _write(self, checkpoint: Path) -> None:
         """Write the costs that the search was told: from its seed and these, its state follows."""
-        best = float(self._scores.best) if np.isfinite(self._scores.best) else None
-        told = {"decisions": self.done, "best": best, "told": self._told}
+        told = {"decisions": self.done, "best": self._scores.best, "told": self._told}
         (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
 
     def _read(self, checkpoint: Path) -> None:
@@ -100,7 +93,7 @@ class ConstantSearch(Trainer):
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
         self._done = state["decisions"]
-        self._scores.best = np.inf if state["best"] is None else state["best"]
+        self._scores.best = state["best"]
 
     def _ask(self) -> Array:
         """Candidates of a generation, (population, constants)."""
@@ -111,9 +104,7 @@ class ConstantSearch(Trainer):
         self._told.append(costs.tolist())
 
     def _play(self, candidates: Array) -> Array:
-        """Cost of each candidate: minus its mean sum of rewards over an episode, and falls,
-        (population,).
-        """
+        """Cost of each candidate: minus its mean sum of rewards, and falls, (population,)."""
         n = self._worlds.num_envs
         scenarios = len(self.config.scenarios)
         generation = len(self._told)

@@ -41,9 +41,7 @@ class Curves(Logger):
         super().dump(step)
 
     def finish(self, step: int) -> None:
-        """Write the reward per decision of the present episodes, where no whole one came to its
-        end.
-        """
+        """Write the reward per decision of the present episodes, where no whole one has ended."""
         reward = self._worlds.reward_per_decision
         if not self._model.ep_info_buffer and reward is not None:
             self.record(_REWARD, reward)

@@ -1,6 +1,4 @@
-"""Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without
-torch.
-"""
+"""Trained SB3 models as residual folders: weights for a NumPy forward pass without torch."""
 
 import pickle
 from pathlib import Path
@@ -12,7 +10,7 @@ from gymnasium.spaces.utils import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
-from baselines.residual.residual import save_residual
+from baselines.residual.residual_policy import save_residual
 from elastic_env.core.errors import ConfigurationError, shorten
 from train.learn.algorithms import algorithm_class
 from train.learn.train_config import TrainConfig, joints_of, training_worlds
@@ -64,9 +62,7 @@ def network_of(
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
-    """The joints of the configuration's robot, once the widths of a network are what its
-    residual sees and does.
-    """
+    """The joints of the robot, if the widths of a network are those that its residual needs."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
     sees = flatdim(worlds.single_observation_space)
     does = flatdim(worlds.single_action_space)
@@ -112,7 +108,7 @@ def export_zip(
             raise ConfigurationError(f"no model at {shorten(file)}")
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
-        statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())
+        statistics = pickle.loads(normaliser.read_bytes()) if normaliser else None
         tensors, activation, kind = network_of(model, statistics)
     except ConfigurationError:
         raise

@@ -1,6 +1,4 @@
-"""Several vector environments as one: worlds of scenarios that cannot share one, under one
-policy.
-"""
+"""Several vector environments as one, for scenarios that cannot share one."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -54,22 +52,15 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         for env in self.envs:
             if env.autoreset_mode is not AutoresetMode.DISABLED:
                 mode = env.autoreset_mode.value
-                raise ConfigurationError(
-                    f"all environments of a mixture must have autoreset_mode Disabled, got {mode}"
-                )
+                raise _differ(f"have autoreset_mode Disabled, got {mode}")
             if env.single_observation_space != self.envs[0].single_observation_space:
-                raise ConfigurationError(
-                    "all environments of a mixture must have the same observation"
-                )
+                raise _differ("have the same observation")
             if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
-                raise ConfigurationError(
-                    "all environments of a mixture must have the same task and motion"
-                )
+                raise _differ("have the same task and motion")
             if env.assumed_model.joints != self.assumed_model.joints:
-                raise ConfigurationError(
-                    "all environments of a mixture must let a policy assume the same joints: give"
-                    ' them the same stiffness, and keep scenarios with "ideal", where no friction'
-                    " is assumed, apart from the others"
+                raise _differ(
+                    "let a policy assume the same joints: give them the same stiffness, and keep"
+                    ' scenarios with "ideal", where no friction is assumed, apart from the others'
                 )
         self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
         sizes = [env.num_envs for env in envs]
@@ -107,11 +98,9 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         World i gets seed + i, or the i-th of a list of seeds.
         """
-        seeds: Any = (
-            [int(seed) + i for i in range(self.num_envs)]
-            if isinstance(seed, int | np.integer)
-            else seed
-        )
+        seeds: Any = seed
+        if isinstance(seed, int | np.integer):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
         mask = reset_mask(options, self.num_envs)
 
         def begun(env: Any, worlds: slice) -> Array:
@@ -123,9 +112,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return np.concatenate(self._side_by_side(begun)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step in every world; the info is that of worlds that end: `termination` and
-        `episode_metrics`.
-        """
+        """One step in every world; the info is that of worlds that end."""
         results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
         observation, reward, terminated, truncated = (
             np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
@@ -176,17 +163,16 @@ def mixed_env(
     pairs = zip(conditions, sizes, strict=True)
     shares = [list(share) for _, share in groupby(pairs, lambda own: shared_settings(own[0]))]
     threads = threads_of_each(_cores(num_threads), len(shares))
-    envs = [
-        make_shared_env(
-            [condition for condition, size in share for _ in range(size)],
-            own,
-            AutoresetMode.DISABLED,
-        )
-        for share, own in zip(shares, threads, strict=True)
-    ]
-    return MixedVectorEnv(
-        envs, num_threads, None if weights is None else np.repeat(weights, sizes).tolist()
-    )
+    envs = []
+    for share, own in zip(shares, threads, strict=True):
+        worlds = [condition for condition, size in share for _ in range(size)]
+        envs.append(make_shared_env(worlds, own, AutoresetMode.DISABLED))
+    of_worlds = None if weights is None else np.repeat(weights, sizes).tolist()
+    return MixedVectorEnv(envs, num_threads, of_worlds)
+
+
+def _differ(what: str) -> ConfigurationError:
+    return ConfigurationError(f"all environments of a mixture must {what}")
 
 
 def _cores(num_threads: int) -> int:
@@ -194,8 +180,6 @@ def _cores(num_threads: int) -> int:
 
 
 def threads_of_each(cores: int, count: int) -> list[int]:
-    """Threads of environments that step side by side: one each, and the last ones share what
-    they leave idle.
-    """
+    """Threads of environments that step side by side: one each, the last ones share the rest."""
     last = count % cores
     return [1] * (count - last) + [cores // max(last, 1)] * last

@@ -1,6 +1,4 @@
-"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable at
-any moment.
-"""
+"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -38,11 +36,10 @@ class Run:
     config: TrainConfig
     folder: Path
 
-    def lacks(self) -> list[int]:
-        """Training seeds that have not come to their end."""
-        return [
-            seed for seed in self.config.seeds if not _is_complete(self.folder / f"seed_{seed}")
-        ]
+    @property
+    def is_complete(self) -> bool:
+        """True if all training seeds have come to their end."""
+        return all(_is_complete(self.folder / f"seed_{seed}") for seed in self.config.seeds)
 
 
 def start(
@@ -70,11 +67,9 @@ def start(
     runs = list[Run]()
     with ExitStack() as held:
         for config in configs:
-            own = (
-                output
-                if output is None or len(configs) == 1
-                else output / require_name(config.name)
-            )
+            own = output
+            if output is not None and len(configs) > 1:
+                own = output / require_name(config.name)
             made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
             held.enter_context(lock_run(runs[-1].folder))
@@ -124,82 +119,58 @@ def _names_of_code(config: TrainConfig) -> list[str]:
 
 def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
-        if run.lacks():
-            console.print(
-                f"training in {run.folder}; if it stops: elastic train --resume {run.folder}",
-                soft_wrap=True,
-            )
-        else:
-            said = (
+        text = f"training in {run.folder}; if it stops: elastic train --resume {run.folder}"
+        if run.is_complete:
+            text = (
                 f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
             )
-            console.print(said, soft_wrap=True)
-    calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
-    totals = {call.name: call.run.config.decisions for call in calls}
+        console.print(text, soft_wrap=True)
+    calls = [(run, seed) for run in runs for seed in run.config.seeds]
+    names = [f"seed {seed}" for _, seed in calls]
+    if len(runs) > 1:
+        names = [f"{run.folder.name}, seed {seed}" for run, seed in calls]
+    totals = {name: run.config.decisions for name, (run, _) in zip(names, calls, strict=True)}
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
-            for number, call in enumerate(calls):
-                _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
+            for number, (run, seed) in enumerate(calls):
+                _train_seed(run.config, seed, run.folder, 0, partial(show, number))
         else:
-            _train_beside(calls, console, executors, show)
+            threads = executors.threads_per_call(len(calls))
+            given = [(run.config, seed, run.folder.resolve(), threads) for run, seed in calls]
+            watch = _watch(names, console, show)
+            with executors.open(len(given), runs[0].folder) as pool:
+                # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint
+                outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
+            _raise_first(names, outcomes)
     for run in runs:
         console.print(_table(run.config, run.folder))
 
 
-@dataclass(frozen=True)
-class _Call:
-    """A training seed of a run."""
-
-    run: Run
-    seed: int
-    is_one_of_several: bool
-
-    @property
-    def name(self) -> str:
-        """Name of the seed in the progress."""
-        return (
-            f"{self.run.folder.name}, seed {self.seed}"
-            if self.is_one_of_several
-            else f"seed {self.seed}"
-        )
-
-
-def _train_beside(
-    calls: Sequence[_Call], console: Console, executors: Executors, show: Show
-) -> None:
-    """Train seeds beside each other: they share the cores among them.
-
-    Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
-    """
-    done = [0] * len(calls)
+def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
+    """Show the progress of seeds that are trained side by side."""
+    done = [0] * len(names)
     note = ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
         show(number, done[number], note)
 
-    def tallied(tally: Tally) -> None:
+    def count(tally: Tally) -> None:
         nonlocal note
         note = tally.in_words("seeds")
 
-    def moved(number: int) -> None:
-        console.print(
-            f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True
-        )
+    def move(number: int) -> None:
+        text = f"a worker was lost; {names[number]} goes on from its checkpoint"
+        console.print(text, soft_wrap=True)
 
-    threads = executors.threads_per_call(len(calls))
-    given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
-    watch = Watch(reported=report, tallied=tallied, moved=moved)
-    with executors.open(len(given), calls[0].run.folder) as pool:
-        outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
-    _raise_first(calls, outcomes)
+    return Watch(reported=report, tallied=count, moved=move)
 
 
-def _raise_first(calls: Sequence[_Call], outcomes: Sequence[Outcome | None]) -> None:
+def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> None:
     """The first error of a seed, when the others have ended."""
-    for call, outcome in zip(calls, outcomes, strict=True):
+    for name, outcome in zip(names, outcomes, strict=True):
         if outcome is not None and outcome.error is not None:
-            outcome.error.add_note(f"in the training of {call.name}; the other seeds have ended")
+            outcome.error.add_note(f"in the training of {name}; the other seeds have ended")
             raise outcome.error
 
 
@@ -237,25 +208,18 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
 
 
 def _table(config: TrainConfig, folder: Path) -> Table:
-    """Scores of the last policies against their base, on the episodes of the evaluation on the
-    way.
-    """
+    """Scores of the last policies against their base, on the episodes of the evaluations."""
     columns = environment(config.env).judged
+    metrics = [column.metric for column in columns]
     head = ["seed", "scenario", *(column.label for column in columns), "failed"]
     table = []
     for seed in config.seeds:
-        rows = read_progress(
-            folder / f"seed_{seed}", [column.metric for column in columns], ["failed"]
-        )
+        rows = read_progress(folder / f"seed_{seed}", metrics, ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
-            scores = [
-                _change(row[f"base_{column.metric}"], row[column.metric], column.scale)
-                for column in columns
-            ]
-            table.append([str(seed), row["scenario"], *scores, f"{row['failed']:.0f}"])
-    return make_table(
-        f"last policies on {config.base}, on episodes that training never sees", head, table, left=2
-    )
+            changes = [_change(row[f"base_{c.metric}"], row[c.metric], c.scale) for c in columns]
+            table.append([str(seed), row["scenario"], *changes, f"{row['failed']:.0f}"])
+    title = f"last policies on {config.base}, on episodes that training never sees"
+    return make_table(title, head, table, left=2)
 
 
 def _change(base: float, mine: float, scale: float) -> str:

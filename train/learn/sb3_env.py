@@ -1,6 +1,4 @@
-"""Our vector environments for Stable-Baselines3: arrays in, arrays out, no Python loop over
-worlds.
-"""
+"""Our vector environments for Stable-Baselines3: arrays in, arrays out, no loop over worlds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -63,9 +61,7 @@ class SB3VecEnv(VecEnv):
         return observation
 
     def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
-        """Seed the next `reset`, world i with seed + i, and the order in which it lets first
-        episodes end early.
-        """
+        """Seed the next `reset`, world i with seed + i, and the order of its early ends."""
         self.seed(seed)
         self._stagger = stagger
 
@@ -137,9 +133,7 @@ class SB3VecEnv(VecEnv):
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Worlds are not wrapped one by one; this environment keeps episode statistics, as a
-        Monitor does.
-        """
+        """True for a Monitor: this environment keeps the statistics of episodes."""
         from stable_baselines3.common.monitor import Monitor
 
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]

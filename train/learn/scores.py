@@ -1,9 +1,5 @@
-"""A training on its way: scores against the base on episodes that it never learns from, best and
-last policy.
-"""
+"""Evaluations during a training, on episodes that it never learns from; best and last policy."""
 
-import csv
-import io
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from baselines.residual.residual import ResidualDescription, save_residual
+from baselines.residual.residual_policy import save_residual
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import read_bounded, write_whole
 from elastic_env.core.signals import Array, BoolArray
@@ -24,8 +22,11 @@ from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
 
-_Scored = tuple[list[float], int]
-"""Means of metrics over the episodes of a scenario that did not fail, and how many did."""
+_Policy = tuple[dict[str, Any], ResidualDescription]
+_Scored = tuple[Array, Array]
+"""Means of metrics over the episodes that did not fail, (scenarios, metrics), and how many did,
+(scenarios,).
+"""
 
 
 class Scores:
@@ -43,13 +44,11 @@ class Scores:
         self._folder = folder
         self._threads = threads
         self._provenance = provenance(seed)
-        self._base_scores: list[_Scored] | None = None
-        self.best = np.inf
+        self._base: _Scored | None = None
+        self.best: float | None = None
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
-    def evaluate(
-        self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
-    ) -> dict[str, float]:
+    def evaluate(self, decisions: int, policy: _Policy) -> dict[str, float]:
         """Score a policy after some decisions, and keep it where it is the best so far.
 
         A residual begins as its base, within a hundredth of its range: before the first decision
@@ -62,37 +61,30 @@ class Scores:
         """
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
-        if self._base_scores is None:
-            self._base_scores = self._play(self._config.base, columns)
-        scores = self._base_scores if decisions == 0 else self._play(f"residual:{current}", columns)
-        table = []
-        ratios = []
-        for scenario, (mine, falls), (base, base_falls) in zip(
-            self._config.scenarios, scores, self._base_scores, strict=True
-        ):
-            table.append([decisions, scenario, *mine, *base, falls, base_falls])
-            ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
-        header = [
-            "decisions",
-            "scenario",
-            *columns,
-            *(f"base_{name}" for name in columns),
-            "failed",
-            "base_failed",
-        ]
-        _append(self._folder / PROGRESS, header, table)
-        score = float(np.mean(ratios))
-        if score < self.best:
+        if self._base is None:
+            self._base = self._play(self._config.base, columns)
+        base, base_failed = self._base
+        mine, failed = self._base
+        if decisions > 0:
+            mine, failed = self._play(f"residual:{current}", columns)
+        names = self._config.scenarios
+        table = pd.DataFrame({"decisions": decisions, "scenario": names})
+        table[columns] = mine
+        table[[f"base_{name}" for name in columns]] = base
+        table = table.assign(failed=failed, base_failed=base_failed)
+        _append(table, self._folder / PROGRESS)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = mine / base
+        score = float((np.nan_to_num(ratios, nan=10.0).mean(axis=1) + failed).mean())
+        if self.best is None or score < self.best:
             self.best = score
             self.keep("best", decisions, policy)
         shutil.rmtree(current)
-        found = dict(zip(columns, _changes(scores, self._base_scores), strict=True))
+        found = dict(zip(columns, (ratios.mean(axis=0) - 1.0).tolist(), strict=True))
         known = {f"{name}_change": change for name, change in found.items() if np.isfinite(change)}
-        return {**known, "failed": float(sum(failed for _, failed in scores))}
+        return {**known, "failed": float(failed.sum())}
 
-    def keep(
-        self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]
-    ) -> Path:
+    def keep(self, name: str, decisions: int, policy: _Policy) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
         tensors, description = policy
         training = {
@@ -107,57 +99,35 @@ class Scores:
         return fresh.rename(self._folder / name)
 
     def forget_after(self, decisions: int) -> None:
-        """Drop evaluations that were made after the checkpoint that is gone on with; they will
-        be made again.
-        """
+        """Drop evaluations that were made after a checkpoint; they will be made again."""
         path = self._folder / PROGRESS
         lines = _text_of(path).splitlines(keepends=True)
+        whole = [line for line in lines[1:] if line.endswith("\n")]
         try:
-            kept = [
-                line
-                for line in lines[1:]
-                if line.endswith("\n") and int(line.split(",")[0]) <= decisions
-            ]
+            kept = [line for line in whole if int(line.split(",")[0]) <= decisions]
         except ValueError as error:
-            raise ConfigurationError(
-                f"{path} is no table of evaluations ({error}); remove it"
-            ) from None
+            raise _no_table(path, error) from None
         if decisions == 0 or not lines:
             path.unlink(missing_ok=True)
             return
         write_whole(path, "".join([lines[0], *kept]))
 
-    def _play(self, policy: str, metrics: list[str]) -> list[_Scored]:
-        """For each scenario means of metrics over the episodes that did not fail, and how many
-        did.
-        """
-        conditions = [
-            self._config.condition(scenario, policy) for scenario in self._config.scenarios
+    def _play(self, policy: str, metrics: list[str]) -> _Scored:
+        """Scores of a policy in every scenario."""
+        conditions = [self._config.condition(name, policy) for name in self._config.scenarios]
+        results = play_together(conditions, metrics, self._threads)
+        means = [
+            [np.mean(some) if len(some) else np.nan for some in scores[~failed].T]
+            for scores, failed in results
         ]
-        results = played_together(conditions, metrics, self._threads)
-        return [
-            (
-                [float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T],
-                int(failed.sum()),
-            )
-            for result, failed in results
-        ]
+        return np.array(means), np.array([failed.sum() for _, failed in results])
 
 
-def _changes(scores: Sequence[_Scored], base: Sequence[_Scored]) -> list[float]:
-    """Change of every metric relative to the base's, [1], mean over the scenarios."""
-    mine, theirs = (np.array([metrics for metrics, _ in scored]) for scored in (scores, base))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return [float(change) for change in (mine / theirs).mean(axis=0) - 1.0]
-
-
-def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")  # as `Scores.forget_after` leaves it
-    if not path.exists():
-        writer.writerow(header)
-    writer.writerows(rows)
-    write_whole(path, _text_of(path) + text.getvalue())
+def _append(table: pd.DataFrame, path: Path) -> None:
+    """Add rows to a table of evaluations, as `Scores.forget_after` leaves it."""
+    before = _text_of(path)
+    rows = table.to_csv(index=False, header=not before, na_rep="nan", lineterminator="\n")
+    write_whole(path, before + rows)
 
 
 def _text_of(path: Path) -> str:
@@ -171,16 +141,17 @@ def _text_of(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            f"{path} is no table of evaluations ({error}); remove it"
-        ) from None
+        raise _no_table(path, error) from None
 
 
-def played_together(
+def _no_table(path: Path, error: object) -> ConfigurationError:
+    return ConfigurationError(f"{path} is no table of evaluations ({error}); remove it")
+
+
+def play_together(
     conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
 ) -> list[tuple[Array, BoolArray]]:
-    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time
-    series.
+    """Play the episodes of several conditions at once: scores as of `evaluate`, without traces.
 
     Args:
         conditions: Cells of one environment, motion and policy.
@@ -191,16 +162,12 @@ def played_together(
         For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
     """
     sizes = [condition.episodes for condition in conditions]
+    seeds = [condition.seed + i for condition in conditions for i in range(condition.episodes)]
+    values = np.full((len(seeds), len(metrics)), np.nan)
+    failed = np.zeros(len(seeds), dtype=np.bool_)
+    playing = np.ones_like(failed)
     with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
         policy = make_policy(conditions[0].policy, worlds)
-        seeds = [
-            condition.seed + episode
-            for condition in conditions
-            for episode in range(condition.episodes)
-        ]
-        values = np.full((len(seeds), len(metrics)), np.nan)
-        failed = np.zeros(len(seeds), dtype=np.bool_)
-        playing = np.ones_like(failed)
         for step in control_steps(worlds, policy, seeds):
             first = playing & step.is_over
             if first.any():

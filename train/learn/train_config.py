@@ -6,8 +6,7 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 import baselines
-from baselines.residual.residual import ResidualDescription, require_plain_base
-from baselines.residual.settings import ResidualSettings
+from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote
@@ -30,7 +29,7 @@ EVALUATION_SEED = 50_000
 """Episodes of evaluation begin at the second, those of training at the first: no seed serves
 both.
 """
-TRAINING_SEED_STRIDE = 100_000
+_TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
 
 
@@ -124,18 +123,17 @@ class TrainConfig(Model):
     @property
     def motion(self) -> Any:
         """The reference, or the environment's default."""
-        return environment(self.env).default_reference if self.reference is None else self.reference
+        if self.reference is not None:
+            return self.reference
+        return environment(self.env).default_reference
 
     def condition(self, scenario: str, policy: str) -> Condition:
-        """A cell in which a policy is evaluated on the way; where nothing is drawn, one episode
-        is all there is.
-        """
+        """A cell in which a policy is evaluated; where nothing is drawn, it has one episode."""
         is_one = environment(self.env).is_deterministic(scenario, self.motion)
+        options = self.base_options if policy == self.base else {}
         return Condition(
             env=self.env,
-            policy=PolicySpec(
-                name=policy, options=self.base_options if policy == self.base else {}
-            ),
+            policy=PolicySpec(name=policy, options=options),
             scenario=scenario,
             reference=self.motion,
             ranges=self.ranges,
@@ -157,9 +155,7 @@ class TrainConfig(Model):
         )
 
     def is_due(self, every: int, before: int, now: int) -> bool:
-        """True if work that is done every so many decisions, and at the end, is due between two
-        counts.
-        """
+        """True if work that is done every so many decisions, and at the end, is due."""
         return now // every > before // every or now >= self.decisions
 
     @property
@@ -182,6 +178,11 @@ _WORLD_BYTES = 100_000
 """Memory of a world: measured on the walker with its policy, and on the testbed with a motion of
 its own.
 """
+
+
+def first_episode(seed: int) -> int:
+    """Seed of the first episode that a training seed learns from."""
+    return FIRST_TRAINING_SEED + _TRAINING_SEED_STRIDE * seed
 
 
 def joints_of(worlds: Any) -> list[str]:

@@ -1,13 +1,11 @@
-"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints on the
-way.
-"""
+"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from baselines.residual.residual import ResidualDescription
+from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ElasticError, shorten
 from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
 from train.learn.finite import DivergedError
@@ -127,6 +125,4 @@ class Trainer(ABC):
         self._show(self._scores.evaluate(self.done, self._policy()))
 
     def _show(self, changes: Mapping[str, float]) -> None:  # noqa: B027  who has curves shows them
-        """Show the scores of an evaluation beside the curves of the training, see
-        `Scores.evaluate`.
-        """
+        """Show the scores of an evaluation beside the curves of the training."""

@@ -22,8 +22,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from baselines.residual.residual import ResidualDescription
-from train.learn.algorithms import algorithm_class, options_named
+from baselines.residual.settings import ResidualDescription
+from train.learn.algorithms import algorithm_class, name_options
 from train.learn.curves import Curves
 from train.learn.export import network_of
 from train.learn.finite import require_finite
@@ -31,8 +31,8 @@ from train.learn.sb3_env import SB3VecEnv
 from train.learn.state import read_state, write_state
 from train.learn.train_config import (
     FIRST_TRAINING_SEED,
-    TRAINING_SEED_STRIDE,
     TrainConfig,
+    first_episode,
     joints_of,
     training_worlds,
 )
@@ -82,9 +82,9 @@ class Training(Trainer):
             self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma
         )
         set_random_seed(seed)
-        self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
+        self._normaliser.seed(first_episode(seed))
         algorithm = algorithm_class(config.algorithm)
-        with options_named(config.algorithm, config.algorithm_options), warnings.catch_warnings():
+        with name_options(config.algorithm, config.algorithm_options), warnings.catch_warnings():
             # a rollout whose last minibatch is smaller is no mistake
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
             self.model: Any = algorithm(
@@ -97,9 +97,7 @@ class Training(Trainer):
         self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Learn to the end; what TensorBoard's thread could not write, such as to a full disk,
-        is raised here.
-        """
+        """Learn to the end, and raise here what TensorBoard's thread could not write."""
         with _thread_raises_here(), self._curves():
             super().run(progress)
 
@@ -140,11 +138,8 @@ class Training(Trainer):
     def _require_finite_weights(self) -> None:
         for name, tensor in self.model.policy.state_dict().items():
             require_finite(f"{name} of the network", tensor.numpy())
-        for name, rms in {
-            "observations": self._normaliser.obs_rms,
-            "returns": self._normaliser.ret_rms,
-        }.items():
-            require_finite(f"the variance of the {name}", rms.var)  # type: ignore[union-attr]
+        for name, rms in zip(("observations", "returns"), self._statistics, strict=True):
+            require_finite(f"the variance of the {name}", rms.var)
 
     def _write(self, checkpoint: Path) -> None:
         parameters = io.BytesIO()  # torch itself calls a full disk an internal error
@@ -166,7 +161,7 @@ class Training(Trainer):
         optimisers = self._optimisers().items()
         parameters = {
             "policy": self.model.policy.state_dict(),
-            "optimisers": {name: optimiser.state_dict() for name, optimiser in optimisers},
+            "optimisers": {name: own.state_dict() for name, own in optimisers},
             "rng": torch.get_rng_state(),
         }
         if getattr(self.model, "log_ent_coef", None) is not None:
@@ -181,14 +176,14 @@ class Training(Trainer):
             "critic": getattr(getattr(policy, "critic", None), "optimizer", None),
             "entropy": getattr(self.model, "ent_coef_optimizer", None),
         }
-        return {name: optimiser for name, optimiser in found.items() if optimiser is not None}
+        return {name: own for name, own in found.items() if own is not None}
 
     def _state(self) -> dict[str, Any]:
         model = self.model
         state = {
             "model": {name: getattr(model, name) for name in _OF_MODEL},
-            "statistics": [[rms.mean, rms.var, float(rms.count)] for rms in self._statistics],
-            "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
+            "statistics": [[s.mean, s.var, float(s.count)] for s in self._statistics],
+            "best": self._scores.best,
             "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002
             "python": _to_lists(random.getstate()),
             "actions": model.action_space.np_random.bit_generator.state,
@@ -206,11 +201,9 @@ class Training(Trainer):
         model = self.model
         for name, value in state["model"].items():
             setattr(model, name, value)
-        for rms, (mean, variance, count) in zip(self._statistics, state["statistics"], strict=True):
-            rms.mean = mean
-            rms.var = variance
-            rms.count = count
-        self._scores.best = np.inf if state["best"] is None else state["best"]
+        for rms, own in zip(self._statistics, state["statistics"], strict=True):
+            rms.mean, rms.var, rms.count = own
+        self._scores.best = state["best"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_to_tuples(state["python"]))
         model.action_space.np_random.bit_generator.state = state["actions"]
@@ -225,14 +218,12 @@ class Training(Trainer):
         self._begin_episodes()
 
     def checkpoint(self) -> None:
-        """See `Trainer`. A checkpoint holds no state of the worlds: it ends their episodes."""
+        """Keep everything but the state of the worlds: a checkpoint ends their episodes."""
         super().checkpoint()
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
-        """End all episodes and begin others, with seeds that follow from the training seed and
-        the decisions done.
-        """
+        """End all episodes and begin others, seeded by the training seed and the decisions done."""
         model = self.model
         if isinstance(
             model, OffPolicyAlgorithm
@@ -256,13 +247,10 @@ class Training(Trainer):
         return self._normaliser.obs_rms, self._normaliser.ret_rms
 
     def _portion(self) -> int:
-        """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on
-        to its next update.
-        """
-        is_off_policy = isinstance(
-            self.model, OffPolicyAlgorithm
-        )  # whose n_steps are those of its returns
-        return self.config.worlds * (1 if is_off_policy else self.model.n_steps)
+        """Decisions of one call of `learn`: a rollout of PPO; SAC goes on to its next update."""
+        if isinstance(self.model, OffPolicyAlgorithm):  # whose n_steps are those of its returns
+            return self.config.worlds
+        return self.config.worlds * self.model.n_steps
 
     def _shrink_last_layer(self) -> None:
         """A residual begins near zero: as the base."""

@@ -1,6 +1,4 @@
-"""Paired changes as tables: a line per cell for the terminal, every figure for the report, and
-as CSV.
-"""
+"""Paired changes as tables: a line per cell for the terminal, all for the report, and CSV."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,44 +18,35 @@ from train.evaluate.changes import (
     percent_interval,
     signed_interval,
 )
+from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
-from train.report.render import Head, Part, Row, Table, print_table, write_table
+from train.report.render import Cell, Head, Part, Row, Table, print_table
+from train.runs.escaping import write_records
 
-_SIGNS = {HELD_OUT: "°", PARTLY: "(°)", CEILING: "†", SAME_ROBOT: "‡"}
-"""Signs of marks, where there is little room."""
+_SIGNS = {"°": HELD_OUT, "(°)": PARTLY, "†": CEILING, "‡": SAME_ROBOT}
+"""Marks by their signs, where there is little room."""
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; first against bases, then against
-    rivals.
-    """
+    """Print the changes of the residuals, a line per cell: against bases, then against rivals."""
+    shown = [row for row in rows if row.is_family and row.is_judged]
     for is_rival in (False, True):
-        shown = [
-            row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival
-        ]
-        if shown:
-            print_table(cells_table(shown), console, "statistics.csv")
+        own = [row for row in shown if row.is_rival == is_rival]
+        if own:
+            print_table(cells_table(own), console, "statistics.csv")
 
 
 def cells_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against their bases, or against their rivals, a line per cell with all
-    metrics.
+    """Changes of residuals against one kind of opponent, a line per cell with all metrics.
 
     Args:
         rows: Changes of families, of one environment, all against bases or all against rivals.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    policies = list(dict.fromkeys(row.policy for row in rows))
-    marks = {mark for row in rows for mark in row.marks}
-    signs = [
-        f"{sign} {words}"
-        for words, sign in _SIGNS.items()
-        if any(mark.startswith(words) for mark in marks)
-    ]
-    names = (
-        ["reference", "scenario"] if len(policies) == 1 else ["residual", "reference", "scenario"]
-    )
+    policies = tuple(dict.fromkeys(row.policy for row in rows))
+    is_one = len(policies) == 1
+    names = [*([] if is_one else ["residual"]), "reference", "scenario"]
     heads = [Head(name, is_number=False, wraps=True, titles=name == "reference") for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head(column.title, leaves=1) for column in columns]
@@ -65,34 +54,25 @@ def cells_table(rows: Sequence[Change]) -> Table:
     lines = []
     for line in by_line(rows):
         first = line[0]
-        scope = first.scope + _signs(first)
-        own = (
-            [first.reference, scope]
-            if len(policies) == 1
-            else [first.policy, first.reference, scope]
-        )
+        scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
+        own = [*([] if is_one else [first.policy]), first.reference, scope]
         figures = {row.column: signed_interval(row.relative, row.verdict) for row in line}
-        cells = [
-            *own,
-            *_swept(first, swept),
-            *(figures[column] for column in columns),
-            failed_and_base(first),
-        ]
-        lines.append(Row(tuple(cells), kind="group" if first.is_group else ""))
-    title = f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}"
+        cells = [*own, *_swept(first, swept), *(figures[column] for column in columns)]
+        kind = "group" if first.is_group else ""
+        lines.append(Row((*cells, failed_and_base(first)), kind))
+    signs = _signs([mark for row in rows for mark in row.marks])
     return Table(
         tuple(heads),
         tuple(lines),
         keys=len(names),
-        title=title,
-        subjects=tuple(policies) if len(policies) == 1 else (),
-        caption=". ".join([*signs, SIGNS_ARE]),
+        title=f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}",
+        subjects=policies if is_one else (),
+        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), SIGNS_ARE]),
     )
 
 
 def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
-    """All figures of paired changes, a row per cell and metric, under a heading per policy and
-    base.
+    """All figures of paired changes, a row per cell and metric, with headings.
 
     Args:
         rows: Changes of residuals, or of policies without training seeds.
@@ -100,41 +80,33 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     """
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     is_family = rows[0].is_family
+    figures = ("base → policy", "change", "better than base", f"{rows[0].failure} (base)")
     heads = [Head(name, is_number=False) for name in ("reference", "scenario")]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head("metric", is_number=False)]
-    heads += [
-        Head(name)
-        for name in ("base → policy", "change", "better than base", f"{rows[0].failure} (base)")
-    ]
+    heads += [Head(name) for name in figures]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
-    previous = ("", "")
-    for row in (row for line in by_line(rows) for row in line):
-        if (row.policy, row.base) != previous:
-            previous = (row.policy, row.base)
-            seeds = (
-                f", {row.num_seeds} training seed{'s' * (row.num_seeds != 1)}" if is_family else ""
-            )
-            heading = f"{row.policy} against {row.base}{seeds}"
-            lines.append(Row((heading,), kind="heading", dot=colours[row.policy]))
-        failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
-        cells = [row.reference, _scope(row), *_swept(row, swept), row.column.title, _means(row)]
-        cells += [
-            (Part(percent_interval(row.relative), row.verdict),),
-            percent_interval(row.improvement, signed=False),
-        ]
-        cells += [(failed,), *([row.sentence] if is_family else [])]
-        lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
+    for (policy, base), own in group_by(rows, lambda row: (row.policy, row.base)).items():
+        number = own[0].num_seeds
+        seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
+        title = f"{policy} against {base}{seeds}"
+        lines.append(Row((title,), kind="heading", dot=colours[policy]))
+        for row in (row for line in by_line(own) for row in line):
+            failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
+            cells: list[Cell] = [row.reference, _scope(row), *_swept(row, swept)]
+            cells += [row.column.title, _means(row)]
+            cells += [(Part(percent_interval(row.relative), row.verdict),)]
+            cells += [percent_interval(row.improvement, signed=False), (failed,)]
+            cells += [row.sentence] if is_family else []
+            lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
     return Table(tuple(heads), tuple(lines), keys=3 + len(swept), kind="changes")
 
 
 def _scope(row: Change) -> tuple[Part, ...]:
     """Scenario or group, with its marks."""
     pooled = [Part("pooled", "pooled", before=" ")] if row.is_group else []
-    marks = (
-        Part(mark, "ceiling" if mark == CEILING else "badge", before=" ") for mark in row.marks
-    )
+    marks = [Part(m, "ceiling" if m == CEILING else "badge", before=" ") for m in row.marks]
     return (Part(row.scope), *pooled, *marks)
 
 
@@ -143,14 +115,11 @@ def _swept(row: Change, names: Sequence[str]) -> list[str]:
 
 
 def _means(row: Change) -> str:
-    """Means of base and policy in the unit in which they are shown; - where there is nothing to
-    compare.
-    """
+    """Means of base and policy in the shown unit; - where there is nothing to compare."""
     if not np.isfinite(row.mine):
         return "-"
-    before, after = (
-        f"{row.column.scale * value:.{row.column.decimals}f}" for value in (row.theirs, row.mine)
-    )
+    shown = (row.column.scale * value for value in (row.theirs, row.mine))
+    before, after = (f"{value:.{row.column.decimals}f}" for value in shown)
     return f"{before} → {after} {row.column.unit}"
 
 
@@ -168,125 +137,85 @@ def _opponent(rows: Sequence[Change]) -> str:
     return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({BEST_ANALYTIC})"
 
 
-def _signs(row: Change) -> str:
-    """Marks of a row as signs, where there is little room."""
-    found = [
-        sign for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in row.marks)
-    ]
-    return f" {''.join(found)}" if found else ""
+def _signs(marks: Sequence[str]) -> list[str]:
+    """Signs of some marks, where there is little room."""
+    return [s for s, words in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
 
 
 def failed_and_base(row: Change) -> str:
-    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are
-    more.
-    """
+    """Failed episodes of all, the base's in brackets; an exclamation mark where there are more."""
     return (
         f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes}"
         f" ({row.base_falls}/{row.base_episodes})"
     )
 
 
-_HEAD = ("policy", "base", "base_is", "kind", "reference", "scope", "pooled", "marks")
-_FIGURES = (
-    "metric",
-    "base_mean",
-    "mean",
-    "change",
-    "change_low",
-    "change_high",
-    "improvement",
-    "improvement_low",
-    "improvement_high",
-    "training_seeds",
-    "pairs",
-    "failed",
-    "episodes",
-    "base_failed",
-    "base_episodes",
-    "change_per_training_seed",
-    "sentence",
-)
-_MAP_HEAD = (
-    "map",
-    "x_is",
-    "x",
-    "y_is",
-    "y",
-    "metric",
-    "policy",
-    "mean",
-    "mean_low",
-    "mean_high",
-    "failed",
-    "episodes",
-    "is_best",
-    "is_best_without_learning",
-    "best_without_learning",
-    "change",
-    "change_low",
-    "change_high",
-    "verdict",
-)
-
-
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     """One row per change; metrics in SI units, changes and probabilities as shares of one."""
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    return write_table([*_HEAD, *swept, *_FIGURES], (_record(row, swept) for row in rows), path)
+    return write_records([_record(row, swept) for row in rows], path)
 
 
-def _record(row: Change, swept: Sequence[str]) -> list[object]:
-    role = (
-        BEST_ANALYTIC
-        if row.is_rival
-        else "base of the residual"
-        if row.is_family
-        else "policy to compare with"
-    )
-    kind = "residual" if row.is_family else "baseline"
-    found = [
-        row.policy,
-        row.base,
-        role,
-        kind,
-        row.reference,
-        row.scope,
-        row.is_group,
-        "; ".join(row.marks),
-    ]
-    found += [row.swept.get(name, "") for name in swept]
-    found += [row.column.metric, row.theirs, row.mine, *row.relative.cells, *row.improvement.cells]
-    found += [
-        row.num_seeds,
-        row.num_pairs,
-        row.falls,
-        row.episodes,
-        row.base_falls,
-        row.base_episodes,
-    ]
-    return [*found, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence]
+def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
+    of_residual = BEST_ANALYTIC if row.is_rival else "base of the residual"
+    return {
+        "policy": row.policy,
+        "base": row.base,
+        "base_is": of_residual if row.is_family else "policy to compare with",
+        "kind": "residual" if row.is_family else "baseline",
+        "reference": row.reference,
+        "scope": row.scope,
+        "pooled": row.is_group,
+        "marks": "; ".join(row.marks),
+        **{name: row.swept.get(name, "") for name in swept},
+        "metric": row.column.metric,
+        "base_mean": row.theirs,
+        "mean": row.mine,
+        **row.relative.record("change"),
+        **row.improvement.record("improvement"),
+        "training_seeds": row.num_seeds,
+        "pairs": row.num_pairs,
+        "failed": row.falls,
+        "episodes": row.episodes,
+        "base_failed": row.base_falls,
+        "base_episodes": row.base_episodes,
+        "change_per_training_seed": " ".join(f"{value:.6g}" for value in row.per_seed),
+        "sentence": row.sentence,
+    }
 
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
-    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as
-    they are shown.
-    """
-    return write_table(_MAP_HEAD, (row for found in maps for row in _map_records(found)), path)
+    """One row per cell, metric and policy; scores in SI units, changes as shares of one."""
+    return write_records([record for found in maps for record in _map_records(found)], path)
 
 
-def _map_records(found: HeatMap) -> Iterator[list[object]]:
+_AGAINST = ("change", "change_low", "change_high", "verdict")
+"""Columns of a map that only residuals fill."""
+
+
+def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
+    x_ticks = found.x.ticks(found.known)
     for y, row in zip(found.y.ticks(found.known), found.cells, strict=True):
-        for x, cell in zip(found.x.ticks(found.known), row, strict=True):
+        for x, cell in zip(x_ticks, row, strict=True):
             for title, estimate in cell.levels.items():
                 change = cell.learned.get(title)
-                against = ("",) * 4 if change is None else (*change.relative.cells, change.verdict)
-                own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
-                marks = [title == cell.best, title == cell.best_analytic]
-                yield [
-                    *own,
-                    *estimate.cells,
-                    *cell.failed[title],
-                    *marks,
-                    cell.best_analytic,
-                    *against,
-                ]
+                against: dict[str, object] = dict.fromkeys(_AGAINST, "")
+                if change is not None:
+                    against = {**change.relative.record("change"), "verdict": change.verdict}
+                failed, episodes = cell.failed[title]
+                yield {
+                    "map": found.title,
+                    "x_is": found.x.title,
+                    "x": x,
+                    "y_is": found.y.title,
+                    "y": y,
+                    "metric": found.column.metric,
+                    "policy": title,
+                    **estimate.record("mean"),
+                    "failed": failed,
+                    "episodes": episodes,
+                    "is_best": title == cell.best,
+                    "is_best_without_learning": title == cell.best_analytic,
+                    "best_without_learning": cell.best_analytic or "",
+                    **against,
+                }

@@ -17,8 +17,12 @@ from train.evaluate.episodes import group_by
 from train.evaluate.maps import best_of
 from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
-from train.report.render import Head, Part, Row, Table, print_table, render, write_table
+from train.report.page import Page
+from train.report.render import Head, Part, Row, Table, print_table, to_markdown
+from train.report.report_text import capital
+from train.runs.escaping import write_records
 
+_SCORE = ("mean", "low", "high")
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
 _RIVAL = (
     "best_without_learning",
@@ -27,25 +31,7 @@ _RIVAL = (
     "change_to_best_high",
     "verdict_to_best",
 )
-_HEAD = (
-    "track",
-    "policy",
-    "reference",
-    "scope",
-    "pooled",
-    "column",
-    "title",
-    "metric",
-    "mean",
-    "low",
-    "high",
-    "failed",
-    "episodes",
-    "training_seeds",
-    *_BASE,
-    *_RIVAL,
-    "step_us",
-)
+"""Columns of `leaderboard.csv` for a score, and for a paired change."""
 
 
 def board(found: Sequence[Standing]) -> Table:
@@ -66,35 +52,19 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
     metrics = list(dict.fromkeys(s.metric for s in shown))
     rows = []
     for track in Track:
-        policies = group_by([s for s in shown if s.track is track], lambda s: s.policy)
-        if not policies:
-            continue
-        rows.append(Row((str(track),), kind="heading"))
-        places = {
-            (s.policy, s.scope, s.reference, s.metric): s for own in policies.values() for s in own
-        }
-        best = {
-            (scope, reference, metric): best_of(
-                {
-                    policy: (s.score, (s.failed, s.episodes))
-                    for policy in policies
-                    if (s := places.get((policy, scope, reference, metric))) is not None
-                }
-            )
-            for scope, reference in columns
-            for metric in metrics
-        }
-        order = {
-            policy: _order(places.get((policy, *columns[0], metrics[0]))) for policy in policies
-        }
-        for policy in sorted(policies, key=lambda policy: order[policy]):
-            entries = [
-                _entry(
-                    [places.get((policy, *column, metric)) for metric in metrics],
-                    [best[*column, metric] == policy for metric in metrics],
-                )
-                for column in columns
-            ]
+        own = [s for s in shown if s.track is track]
+        if own:
+            rows.append(Row((str(track),), kind="heading"))
+        places = {(s.policy, s.scope, s.reference, s.metric): s for s in own}
+        best = {}
+        for key, some in group_by(own, lambda s: (s.scope, s.reference, s.metric)).items():
+            best[key] = best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in some})
+        order = {s.policy: _order(places.get((s.policy, *columns[0], metrics[0]))) for s in own}
+        for policy in sorted(order, key=lambda policy: order[policy]):
+            entries = []
+            for column in columns:
+                found = [places.get((policy, *column, metric)) for metric in metrics]
+                entries.append(_entry([s for s in found if s is not None], best))
             rows.append(Row((policy, *entries, *_totals(policy, everything))))
     heads = [Head("policy", is_number=False)]
     heads += [Head(scope, second=reference, leaves=1) for scope, reference in columns]
@@ -109,9 +79,9 @@ def _meaning(shown: Sequence[Standing]) -> str:
 
 
 def _order(standing: Standing | None) -> float:
-    return (
-        math.inf if standing is None or math.isnan(standing.score.value) else standing.score.value
-    )
+    if standing is None or not standing.score.is_known:
+        return math.inf
+    return standing.score.value
 
 
 def _totals(policy: str, everything: Sequence[Standing]) -> list[str]:
@@ -125,23 +95,24 @@ def _totals(policy: str, everything: Sequence[Standing]) -> list[str]:
     return [failed, "-" if math.isnan(step_us) else f"{step_us:.0f}"]
 
 
-def _entry(standings: Sequence[Standing | None], is_best: Sequence[bool]) -> tuple[Part, ...]:
+def _entry(
+    found: Sequence[Standing], best: Mapping[tuple[str, str, str], str | None]
+) -> tuple[Part, ...]:
     """Figures of all metrics, failures, and the intervals below."""
-    found = [s for s in standings if s is not None]
     if not found:
         return (Part("not played"),)
-    scores = [s.score.times(_column(s).scale) for s in found]
-    parts = [
-        Part(three_digits(score.value), "bold" if best else "", before=" / " if number else "")
-        for number, (score, best) in enumerate(zip(scores, is_best, strict=True))
-    ]
+    parts = []
+    intervals = []
+    for s in found:
+        score = s.score.times(_column(s).scale)
+        look = "bold" if best[s.scope, s.reference, s.metric] == s.policy else ""
+        parts.append(Part(three_digits(score.value), look, before=" / " if parts else ""))
+        if score.has_interval:
+            low, high = map(three_digits, score.ends)
+            intervals.append(Part(f"[{low}, {high}]", "small"))
     if found[0].failed:
         parts.append(Part(f"✕{found[0].failed}/{found[0].episodes}", "failure", before=" "))
-    intervals = [score.ends for score in scores if score.has_interval]
-    parts += [
-        Part(f"[{three_digits(low)}, {three_digits(high)}]", "small") for low, high in intervals
-    ]
-    return tuple(parts)
+    return (*parts, *intervals)
 
 
 def three_digits(value: float) -> str:
@@ -159,34 +130,25 @@ def _column(standing: Standing) -> Column:
 def claims_table(found: Sequence[Standing]) -> Table:
     """The paired changes of residuals in every column; no rows without residuals."""
     learned = [s for s in found if s.is_column and s.training_seeds]
-    titles = dict.fromkeys(s.title for s in learned)
     rows = []
-    for (policy, scope, reference), own in group_by(
-        learned, lambda s: (s.policy, s.scope, s.reference)
-    ).items():
-        changes = [text for s in own for text in (_change(s.base), _beside_base(s.rival, s.base))]
-        rows.append([policy, f"{scope}, {reference}", *changes])
-    others = ("its base", f"the {BEST_ANALYTIC}")
-    head = [f"{title}, against {other}" for title in titles for other in others]
-    return Table.plain(["residual", "where", *head], rows, words=2)
-
-
-def _beside_base(rival: Paired | None, base: Paired | None) -> str:
-    """A change against a rival, once where that is the base."""
-    return (
-        "the same"
-        if rival is not None and base is not None and rival.to == base.to
-        else _change(rival)
-    )
+    lines = group_by(learned, lambda s: (s.policy, s.scope, s.reference))
+    for (policy, scope, reference), own in lines.items():
+        cells = [policy, f"{scope}, {reference}"]
+        for s in own:
+            same = s.rival is not None and s.base is not None and s.rival.to == s.base.to
+            cells += [_change(s.base), "the same" if same else _change(s.rival)]
+        rows.append(cells)
+    head = ["residual", "where"]
+    for title in dict.fromkeys(s.title for s in learned):
+        head += [f"{title}, against its base", f"{title}, against the {BEST_ANALYTIC}"]
+    return Table.plain(head, rows, words=2)
 
 
 def _change(paired: Paired | None) -> str:
-    """A paired change: its value, its interval, a sign where nothing is shown, and whom it
-    compares with.
-    """
-    return (
-        "-" if paired is None else f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
-    )
+    """A paired change: value, interval, a sign where nothing is shown, and the opponent."""
+    if paired is None:
+        return "-"
+    return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
 
 
 LEGEND = (
@@ -208,26 +170,32 @@ def legend(found: Sequence[Standing]) -> str:
     meaning = _meaning([s for s in found if s.is_column])
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in found if not s.is_group})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
-    return (
-        f"{meaning[:1].upper()}{meaning[1:]}; episodes of a scenario, per training seed: {span}."
-        f" {LEGEND}"
-    )
+    return f"{capital(meaning)}; episodes of a scenario, per training seed: {span}. {LEGEND}"
+
+
+def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
+    """Add the leaderboard to a page, with what learning adds and the single scenarios."""
+    page.section("Leaderboard", legend(found))
+    page.add("table", board(found))
+    claims = claims_table(found)
+    if claims.rows:
+        page.add("text", PAIRED, "What learning adds")
+        page.add("table", claims)
+    single = scenarios_board(found)
+    if single is not None:
+        page.add("table", single, f"Single scenarios, {found[0].reference}", is_folded=True)
 
 
 def leaderboard_markdown(found: Sequence[Standing]) -> str:
-    """The tables of the leaderboard."""
-    parts = [legend(found), render(board(found), "markdown")]
-    if any(s.training_seeds for s in found):
-        parts += ["### What learning adds", claims_markdown(found).rstrip()]
-    single = scenarios_board(found)
-    if single is not None:
-        parts += [f"### Single scenarios, {found[0].reference}", render(single, "markdown")]
-    return "\n\n".join(parts) + "\n"
+    """The tables of the leaderboard, without a title."""
+    page = Page("", "")
+    add_leaderboard(page, found)
+    return "\n\n".join(page.sections[0].markdown[1:]) + "\n"
 
 
 def claims_markdown(found: Sequence[Standing]) -> str:
     """The paired changes of residuals, as a table."""
-    return f"{PAIRED}\n\n{render(claims_table(found), 'markdown')}\n"
+    return f"{PAIRED}\n\n{to_markdown(claims_table(found))}\n"
 
 
 def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
@@ -236,41 +204,37 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
-    """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they
-    agree.
-    """
-    table = folder / "leaderboard.csv"
+    """Write `leaderboard.csv`, and from it `leaderboard.md`, so that they agree."""
+    table = write_records([_record(standing) for standing in found], folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
-    write_table(_HEAD, map(_record, found), table)
-    write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
+    board = leaderboard_markdown(read_leaderboard(table))
+    write_whole(text, f"# Leaderboard\n\n{board}")
     return [table, text]
 
 
-def _record(s: Standing) -> list[Any]:
-    return [
-        str(s.track),
-        s.policy,
-        s.reference,
-        s.scope,
-        s.is_group,
-        s.is_column,
-        s.title,
-        s.metric,
-        *_cells(s.score),
-        s.failed,
-        s.episodes,
-        s.training_seeds,
-        *_paired_cells(s.base),
-        *_paired_cells(s.rival),
-        f"{s.step_us:.3g}",
-    ]
+def _record(s: Standing) -> dict[str, Any]:
+    return {
+        "track": str(s.track),
+        "policy": s.policy,
+        "reference": s.reference,
+        "scope": s.scope,
+        "pooled": s.is_group,
+        "column": s.is_column,
+        "title": s.title,
+        "metric": s.metric,
+        **dict(zip(_SCORE, _cells(s.score), strict=True)),
+        "failed": s.failed,
+        "episodes": s.episodes,
+        "training_seeds": s.training_seeds,
+        **dict(zip(_BASE, _paired_cells(s.base), strict=True)),
+        **dict(zip(_RIVAL, _paired_cells(s.rival), strict=True)),
+        "step_us": f"{s.step_us:.3g}",
+    }
 
 
 def _cells(estimate: Estimate) -> list[str]:
-    return [
-        "" if value is None else f"{value:.6g}"
-        for value in (estimate.value, estimate.low, estimate.high)
-    ]
+    values = (estimate.value, estimate.low, estimate.high)
+    return ["" if value is None else f"{value:.6g}" for value in values]
 
 
 def _paired_cells(paired: Paired | None) -> list[str]:
@@ -284,12 +248,10 @@ def read_leaderboard(path: Path) -> list[Standing]:
         ConfigurationError: It is none.
     """
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != _HEAD:
-            raise ConfigurationError(
-                f"{shorten(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}"
-            )
-        found = [_standing(row) for row in reader]
+        try:
+            found = [_standing(row) for row in csv.DictReader(file)]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {error!r}") from None
     if not found:
         raise ConfigurationError(f"{shorten(path)} has no rows")
     return found
@@ -305,18 +267,17 @@ def _standing(row: Mapping[str, str]) -> Standing:
         is_column=row["column"] == "True",
         title=row["title"],
         metric=row["metric"],
-        score=_estimate(row["mean"], row["low"], row["high"]),
+        score=_estimate(*(row[name] for name in _SCORE)),
         failed=int(row["failed"]),
         episodes=int(row["episodes"]),
         training_seeds=int(row["training_seeds"]),
-        base=_read_paired([row[name] for name in _BASE]),
-        rival=_read_paired([row[name] for name in _RIVAL]),
+        base=_paired(*(row[name] for name in _BASE)),
+        rival=_paired(*(row[name] for name in _RIVAL)),
         step_us=float(row["step_us"]),
     )
 
 
-def _read_paired(cells: Sequence[str]) -> Paired | None:
-    to, value, low, high, verdict = cells
+def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
     return Paired(to, _estimate(value, low, high), verdict) if to else None
 
 

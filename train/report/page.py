@@ -1,10 +1,66 @@
-"""The page of a report: what its sections hold, as data for the template `page.html.j2`."""
+"""A report as sections of texts, tables and charts, written as an HTML page and as Markdown."""
 
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from train.report.render import require_jinja2
+from train.figures.map_plots import Panel, panel_rows
+from train.report.render import Table, load_template, to_markdown
+from train.runs.escaping import markdown_text
 
-Kind = Literal["heading", "bullets", "definitions", "table", "chart", "map", "text"]
+Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a section.
+
+    Attributes:
+        kind: What it is; captions and charts stand on the page alone.
+        content: A text, texts, pairs of texts, a `Table`, a `PageChart`, or the panels of a map.
+        title: Above it; empty for none.
+        is_folded: Whether it is folded away under its title. A chart is drawn when it is unfolded.
+        is_open: Whether it is unfolded at first.
+    """
+
+    kind: Kind
+    content: Any
+    title: str = ""
+    is_folded: bool = False
+    is_open: bool = False
+
+    @property
+    def markdown(self) -> list[str]:
+        """Blocks of Markdown; none of a chart."""
+        if self.kind in ("caption", "chart"):
+            return []
+        blocks = [f"### {markdown_text(self.title)}"] if self.title else []
+        if self.kind == "table":
+            return [*blocks, to_markdown(self.content)]
+        if self.kind == "map":
+            return [*blocks, *(block for panel in self.content for block in _panel(panel))]
+        if self.kind == "text":
+            return [*blocks, markdown_text(self.content)]
+        texts = self.content
+        if self.kind == "definitions":
+            texts = [f"{term}: {text}" for term, text in self.content]
+        return [*blocks, bullets(texts)]
+
+
+@dataclass
+class Section:
+    """A section of a page, with a paragraph under its title."""
+
+    title: str
+    text: str = ""
+    parts: list[Part] = field(default_factory=list)
+
+    @property
+    def markdown(self) -> list[str]:
+        """Blocks of Markdown; none of a section of charts."""
+        blocks = [block for part in self.parts for block in part.markdown]
+        text = [markdown_text(self.text)] if self.text else []
+        return [f"## {markdown_text(self.title)}", *text, *blocks] if blocks else []
 
 
 class Page:
@@ -18,28 +74,33 @@ class Page:
     def __init__(self, title: str, under: str) -> None:
         self.title = title
         self.under = under
-        self.sections: list[dict[str, Any]] = []
+        self.sections: list[Section] = []
 
     def section(self, title: str, text: str = "") -> None:
         """Begin a section, with a paragraph under its title."""
-        self.sections.append({"title": title, "text": text, "parts": []})
+        self.sections.append(Section(title, text))
 
-    def add(
-        self, kind: Kind, content: Any, folded: str | None = None, is_open: bool = False
-    ) -> None:
-        """Add to the section.
-
-        Args:
-            kind: What it is.
-            content: A text, texts, pairs of texts, a `Table`, a `Chart`, or the panels of a map.
-            folded: Title under which it is folded away; None if it is not. A chart is drawn when it
-                is unfolded.
-            is_open: Whether it is unfolded at first.
-        """
-        self.sections[-1]["parts"].append(
-            {"kind": kind, "content": content, "folded": folded, "is_open": is_open}
-        )
+    def add(self, kind: Kind, content: Any, title: str = "", **folding: bool) -> None:
+        """Add a `Part` to the section."""
+        self.sections[-1].parts.append(Part(kind, content, title, **folding))
 
     def html(self, plotly_js: str) -> str:
         """The whole page, with the source of plotly.js in it."""
-        return require_jinja2().render(page=self, plotly_js=plotly_js)
+        return load_template().render(page=self, plotly_js=plotly_js)
+
+    def markdown(self) -> str:
+        """The texts and tables of the page."""
+        blocks = [block for section in self.sections for block in section.markdown]
+        return "\n\n".join([f"# {markdown_text(self.title)}", *blocks]) + "\n"
+
+
+def bullets(texts: Iterable[str]) -> str:
+    """A list in Markdown."""
+    return "\n".join(f"* {markdown_text(text)}" for text in texts)
+
+
+def _panel(panel: Panel) -> list[str]:
+    """Title and table of a panel of a map."""
+    key = ", ".join(f"{letter} {title}" for letter, title, _ in panel.key)
+    title = f"{panel.title} ({key}):" if key else f"{panel.title}:"
+    return [markdown_text(title), to_markdown(Table.plain(*panel_rows(panel)))]

@@ -1,15 +1,13 @@
-"""Tables of results, and their one outlet: for the terminal, as Markdown, as CSV and as HTML.
+"""Tables of results for the terminal, as Markdown and, by `table.html.j2`, as HTML.
 
-Texts of a table are plain. This outlet escapes them for each format, see `train.runs.escaping`.
+Texts of a table are plain. Each of these escapes them, see `train.runs.escaping`.
 """
 
-import csv
-import io
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich import box
@@ -19,29 +17,18 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from elastic_env.core.errors import missing_extra
-from elastic_env.core.files import write_whole
+from train.evaluate.changes import Verdict
 from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
 from train.figures.colours import NIGHT, VERDICTS
 from train.report.specs import FONT
-from train.runs.escaping import csv_row, markdown_text, script_json, template_value
+from train.runs.escaping import markdown_text, script_json, template_value
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
-Style = Literal[
-    "",
-    "bold",
-    "small",
-    "failure",
-    "badge",
-    "pooled",
-    "ceiling",
-    "lower",
-    "higher",
-    "none",
-    "unclear",
-]
+Look = Literal["", "bold", "small", "failure", "badge", "pooled", "ceiling"]
+Style = Look | Verdict
 
 _ANY_WIDTH = 10_000
 _WORD = re.compile(r"\S+(?: [^\w\s]+)*")
@@ -159,16 +146,13 @@ class Table:
 
     def without(self, place: int) -> "Table":
         """The same without a column."""
-        rows = (
-            (
-                row
-                if row.kind == "heading"
-                else replace(row, cells=row.cells[:place] + row.cells[place + 1 :])
-            )
-            for row in self.rows
-        )
+        rows = []
+        for row in self.rows:
+            cells = row.cells[:place] + row.cells[place + 1 :]
+            rows.append(row if row.kind == "heading" else replace(row, cells=cells))
         heads = self.heads[:place] + self.heads[place + 1 :]
-        return replace(self, heads=heads, rows=tuple(rows), keys=self.keys - (place < self.keys))
+        keys = self.keys - (place < self.keys)
+        return replace(self, heads=heads, rows=tuple(rows), keys=keys)
 
     @property
     def sparse(self) -> list[Row]:
@@ -178,11 +162,8 @@ class Table:
         for row in self.rows:
             is_heading = row.kind == "heading"
             said = 0
-            while (
-                not is_heading
-                and said < self.keys - 1
-                and row.cells[: said + 1] == before[: said + 1]
-            ):
+            most = 0 if is_heading else self.keys - 1
+            while said < most and row.cells[: said + 1] == before[: said + 1]:
                 said += 1
             found.append(replace(row, cells=("",) * said + row.cells[said:]))
             before = () if is_heading else row.cells
@@ -196,31 +177,8 @@ def plain_text(cell: Cell) -> str:
     return "".join(part.before + part.text for part in cell if part.style != "small")
 
 
-@overload
-def render(table: Table, to: Literal["terminal"]) -> RichTable: ...
-@overload
-def render(table: Table, to: Literal["markdown", "csv", "html"]) -> str: ...
-def render(table: Table, to: Literal["terminal", "markdown", "csv", "html"]) -> RichTable | str:
-    """A table in a format, with its texts escaped for it."""
-    formats: dict[str, Any] = {
-        "terminal": _terminal,
-        "markdown": _markdown,
-        "csv": _csv,
-        "html": _html,
-    }
-    return formats[to](table)
-
-
-def write_table(head: Iterable[str], rows: Iterable[Iterable[object]], path: Path) -> Path:
-    """Write a table of texts and numbers as CSV; None is empty."""
-    texts = (["" if cell is None else str(cell) for cell in row] for row in rows)
-    write_whole(path, render(Table.plain(head, texts), "csv"))
-    return path
-
-
 def print_table(table: Table, console: Console, file: str) -> None:
-    """Print a table without the columns that the terminal has no room for, and name those and who
-    has them.
+    """Print a table without the columns that have no room, and name those and their file.
 
     Args:
         table: The table.
@@ -232,7 +190,7 @@ def print_table(table: Table, console: Console, file: str) -> None:
     while not (fitting := _fit(shown, console)):
         leaving = [place for place, head in enumerate(shown.heads) if head.leaves]
         if len(leaving) < 2:
-            fitting = _terminal(shown, breaks_words=True)
+            fitting = to_terminal(shown, breaks_words=True)
             break
         place = min(leaving, key=lambda place: (shown.heads[place].leaves, -place))
         head = shown.heads[place]
@@ -249,7 +207,7 @@ def _fit(table: Table, console: Console) -> RichTable | None:
     """A table as it has room on a terminal; None where it has none."""
     options = console.options.update(max_width=_ANY_WIDTH)
     for form in (table, _with_titles(table)):
-        found = _terminal(form)
+        found = to_terminal(form)
         if console.measure(found, options=options).minimum <= console.width:
             return found
     return None
@@ -264,7 +222,8 @@ def _with_titles(table: Table) -> Table:
     return table
 
 
-def _terminal(table: Table, breaks_words: bool = False) -> RichTable:
+def to_terminal(table: Table, breaks_words: bool = False) -> RichTable:
+    """A table for a terminal; words are broken where there is no other way."""
     title = ": ".join(filter(None, [", ".join(table.subjects), table.title]))
     notes = "; ".join(f"{head.title}: {head.note}" for head in table.heads if head.note)
     caption = " ".join(filter(None, [notes and f"{notes}.", table.caption]))
@@ -312,7 +271,8 @@ def _terminal_cell(cell: Cell) -> Text:
     return text
 
 
-def _markdown(table: Table) -> str:
+def to_markdown(table: Table) -> str:
+    """A table in Markdown, with its texts escaped."""
     rules = ["---:" if head.is_number else "---" for head in table.heads]
     lines = [[markdown_text(head.label) for head in table.heads], rules]
     for row in table.rows:
@@ -338,18 +298,7 @@ def _markdown_cell(cell: Cell) -> str:
     )
 
 
-def _csv(table: Table) -> str:
-    text = io.StringIO(newline="")
-    rows = ([plain_text(cell) for cell in row.cells] for row in table.rows)
-    csv.writer(text).writerows(map(csv_row, [[head.label for head in table.heads], *rows]))
-    return text.getvalue()
-
-
-def _html(table: Table) -> str:
-    return str(require_jinja2("table.html.j2").module.table(table))  # type: ignore[attr-defined]
-
-
-def require_jinja2(name: str = "page.html.j2") -> "Template":
+def load_template(name: str = "page.html.j2") -> "Template":
     """A template, by default that of a page; it escapes all that is put into it.
 
     Raises:

@@ -12,7 +12,9 @@ from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.table import EpisodeTable, score
-from train.report.render import Head, Row, Table, number_interval, print_table, write_table
+from train.figures.chart import spread
+from train.report.render import Head, Row, Table, number_interval, print_table
+from train.runs.escaping import write_records
 
 SCORES = (
     "Mean over the episodes that reached the end; of residuals the interquartile mean over training"
@@ -49,43 +51,31 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
     rows = []
     for title, curves in learning.items():
         for column in columns:
-            for at, ratio in zip(curves.decisions, curves.ratios[column.metric].T, strict=True):
-                known = ratio[np.isfinite(ratio)]
-                values = (
-                    (np.median(known), known.min(), known.max()) if len(known) else (np.nan,) * 3
-                )
-                rows.append(
-                    [title, column.title, f"{at:.0f}", *(f"{value:.2f}" for value in values)]
-                )
-    return Table.plain(
-        ["residual", "metric", "decisions", "median", "best", "worst"], rows, words=2
-    )
+            best, median, worst = spread(curves.ratios[column.metric])
+            for at, *values in zip(curves.decisions, median, best, worst, strict=True):
+                figures = (f"{value:.2f}" for value in values)
+                rows.append([title, column.title, f"{at:.0f}", *figures])
+    head = ["residual", "metric", "decisions", "median", "best", "worst"]
+    return Table.plain(head, rows, words=2)
 
 
 def robots_table(found: Sequence[RobotScores]) -> Table:
     """All scores over drawn robots, a row per cell and metric."""
-    heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy", "metric")]
-    heads += [
-        Head(name) for name in ("mean", "interquartile mean", "worst tenth", found[0].failure)
-    ]
-    heads += [Head("better than", is_number=False)]
+    figures = ("mean", "interquartile mean", "worst tenth", found[0].failure)
+    head = ["reference", "scenario", "policy", "metric", *figures]
     rows = []
     for row in found:
-        figures = [
-            number_interval(estimate, row.column) for estimate in (row.mean, row.middle, row.worst)
-        ]
-        better = "; ".join(
-            f"{title}: {percent_interval(e, signed=False)}" for title, e in row.better.items()
-        )
-        names = [row.reference, row.scenario, row.policy, row.column.label]
-        rows.append(Row((*names, *figures, f"{row.failed}/{row.episodes}", better or "-")))
-    return Table(tuple(heads), tuple(rows), keys=4)
+        names = (row.reference, row.scenario, row.policy, row.column.label)
+        scores = [number_interval(own, row.column) for own in (row.mean, row.middle, row.worst)]
+        shares = {title: percent_interval(own, signed=False) for title, own in row.better.items()}
+        better = "; ".join(f"{title}: {share}" for title, share in shares.items())
+        rows.append(Row((*names, *scores, f"{row.failed}/{row.episodes}", better or "-")))
+    heads = Table.plain(head, [], words=4).heads
+    return Table((*heads, Head("better than", is_number=False)), tuple(rows), keys=4)
 
 
 def print_robots(found: Sequence[RobotScores], console: Console) -> None:
-    """Print a line per policy with all metrics, under the motion and the scenario, where there
-    is anything to print.
-    """
+    """Print a line per policy with all metrics, under the motion and the scenario."""
     if not found:
         return
     columns = list(dict.fromkeys(row.column for row in found))
@@ -97,13 +87,10 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
             figures = {row.column: _three(row) for row in own}
             failed = f"{own[0].failed}/{own[0].episodes}"
             rows.append(Row((policy, *(figures[column] for column in columns), failed)))
-    title = (
-        "over the drawn robots that did not fail: mean / interquartile mean / mean of the worst"
-        " tenth"
-    )
-    print_table(
-        Table((*heads, Head(found[0].failure)), tuple(rows), title=title), console, "robots.csv"
-    )
+    figures = "mean / interquartile mean / mean of the worst tenth"
+    title = f"over the drawn robots that did not fail: {figures}"
+    heads.append(Head(found[0].failure))
+    print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
 
 
 def _three(row: RobotScores) -> str:
@@ -116,41 +103,27 @@ def _three(row: RobotScores) -> str:
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
     """One row per cell, metric and other policy; metrics in SI units, shares as shares of one."""
-    return write_table(_HEAD, (record for row in rows for record in _records(row)), path)
+    return write_records([record for row in rows for record in _records(row)], path)
 
 
-def _records(row: RobotScores) -> Iterator[list[object]]:
-    own = [
-        row.policy,
-        row.reference,
-        row.scenario,
-        row.column.metric,
-        *row.mean.cells,
-        *row.middle.cells,
-    ]
-    own += [*row.worst.cells, row.failed, row.episodes]
+_SHARE = ("better_share", "better_share_low", "better_share_high")
+
+
+def _records(row: RobotScores) -> Iterator[dict[str, object]]:
     for other, better in row.better.items() or [("", None)]:
-        yield [*own, other, *(("",) * 3 if better is None else better.cells)]
-
-
-_HEAD = (
-    "policy",
-    "reference",
-    "scenario",
-    "metric",
-    "mean",
-    "mean_low",
-    "mean_high",
-    "interquartile_mean",
-    "interquartile_mean_low",
-    "interquartile_mean_high",
-    "worst_tenth",
-    "worst_tenth_low",
-    "worst_tenth_high",
-    "failed",
-    "episodes",
-    "against",
-    "better_share",
-    "better_share_low",
-    "better_share_high",
-)
+        share: dict[str, object] = dict.fromkeys(_SHARE, "")
+        if better is not None:
+            share = better.record("better_share")
+        yield {
+            "policy": row.policy,
+            "reference": row.reference,
+            "scenario": row.scenario,
+            "metric": row.column.metric,
+            **row.mean.record("mean"),
+            **row.middle.record("interquartile_mean"),
+            **row.worst.record("worst_tenth"),
+            "failed": row.failed,
+            "episodes": row.episodes,
+            "against": other,
+            **share,
+        }

@@ -37,15 +37,13 @@ class PageChart:
 def page_chart(chart: Chart) -> PageChart:
     """The panels of a chart one below the other, with a legend on top."""
     count = len(chart.panels)
-    names = dict.fromkeys(
-        curve.name for panel in chart.panels for curve in panel.curves if curve.name
-    )
+    curves = [curve for panel in chart.panels for curve in panel.curves]
+    names = dict.fromkeys(curve.name for curve in curves if curve.name)
+    legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
     strip = 24 * len(chart.failing) + 12 if chart.failing else 0
     height = 130 + chart.panel_height * count + strip
-    top = 1.0 - strip / height if strip else 1.0
-    layout = base_layout(
-        left=76, top=28 + 20 * -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW), bottom=50
-    )
+    top = 1.0 - strip / height
+    layout = base_layout(left=76, top=28 + 20 * legend_rows, bottom=50)
     data: list[Spec] = []
     for number, panel in enumerate(chart.panels):
         axis = nth(number)
@@ -57,13 +55,12 @@ def page_chart(chart: Chart) -> PageChart:
         axis = nth(count)
         data += [_failing_trace(policy, row, axis) for row, policy in enumerate(chart.failing)]
         titles = [chart_text(shorten(policy.name)) for policy in chart.failing]
-        rows = list(range(len(titles)))
         layout[f"yaxis{axis}"] = base_axis(
             domain=[min(top + 0.02, 0.99), 1.0],
-            tickvals=rows,
+            tickvals=list(range(len(titles))),
             ticktext=titles,
             anchor="x",
-            range=[len(rows) - 0.4, -0.6],
+            range=[len(titles) - 0.4, -0.6],
             showgrid=False,
         )
         layout["margin"]["l"] = max(76, 7.4 * max(map(len, titles)) + 20)
@@ -72,13 +69,7 @@ def page_chart(chart: Chart) -> PageChart:
         values = list(chart.ticks)
         ticks = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{nth(count - 1)}", **ticks)
-    layout["legend"] = {
-        "orientation": "h",
-        "y": 1.0,
-        "yanchor": "bottom",
-        "x": 0.0,
-        "xanchor": "left",
-    }
+    layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0}
     layout["showlegend"] = True
     layout["hovermode"] = "x unified" if len(names) < 7 else "closest"
     layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
@@ -94,40 +85,34 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
-    where = {
-        "type": "scatter",
-        "yaxis": f"y{axis}",
-        "legendgroup": curve.name,
-        **_abscissa(curve.x),
-    }
+    where = {"type": "scatter", "yaxis": f"y{axis}", **_abscissa(curve.x)}
     line = {
         **where,
         "mode": "lines+markers" if curve.has_points else "lines",
         "y": numbers(curve.y),
         "name": chart_text(curve.name),
+        "legendgroup": curve.name,
         "showlegend": is_first and bool(curve.name),
         "line": {"color": curve.colour, "width": curve.width, "dash": curve.dash},
+        "marker": {"size": 7},
     }
-    if curve.has_points:
-        line["marker"] = {"size": 7}
     if curve.band is None:
         return [line]
     hidden = {
         **where,
         "mode": "lines",
+        "legendgroup": curve.name,
         "showlegend": False,
         "hoverinfo": "skip",
         "line": {"width": 0},
     }
-    low, high = curve.band
+    low, high = map(numbers, curve.band)
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
-    return [{**hidden, "y": numbers(low)}, {**hidden, "y": numbers(high), **filled}, line]
+    return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
 
 
 def _abscissa(x: Array) -> Spec:
-    """Points of the axis; of many that are evenly spaced the first one and the distance, which
-    is shorter.
-    """
+    """Points of the axis; of many that are evenly spaced the first one and the distance."""
     if len(x) < 20:
         return {"x": x.tolist()}
     return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
@@ -145,7 +130,6 @@ def _failing_trace(policy: Failing, row: int, axis: str) -> Spec:
         "showlegend": False,
         "marker": {"symbol": symbols, "size": 9, "color": policy.colour},
         "hoverinfo": "skip",
-        "name": chart_text(policy.name),
     }
 
 

@@ -1,5 +1,4 @@
-"""The summary of a comparison: medians over the episodes of every cell, on the terminal and as
-Markdown.
+"""The summary of a comparison: medians over the episodes of every cell.
 
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
@@ -14,14 +13,14 @@ from rich.console import Console
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation
-from train.report.render import Head, Row, Table, print_table, render
-from train.runs.escaping import markdown_text, write_records
+from train.report.page import bullets
+from train.report.render import Head, Row, Table, print_table, to_markdown
+from train.report.report_text import capital
+from train.runs.escaping import write_records
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print the summary with as many columns as the terminal has room for; what policies are
-    judged by stays.
-    """
+    """Print the summary with as many columns as the terminal has room for."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
     print_table(summary_table(evaluations, columns), console, "summary.md")
@@ -72,35 +71,30 @@ def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
-    """How and, on the walker, when the episodes of a cell ended, median [s], for the cells in
-    which all failed.
-    """
+    """How and when the episodes of a cell ended, median [s], for cells in which all failed."""
     cells = {(e.condition.reference_name, e.condition.scenario) for e in evaluations}
     notes = []
     for e in evaluations:
         number = len(e.episodes)
-        if e.num_failed == number > 0:
-            reasons = "/".join(dict.fromkeys(episode["termination"] for episode in e.episodes))
-            times = e.values("duration_s", failed=True)
-            when = f" after {np.median(times):.1f} s" if len(times) else ""
-            swept = [f"{name}={value:g}" for name, value in e.condition.swept.items()]
-            cell = [] if len(cells) == 1 else [e.condition.reference_name, e.condition.scenario]
-            who = ", ".join([*cell, " ".join([e.condition.policy.title, *swept])])
-            notes.append(f"{who}: {reasons}{when} ({number} of {number})")
+        if e.num_failed < number or not number:
+            continue
+        reasons = "/".join(dict.fromkeys(episode["termination"] for episode in e.episodes))
+        times = e.values("duration_s", failed=True)
+        when = f" after {np.median(times):.1f} s" if len(times) else ""
+        swept = [f"{name}={value:g}" for name, value in e.condition.swept.items()]
+        cell = [] if len(cells) == 1 else [e.condition.reference_name, e.condition.scenario]
+        who = ", ".join([*cell, " ".join([e.condition.policy.title, *swept])])
+        notes.append(f"{who}: {reasons}{when} ({number} of {number})")
     return notes
 
 
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
-    return write_records(
-        [episode for evaluation in evaluations for episode in evaluation.episodes], path
-    )
+    return write_records([episode for own in evaluations for episode in own.episodes], path)
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """The summary table and its splits as Markdown: medians, and the worst episode in brackets;
-    by environment.
-    """
+    """The summary table and its splits as Markdown, by environment."""
     groups = groupby(evaluations, key=lambda evaluation: evaluation.condition.env)
     parts = [part for _, group in groups for part in _parts(list(group))]
     write_whole(path, "\n\n".join(parts) + "\n")
@@ -111,23 +105,17 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     """The parts of a summary of one environment."""
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
-    statistic = "Median over the episodes that did not fail" + (
-        " (the worst of them in brackets)" if several else ""
-    )
+    worst = " (the worst of them in brackets)" if several else ""
+    statistic = f"Median over the episodes that did not fail{worst}"
     parts = [
-        f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside.",
+        f"{capital(known.subject)}. {statistic}; failures are counted beside.",
         _legend(known, known.columns),
-        render(summary_table(evaluations, known.columns, worst=True), "markdown"),
+        to_markdown(summary_table(evaluations, known.columns, worst=True)),
     ]
     for title, columns in known.splits:
-        parts += [f"{title}:", render(summary_table(evaluations, columns, worst=True), "markdown")]
+        parts += [f"{title}:", to_markdown(summary_table(evaluations, columns, worst=True))]
     notes = failure_notes(evaluations)
-    if notes:
-        parts += [
-            "Where all episodes failed:",
-            "\n".join(f"* {markdown_text(note)}" for note in notes),
-        ]
-    return parts
+    return [*parts, "Where all episodes failed:", bullets(notes)] if notes else parts
 
 
 def _legend(known: Environment, columns: Sequence[Column]) -> str:

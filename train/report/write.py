@@ -1,6 +1,4 @@
-"""The report of a comparison: `report.html`, which works without a network, and its tables as
-Markdown.
-"""
+"""The report of a comparison: `report.html`, which works offline, and `report.md`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,12 +20,11 @@ from train.figures.comparison_figures import (
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
-from train.report.leaderboard import PAIRED, board, claims_table, legend, scenarios_board
-from train.report.markdown import markdown
+from train.report.leaderboard import add_leaderboard
 from train.report.page import Page
-from train.report.render import Table
+from train.report.render import Table, load_template
 from train.report.report_text import Results, capital, facts, headline, in_short, notes
-from train.report.score_tables import ROBOTS, SCORES, robots_table, scores_table
+from train.report.score_tables import ROBOTS, SCORES, learning_table, robots_table, scores_table
 from train.report.specs import page_chart
 
 _LONG = 40
@@ -38,6 +35,16 @@ _ALL_POINTS = 6000
 """Points of a curve, at most and at least, and of all cells together, so that a large comparison
 stays small.
 """
+
+
+def require_libraries() -> None:
+    """Check that a report can be written, before anything is played.
+
+    Raises:
+        MissingExtraError: Plotly or Jinja2 is not installed.
+    """
+    require_plotly()
+    load_template()
 
 
 def require_plotly() -> str:
@@ -57,103 +64,83 @@ def write_report(results: Results) -> list[Path]:
     """Write `report.html` and `report.md` beside the other files of a comparison."""
     page = results.folder / "report.html"
     text = results.folder / "report.md"
-    write_whole(page, _page(results).html(require_plotly()))
-    write_whole(text, markdown(results))
+    content = _page(results)
+    write_whole(page, content.html(require_plotly()))
+    write_whole(text, content.markdown())
     return [page, text]
 
 
 def _page(results: Results) -> Page:
-    known = results.environment
+    subject = capital(results.environment.subject)
     page = Page(
-        f"Comparison: {results.name}",
-        f"{capital(known.subject)}; made {results.metadata['created'][:10]}",
+        f"Comparison: {results.name}", f"{subject}; made {results.metadata['created'][:10]}"
     )
     page.section("What was compared", headline(results))
     page.add("definitions", facts(results))
-    page.add("bullets", in_short(results))
-    _add_leaderboard(page, results)
-    _add_maps(page, results)
+    page.add("bullets", in_short(results), "In short")
+    if results.standings:
+        add_leaderboard(page, results.standings)
+    if results.maps:
+        _add_maps(page, results)
     if results.has_conditions:
         _add_ladder(page, results)
     _add_changes(page, results)
-    _add_robots(page, results)
-    _add_phases(page, results)
+    if results.robots:
+        page.section("Drawn robots", ROBOTS)
+        _add_table(page, robots_table(results.robots), "Table of drawn robots")
+    for title, columns in results.environment.splits:
+        page.section(title, SCORES)
+        _add_table(page, scores_table(results.table, columns))
     if results.has_conditions:
         _add_curves(page, results)
     if not results.maps:
         _add_sweeps(page, results)
     if results.learning:
-        page.section(
-            "Learning curves",
-            "Score over that of the base (dotted) on episodes that training never sees, mean over"
-            " the trained scenarios: median over training seeds, band from the best to the worst.",
-        )
-        chart = learning_chart(results.learning, known.judged, results.colours)
-        page.add("chart", page_chart(chart))
+        _add_learning(page, results)
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
 
 
-def _add_leaderboard(page: Page, results: Results) -> None:
-    """The leaderboard, what learning adds, and folded away the single scenarios."""
-    found = results.standings
-    if not found:
-        return
-    page.section("Leaderboard", legend(found))
-    page.add("table", board(found))
-    claims = claims_table(found)
-    if claims.rows:
-        page.add("heading", "What learning adds")
-        page.add("text", PAIRED)
-        _add_table(page, claims)
-    single = scenarios_board(found)
-    if single is not None:
-        page.add("table", single, folded=f"Single scenarios, {found[0].reference}")
+def _add_learning(page: Page, results: Results) -> None:
+    columns = results.environment.judged
+    page.section(
+        "Learning curves",
+        "Score over that of the base (dotted) on episodes that training never sees, mean over the"
+        " trained scenarios: median over training seeds, band from the best to the worst.",
+    )
+    page.add("chart", page_chart(learning_chart(results.learning, columns, results.colours)))
+    table = learning_table(results.learning, columns)
+    page.add("table", table, "Table of learning curves", is_folded=True)
 
 
 def _add_maps(page: Page, results: Results) -> None:
-    """Heat maps: who is best, learning against the best policy without it, and folded away every
-    policy's score.
-    """
-    if not results.maps:
-        return
+    """Heat maps: who is best, what learning adds, and folded away every policy's score."""
     page.section(
         "Maps",
         "Who is best where, and what learning changes against the best policy without it, in per"
-        " cent: green and below zero, learning is ahead; red and above zero, it is behind."
-        f" {SIGNS_ARE} A cross counts failed episodes.",
+        f" cent: below zero, learning is ahead. {SIGNS_ARE} A cross counts failed episodes.",
     )
+    page.add("caption", "Green: learning is ahead. Red: it is behind.")
     for heat_map in results.maps:
         found = panels(heat_map)
-        page.add("heading", capital(f"{heat_map.column.title}, {heat_map.title}"))
-        page.add("map", [panel for panel in found if panel.is_main])
-        page.add(
-            "map", [panel for panel in found if not panel.is_main], folded="Scores of every policy"
-        )
+        title = capital(f"{heat_map.column.title}, {heat_map.title}")
+        page.add("map", [panel for panel in found if panel.is_main], title)
+        rest = [panel for panel in found if not panel.is_main]
+        page.add("map", rest, "Scores of every policy", is_folded=True)
 
 
 def _add_ladder(page: Page, results: Results) -> None:
-    seeds = (
-        " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
-        if results.table.members
-        else ""
-    )
-    page.section(
-        "Ladder of policies",
-        "Mean over the episodes that reached the end; lower is better, and the axis is"
-        f" logarithmic.{seeds}",
-    )
+    text = "Mean over the episodes that reached the end; lower is better; the axis is logarithmic."
+    if results.table.members:
+        text += " Diamonds: interquartile mean over training seeds with its 95 % interval."
+    page.section("Ladder of policies", text)
     references = results.table.references
     for number, reference in enumerate(references):
         chart = ladder(results.table, reference, results.colours)
-        title = results.environment.title(reference)
-        page.add(
-            "chart",
-            chart,
-            folded=capital(title) if len(references) > 1 else None,
-            is_open=number < 3,
-        )
+        several = len(references) > 1
+        title = capital(results.environment.title(reference)) if several else ""
+        page.add("chart", chart, title, is_folded=several, is_open=number < 3)
 
 
 def _add_changes(page: Page, results: Results) -> None:
@@ -162,22 +149,16 @@ def _add_changes(page: Page, results: Results) -> None:
     for name, rows in of_residuals:
         if not rows:
             continue
-        drawn = results.has_conditions
-        marks = (
-            " Open circles are held out, stars are ceilings on the training condition."
-            if drawn
-            else ""
+        page.section(name, "Change on the same episodes, with 95 % intervals over training seeds.")
+        page.add(
+            "caption",
+            "Green: the interval lies below zero. Red: above. Grey: it includes zero, or there are"
+            " too few training seeds. In charts, open circles are held out, and stars are ceilings"
+            " on the training condition.",
         )
-        page.section(
-            name,
-            "Change on the same episodes, with 95 % intervals over training seeds. Green: the"
-            " interval lies below zero; red: above; grey: it includes zero, or there are too few"
-            f" training seeds.{marks}",
-        )
-        for title in dict.fromkeys(row.policy for row in rows if drawn):
-            own = [row for row in rows if row.policy == title and row.is_judged]
-            page.add("heading", f"{title} against {own[0].base}")
-            page.add("chart", forest(own))
+        drawn = [row for row in rows if row.is_judged] if results.has_conditions else []
+        for title, own in group_by(drawn, lambda row: row.policy).items():
+            page.add("chart", forest(own), f"{title} against {own[0].base}")
         _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
         page.section(
@@ -188,71 +169,60 @@ def _add_changes(page: Page, results: Results) -> None:
         _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
-def _add_robots(page: Page, results: Results) -> None:
-    """Scores over drawn robots: the middle half, the worst tenth, and how many robots are better
-    off.
-    """
-    if not results.robots:
-        return
-    page.section("Drawn robots", ROBOTS)
-    _add_table(page, robots_table(results.robots), "Table of drawn robots")
-
-
 def _add_table(page: Page, table: Table, title: str = "Table") -> None:
     """A table, folded away under its title where it is long."""
     number = len(table.rows)
-    page.add("table", table, f"{title} ({number} rows)" if number > _LONG else None)
-
-
-def _add_phases(page: Page, results: Results) -> None:
-    for title, columns in results.environment.splits:
-        page.section(title, SCORES)
-        _add_table(page, scores_table(results.table, columns))
+    is_long = number > _LONG
+    page.add("table", table, f"{title} ({number} rows)" if is_long else "", is_folded=is_long)
 
 
 def _add_curves(page: Page, results: Results) -> None:
     """Signals of the first episodes over time, a chart for each motion and scenario."""
     table = results.table
-    seeds = " Of residuals: median over training seeds, band from the least to the most."
-    band = seeds if table.members else ""
-    shade = " Single support is shaded." if table.environment.splits else ""
-    text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
+    text = "The first episode of every cell; a line ends where the episode does."
+    if table.members:
+        text += " Of residuals: median over training seeds, band from the least to the most."
+    if table.environment.splits:
+        text += " Single support is shaded."
     page.section("Curves over time", text)
-    most = min(
-        _POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(table.references) * len(table.scenarios)))
-    )
     traced = [e for e in results.evaluations if e.trace]
     cells = group_by(traced, lambda e: (e.condition.reference_name, e.condition.scenario))
+    shared = _ALL_POINTS // (len(table.references) * len(table.scenarios))
+    most = min(_POINTS, max(_LEAST_POINTS, shared))
     for number, ((reference, scenario), own) in enumerate(cells.items()):
         policies = group_by(own, lambda e: e.condition.policy.title)
         chart = time_chart(policies, table.environment.curves, results.colours, most)
-        title = f"{table.environment.title(reference)}, {scenario}"
-        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
+        title = capital(f"{table.environment.title(reference)}, {scenario}")
+        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
     """Scores over the swept option, or over what the references differ in."""
     known = results.environment
-    charts: list[tuple[str, Cells, str]] = []
+    charts: list[tuple[str, Cells]] = []
+    label = f"{known.quantity} [s]" if results.swept is None else results.swept
     if results.swept is not None:
         for own in cells_together(results.evaluations):
-            title = f"{known.title(own[0].condition.reference_name)}, {own[0].condition.scenario}"
-            charts.append((title, by_option(own), results.swept))
+            first = own[0].condition
+            title = f"{known.title(first.reference_name)}, {first.scenario}"
+            charts.append((title, by_option(own)))
     else:
         for scenario in swept_scenarios(results.evaluations):
             own = [e for e in results.evaluations if e.condition.scenario == scenario]
-            charts.append((f"scenario {scenario}", by_reference(own), f"{known.quantity} [s]"))
+            charts.append((f"scenario {scenario}", by_reference(own)))
     if not charts:
         return
-    page.section(
-        "Sweeps",
+    text = (
         "Means over the episodes that reached the end. A cross on top: all episodes of a policy"
         " failed there; an open one: some did."
-        + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
     )
-    for number, (title, cells, label) in enumerate(charts):
+    if results.table.members:
+        text += " Bands are 95 % intervals over training seeds."
+    page.section("Sweeps", text)
+    for number, (title, cells) in enumerate(charts):
         chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)
-        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
+        title = capital(title)
+        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
 
 
 def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:

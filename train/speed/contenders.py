@@ -16,8 +16,9 @@ from gymnasium.vector import AutoresetMode
 from baselines.compensation.inputs import COMMAND, DEFLECTION, inputs_of
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
-from baselines.residual.settings import ResidualSettings
+from baselines.residual.network import Network
+from baselines.residual.residual_policy import ResidualPolicy
+from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
@@ -283,7 +284,7 @@ class PPOLoop(Contender):
             inner = make_vector_env(
                 _condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP
             )
-            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, {acts_on: None}))
+            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, acts_on={acts_on: None}))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
         self._rollout = max(PPO_DECISIONS // num_envs, 8)
@@ -350,7 +351,7 @@ class _Maker:
             return made
         from baselines.residual_env import ResidualWrapper
 
-        return ResidualWrapper(made, self._policy, {self._acts_on: None})
+        return ResidualWrapper(made, self._policy, acts_on={self._acts_on: None})
 
 
 def _condition(env: str, policy: str | None) -> Condition:
