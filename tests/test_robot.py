@@ -152,6 +152,10 @@ NO_MESH = (
         ({"model": "none.xml"}, r"no model at none.xml; give a file of MJCF"),
         ({"model": 3}, r"model must be a file of MJCF"),
         ({"model": "<mujoco>"}, r"is no XML"),
+        (
+            {"joints": {"*": 1e12}},
+            r"too stiff.*explode with a physics step of 4e-06 s.*less stiffness, or more rotor",
+        ),
         ({"model": NO_HINGE}, r"the model has no hinge.*rotary joints"),
         ({"model": FLOATS}, r"joint 'a' is free or a ball joint; a fixed base"),
         (

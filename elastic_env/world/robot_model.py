@@ -97,6 +97,14 @@ class RobotModel:
             [0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos]
         )
 
+    @property
+    def servo_lag(self) -> Array:
+        """k_v/k_p, the time in which a strongly damped servo comes near its command, (n,) [s]: 0
+        without a servo.
+        """
+        servos = [joint.servo for joint in self.joints.values()]
+        return np.array([0.0 if s is None else s.velocity_gain / s.position_gain for s in servos])
+
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
         """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
 
