@@ -331,7 +331,10 @@ def test_the_commands_play_a_robot_from_its_file(
         environment("no.yaml")
 
 
-@pytest.mark.parametrize(("env", "name"), [("arm.robot.yaml", "robot"), ("own.py:ARM", "arm")])
+@pytest.mark.parametrize(
+    ("env", "name"),
+    [("arm.robot.yaml", "robot"), pytest.param("own.py:ARM", "arm", marks=pytest.mark.slow)],
+)
 def test_a_residual_is_trained_on_a_robot_of_ones_own_and_compared(
     env: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,6 +91,7 @@ def elastic(folder: Path, *arguments: str, **more: str) -> "subprocess.Completed
     )
 
 
+@pytest.mark.slow
 def test_nothing_of_the_working_folder_stands_before_what_is_installed(tmp_path: Path) -> None:
     """Catches workers that import a user's multiprocessing.py, and a baselines.py that breaks
     every command."""

@@ -168,8 +168,9 @@ def _columns(path: Path) -> dict[str, Array]:
 
 
 def _split_unit(text: str) -> tuple[str, str | None]:
-    """A name and the unit in brackets behind it; None where there is none. A regular expression
-    would take minutes for a long text.
+    """A name and the unit in brackets behind it; None where there is none.
+
+    A regular expression would take minutes for a long text.
     """
     if text.endswith("]"):
         first = max(text.rfind("]", 0, -1) + 1, 1)

@@ -103,7 +103,7 @@ class RestWatch:
         )
 
     def _cure(self, joint: int) -> str:
-        """What lets a joint rest: a servo that is damped strongly takes longer with more of it."""
+        """Advice for a joint that does not rest: damping makes a slow servo slower."""
         lag_s = float(self._servo_lag[joint])
         if lag_s < _SLOW_S:
             return "Give the reference a longer settle_s, or joints and servos more damping"

@@ -99,9 +99,7 @@ class RobotModel:
 
     @property
     def servo_lag(self) -> Array:
-        """k_v/k_p, the time in which a strongly damped servo comes near its command, (n,) [s]: 0
-        without a servo.
-        """
+        """k_v/k_p, (n,) [s]: a strongly damped servo takes as long; 0 without one."""
         servos = [joint.servo for joint in self.joints.values()]
         return np.array([0.0 if s is None else s.velocity_gain / s.position_gain for s in servos])
 

@@ -56,9 +56,7 @@ def start(run: Callable[[], None]) -> None:
 
 
 def _leave_working_folder() -> None:
-    """Import nothing from the working folder that is installed, here and in the processes that
-    are started.
-    """
+    """Import nothing from the working folder, here and in the processes that are started."""
     leave(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
