@@ -13,7 +13,7 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format typecheck bench residuals docs clean
+.PHONY: help demo test test-all lint format typecheck bench residuals docs clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
@@ -33,6 +33,9 @@ demo: $(STAMP) ## Testbed and walker end to end: identify the spring, compensate
 # logical: with psutil, which dask brings, "auto" would take one worker for two threads of a core
 test: $(STAMP) ## Run the tests, without network or display
 	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal $(ARGS)
+
+test-all: $(STAMP) ## Run all tests, also the slow ones: real processes, kills, long trainings
+	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal -m "" $(ARGS)
 
 lint: $(STAMP) ## Check style, format and types; changes nothing
 	$(BIN)/ruff check .

@@ -1,5 +1,4 @@
-"""Gymnasium environments of robots with elastic joints: a single-actuator testbed and a humanoid
-walking in place.
+"""Gymnasium environments of robots with elastic joints: testbed, arms, a humanoid that walks.
 
 import gymnasium, elastic_env
 env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=3.0, scenario="nominal")
@@ -50,8 +49,9 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Public names when they are asked for: a process beside the control loop imports this
-    package too.
+    """Public names when they are asked for.
+
+    A process beside the control loop imports this package too.
     """
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -67,8 +67,8 @@ BROKEN = (
     ),
     BrokenFormula(
         _ELASTICITY,
-        "self.velocity_gain * self.speed_limit) / self.integral_gain",
-        "self.velocity_gain) / self.integral_gain",
+        "self.torque_limit + self.velocity_gain * self.speed_limit",
+        "self.torque_limit + self.velocity_gain",
         f"{JOINT} sensors testbed",
     ),
     BrokenFormula(

@@ -16,12 +16,13 @@ import tyro
 from rich.console import Console
 
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
+from elastic_env.core.errors import ConfigurationError, require_known
+from train.commands.cli import CONSOLE, run_program
 from train.commands.compare import CompareConfig, Comparison, compare
+from train.commands.entry import start as start_program
 from train.evaluate.conditions import PolicySpec
 from train.learn.run_training import resume, start
 from train.learn.train_config import TrainConfig
-from train.runs.console import PlainConsole
 from train.runs.folders import CONFIG, RUNS
 from train.workers.executors import Executors
 
@@ -121,14 +122,10 @@ def main(
         output: Folder for the runs; runs that are there are gone on with.
         jobs: Training seeds and cells at the same time, 0 for one per core.
     """
-    try:
-        require_known("residual of the package", names, RESIDUALS)
-        console = PlainConsole()
-        for name in names or RESIDUALS:
-            reproduce(name, output, console, seeds or shipped_seeds(name), Executors(jobs=jobs))
-    except ElasticError as error:
-        raise SystemExit(f"error: {error}") from None
+    require_known("residual of the package", names, RESIDUALS)
+    for name in names or RESIDUALS:
+        reproduce(name, output, CONSOLE, seeds or shipped_seeds(name), Executors(jobs=jobs))
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    start_program(lambda: run_program(lambda: tyro.cli(main)))

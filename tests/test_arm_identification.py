@@ -4,8 +4,10 @@ the truth."""
 import csv
 import json
 import math
+import re
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -419,6 +421,29 @@ def test_command_on_the_example_writes_what_the_compensator_takes(
     rows = list(csv.reader(Path("found/plan.csv").read_text().splitlines()))
     assert len(rows) == 6
     assert rows[0][0] == "theta.base_yaw [rad]"
+
+
+@pytest.mark.parametrize("column", ["theta.a" + " " * 9000 + "x]", "theta.a[" + " " * 9000 + "x"])
+def test_a_column_with_a_long_name_is_read_at_once(column: str) -> None:
+    """Catches a search for the unit that takes a time with the cube of the name."""
+    Path("log.csv").write_text(f"{column},q.a\n0.1,0.1\n")
+    begin = time.process_time()
+    with pytest.raises(ConfigurationError) as error:
+        read_log(Path("log.csv"), {"a": (-1.0, 1.0)}, None)
+    assert time.process_time() - begin < 2.0
+    assert len(str(error.value)) < 700
+
+
+@pytest.mark.parametrize("assumed", ["1e-320", "1e300"])
+def test_a_stiffness_that_no_reader_takes_is_not_assumed(
+    assumed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a joints.yaml that its own readers refuse."""
+    with pytest.raises(SystemExit):
+        run("--log", str(EXAMPLE), "--output", "found", "--assume", assumed)
+    said = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"assume must be a finite number >= 1e-09 and <= 1e\+09 \[N·m/rad\]", said)
+    assert not Path("found").exists()
 
 
 def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> None:

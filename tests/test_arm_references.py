@@ -183,7 +183,11 @@ def errors_at_poses(
     }
 
 
-@pytest.mark.parametrize("model", [ARM, SAGGING], ids=["holding", "sagging, gravcomp, springs"])
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(ARM, marks=pytest.mark.slow), SAGGING],
+    ids=["holding", "sagging, gravcomp, springs"],
+)
 def test_static_poses_are_compensated_to_a_hundredth(model: str) -> None:
     """Catches a servo, a spring or a gravcomp that the compensator does not know, at 50 poses."""
     both = (errors_at_poses(policy, model, 5, 10, "ideal") for policy in ("uncompensated", "input"))

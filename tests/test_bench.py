@@ -110,3 +110,31 @@ def test_the_package_has_its_own_configuration(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(ConfigurationError, match=r"copy .* there first"):
         configuration(Path("configs/bench.yaml"), update=True)
     assert configuration(Path("mine.yaml")) == Path("mine.yaml")
+
+
+@pytest.mark.parametrize("field", ["policy", "env"])
+def test_a_configuration_that_nobody_named_runs_no_code(
+    field: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches `elastic bench` in a folder from elsewhere, which imports what its
+    configs/bench.yaml names."""
+    Path("evil.py").write_text("open('imported', 'w')\nROBOT = None\n")
+    Path("configs").mkdir()
+    written(**{field: "evil.py:ROBOT"}).rename("configs/bench.yaml")
+    with pytest.raises(SystemExit):
+        main(["bench"])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "configs/bench.yaml names 'evil.py:ROBOT', whose code would run" in said
+    assert "then name it: elastic bench configs/bench.yaml" in said
+    assert not Path("imported").exists()
+    with pytest.raises(SystemExit):
+        main(["bench", "configs/bench.yaml"])
+    assert Path("imported").exists()
+
+
+def test_a_configuration_that_nobody_named_is_played_where_it_names_no_code() -> None:
+    """Catches a usual file that is no longer looked for."""
+    Path("configs").mkdir()
+    written(figures={"link_error_rms_rad": 9.0}).rename("configs/bench.yaml")
+    assert not failed([])
+    assert failed([str(written(figures={"link_error_rms_rad": 0.0}))])

@@ -75,6 +75,7 @@ def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone
     assert (tmp_path / "mark").exists()
 
 
+@pytest.mark.slow
 def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> None:
     """Catches calls that are tried for ever, and others that go with it."""
     moved: list[int] = []
@@ -265,7 +266,7 @@ policies: [uncompensated, input, dynamic]
 """
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EROFS, marks=pytest.mark.slow)])
 def test_a_disk_that_takes_no_more_keeps_the_cells_before(
     code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -308,6 +309,7 @@ run_conditions([Condition(policy=PolicySpec(name=name)) for name in ("uncompensa
 """
 
 
+@pytest.mark.slow
 def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
     """Catches an EOFError of a process that says nothing, and tracebacks of the processes."""
     (tmp_path / "script.py").write_text(UNGUARDED)
@@ -322,6 +324,7 @@ def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
     assert 'must do so below if __name__ == "__main__":' in run.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

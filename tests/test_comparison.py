@@ -378,6 +378,18 @@ def test_a_residual_on_a_residual_is_refused() -> None:
         read_description(folder)
 
 
+def test_the_base_of_a_residual_is_no_code() -> None:
+    """Catches a comparison with a residual from elsewhere that imports what its description
+    names."""
+    folder = describe(Path("door"))
+    Path("evil.py").write_text("raise SystemExit('imported')\n")
+    content = json.loads((folder / "residual.json").read_text())
+    for base in ("evil.py:make", "evil:make"):
+        (folder / "residual.json").write_text(json.dumps({**content, "base": base}))
+        with pytest.raises(ConfigurationError, match=f"no residual and no code, got '{base}'"):
+            expand([PolicySpec(name="residual:door")])
+
+
 # Changes and their sentences.
 
 

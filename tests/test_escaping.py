@@ -12,6 +12,7 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,6 +21,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from train.figures import plots
+from train.figures.chart import Chart, Curve, Failing, Panel
 from train.report.page import Page
 from train.report.render import Table as ReportTable
 from train.report.render import to_markdown
@@ -266,6 +269,27 @@ def test_a_chart_shows_a_label_as_it_is(label: str) -> None:
     """Catches a label whose tags a chart would draw."""
     assert "<" not in chart_text(label)
     assert html.unescape(chart_text(label)) == label
+
+
+@pytest.mark.parametrize("label", ["$\\foo{", "a $x^", "_mine", "__", "\x1b[31mred", *NASTY])
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_picture_shows_a_label_as_it_is(label: str, fails: bool, tmp_path: Path) -> None:
+    """Catches a label that Matplotlib takes for a formula, which ends the command with a
+    traceback, and one that it leaves out of the legend."""
+    x = np.linspace(0.0, 1.0, 3)
+    curves = [Curve(label, "#123456", x, x, fails=fails), Curve("", "#123456", x, -x)]
+    failing = [Failing(label, "#123456", [0.5], [True])] if fails else []
+    chart = Chart(label, label, [Panel(label, curves)], failing=failing, failure=label)
+    plt = plots.require_matplotlib()
+    figure, axis = plt.subplots()
+    axis.plot(x, x, label=plots.label_text(label))
+    (shown,) = axis.legend().get_texts()
+    assert shown.get_text().strip() == visible(label).strip()
+    plt.close(figure)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "Glyph .* missing")
+        assert plots.draw_chart(chart, tmp_path / "chart.png").stat().st_size > 1000
 
 
 def page_of(text: str) -> str:

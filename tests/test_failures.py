@@ -220,6 +220,7 @@ def test_a_policy_that_fails_is_named_by_every_command(
     assert "the policy 'mine.py:raises' failed in scenario 'nominal', " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
     """Catches a comparison that loses what has been played because one policy fails."""
     (tmp_path / "mine.py").write_text(POLICIES)

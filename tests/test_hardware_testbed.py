@@ -155,6 +155,7 @@ def test_a_link_that_turns_against_its_motor_stops_the_motion(emulator: RunningE
     assert emulator.state()["torque_on"] == [False]
 
 
+@pytest.mark.slow
 def test_a_testbed_that_is_forgotten_lets_go(emulator: RunningEmulator) -> None:
     """Catches a cell of a notebook that cannot be run a second time: its own kernel has the
     ports."""
@@ -470,7 +471,11 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")]
+    ("number", "words"),
+    [
+        (signal.SIGINT, "interrupted"),
+        pytest.param(signal.SIGTERM, "ended by SIGTERM", marks=pytest.mark.slow),
+    ],
 )
 def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
     emulator: RunningEmulator, tmp_path: Path, number: signal.Signals, words: str

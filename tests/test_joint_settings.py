@@ -367,3 +367,18 @@ def test_joints_that_swing_where_they_are_scored_at_rest_are_named() -> None:
     ) as said:
         sag(restless, "input")
     assert len([one for one in said if "does not rest" in str(one.message)]) == 1
+
+
+def test_a_servo_that_creeps_without_a_weight_is_said_as_such() -> None:
+    """Catches a robot whose model carries its weight, of which a compensator "leaves" 100 %, and
+    the advice of more damping for a servo that has too much."""
+    drive = '<position name="{0}" joint="{0}" kp="10" kv="10"/>'
+    drives = "".join(drive.format(name) for name in TWO)
+    model = ARM.replace("</mujoco>", f"<actuator>{drives}</actuator></mujoco>")
+    model = model.replace('<body name="', '<body gravcomp="1" name="')
+    with pytest.warns(
+        UserWarning,
+        match=r"joint 'j\d' does not rest.*no weight bends the joints, so that nothing is there to "
+        r"compensate.*velocity_gain / position_gain = 1 s.*a settle_s of 8 s, or the servo less",
+    ):
+        sag({"j*": 400}, "input", model=model)

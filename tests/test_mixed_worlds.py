@@ -81,7 +81,7 @@ def some_offsets(steps: int, num_worlds: int) -> Array:
     )
 
 
-@pytest.mark.parametrize("sensors", [[], SENSORS])
+@pytest.mark.parametrize("sensors", [pytest.param([], marks=pytest.mark.slow), SENSORS])
 def test_a_world_is_the_same_beside_worlds_of_other_scenarios(sensors: list[str]) -> None:
     """Catches a scenario that takes its plant, bank, sensors, push or noise from another one, in
     any bit."""
@@ -150,7 +150,13 @@ def cell(policy: str, scenario: str, episodes: int = 2, **changes: Any) -> Condi
 
 
 @pytest.mark.parametrize(
-    "policy", ["adaptive_posture", "link_encoder", "thormang", "residual:walker_3s_offset/seed_0"]
+    "policy",
+    [
+        pytest.param("adaptive_posture", marks=pytest.mark.slow),
+        pytest.param("link_encoder", marks=pytest.mark.slow),
+        pytest.param("thormang", marks=pytest.mark.slow),
+        "residual:walker_3s_offset/seed_0",
+    ],
 )
 def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> None:
     """Catches policies, scores, traces and seeds that depend on the worlds beside."""

@@ -97,6 +97,81 @@ def refusals(model: Any) -> list[str]:
     return said
 
 
+LOST_MESH = '<asset><mesh name="lost" file="nowhere.stl"/></asset>'
+VISUAL = '<geom type="mesh" mesh="lost" mass="0"/>'
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ('<actuator><motor name="m" joint="nobody"/></actuator>', "unknown transmission target"),
+        ('<equality><joint joint1="j2" joint2="j2"/></equality>', "'j2' is repeated in equality"),
+        ('<sensor><jointpos joint="nobody"/></sensor>', "unrecognized name 'nobody'"),
+        (tied("nobody"), "joint 'nobody' not found in tendon"),
+        ('<contact><exclude body1="a" body2="nobody"/></contact>', "'nobody' not found"),
+    ],
+)
+@pytest.mark.parametrize("lost", [True, False])
+def test_an_element_that_refers_to_nothing_is_refused(part: str, message: str, lost: bool) -> None:
+    """Catches a drive or a loop that MuJoCo leaves out of a copy without a word, beside a mesh
+    that is missing and in a specification."""
+    model: Any = mjcf(VISUAL if lost else "", part, head=LOST_MESH if lost else "")
+    if not lost:
+        model = mujoco.MjSpec.from_string(model)
+    first, second = refusals(model)
+    assert first == second
+    assert message in first
+    with pytest.raises(ConfigurationError, match=message):
+        make_elastic(model, {"j2": ElasticJoint(stiffness=400.0, damping=2.0, rotor_inertia=0.05)})
+
+
+SLIDES = mjcf(first='name="j1" type="slide"').replace('name="j2"', 'name="j2" type="slide"')
+SLIDES_AND_A_HINGE = SLIDES.replace('name="j2" type="slide"', "")
+FLOATS = mjcf(first='type="free"').replace('axis="0 1 0"', "", 1)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (SLIDES, "the model has no hinge"),
+        (SLIDES_AND_A_HINGE, "a hinge of the model has no name"),
+        (FLOATS, "free or a ball joint.*Without compensation elastic_env.make_elastic takes it"),
+    ],
+)
+@pytest.mark.parametrize("joints", [{"*": 400.0}, {"nobody": 400.0}, "nowhere.yaml"])
+def test_what_no_joint_of_a_model_can_cure_is_said_first(
+    model: str, message: str, joints: Any
+) -> None:
+    """Catches two readers that name different faults, such as "unknown joint '*'" of a model
+    without hinges."""
+    with pytest.raises(ConfigurationError, match=message) as one:
+        gymnasium.make("elastic_env/Robot-v0", model=model, joints=joints)
+    with pytest.raises(ConfigurationError, match=message) as other:
+        PositionCompensator.from_model(model, joints)
+    assert str(one.value) == str(other.value)
+
+
+LOOPED = mjcf(HAND, LOOP)
+DRIVEN = mjcf(also=tied("j1", "j2") + '<actuator><motor name="m" tendon="cord"/></actuator>')
+BLOWN = mjcf(head='<option wind="9 0 0" density="1.2"/>')
+SPRUNG = mjcf(also=tied("j1", "j2", attributes='stiffness="3"'))
+BALL = FLOATS.replace("free", "ball")
+WEIGHTLESS = mjcf(head='<option><flag gravity="disable"/></option>')
+CURVED = mjcf(first='name="j1" stiffness="3 2"')
+
+
+@pytest.mark.parametrize("model", [FLOATS, BALL, LOOPED, DRIVEN, BLOWN, SPRUNG, WEIGHTLESS, CURVED])
+def test_make_elastic_takes_what_nobody_can_compensate(model: str) -> None:
+    """Catches a list of the docs that is not true: MuJoCo computes what is not known in
+    advance."""
+    for read in (robot, PositionCompensator.from_model):
+        with pytest.raises(ConfigurationError):
+            read(model, {"*": 400.0})
+    joint = ElasticJoint(stiffness=400.0, damping=2.0, rotor_inertia=0.05)
+    elastic = make_elastic(model, {"j2": joint}).compile()
+    assert elastic.joint("j2_motor").id >= 0
+
+
 def torque(model: Any, **options: Any) -> list[float]:
     return PositionCompensator.from_model(model, 400.0, **options).torque([0.5, 0.5]).tolist()
 

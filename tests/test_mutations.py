@@ -30,18 +30,20 @@ from train.learn.train_config import TrainConfig, training_worlds
 from train.runs.kinds import TELLING
 
 ROOT = Path(__file__).parents[1]
-CASES = 2000
 LONGEST_S = 300
 MOST_BYTES = 2 * 10**9
 
 
-def test_mutated_configurations_and_folders_are_taken_or_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cases", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_mutated_configurations_and_folders_are_taken_or_refused(
+    tmp_path: Path, cases: int
+) -> None:
     """Catches a traceback, more than 2 GB, a case that does not end, and a file outside of the
     working folder."""
     limit = (
         f"import resource; resource.setrlimit(resource.RLIMIT_DATA, ({MOST_BYTES}, {MOST_BYTES}))"
     )
-    code = f"{limit}; from tests.mutations import main; raise SystemExit(main(0, {CASES}) > 0)"
+    code = f"{limit}; from tests.mutations import main; raise SystemExit(main(0, {cases}) > 0)"
     (tmp_path / "tmp").mkdir()
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "tmp")}
     played = subprocess.run(

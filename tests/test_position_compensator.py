@@ -527,6 +527,20 @@ def test_a_limit_that_the_weight_exceeds_is_said_once_with_what_is_enough() -> N
     assert found == pytest.approx([0.2, 9.81 / SOFT])
 
 
+def test_a_warning_names_the_line_of_the_users_program() -> None:
+    """Catches a warning that shows a line of ours, where nothing can be mended."""
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
+    stiff = PositionCompensator.from_model(pendulum, 100.0)
+    for call in (
+        lambda: PositionCompensator.from_model(pendulum, math.inf, position_gain=SOFT),
+        lambda: PositionCompensator(pendulum, math.inf, position_gain=SOFT),
+        lambda: stiff.command([1.0], [0.0], [50.0]),
+    ):
+        with pytest.warns(UserWarning, match="limit_rad") as said:
+            call()
+        assert [one.filename for one in said] == [__file__]
+
+
 def test_a_limit_that_a_payload_or_a_motion_exceeds_is_said_when_it_is_met() -> None:
     """Catches a clip that only the payload or an acceleration brings, in silence; and one that
     is said at each call."""

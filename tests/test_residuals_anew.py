@@ -1,5 +1,8 @@
 """Residuals of the package, trained anew and compared with those of the package."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -89,5 +92,19 @@ def test_a_comparison_without_the_residual_is_refused() -> None:
 
 def test_an_unknown_residual_is_refused_before_hours_of_training() -> None:
     """Catches a name that is found out after the others were trained."""
-    with pytest.raises(SystemExit, match="walker_3s_posture"):
+    with pytest.raises(ConfigurationError, match="walker_3s_posture"):
         main(("testbed", "walker_3s_postur"))
+
+
+def test_the_program_speaks_and_ends_as_elastic_does() -> None:
+    """Catches escapes of a terminal in what it says, and a closed pipe that is no exit code."""
+    command = [sys.executable, "-m", "tests.residuals_anew"]
+    refused = subprocess.run([*command, "\x1b[31mred"], capture_output=True, check=False)
+    assert refused.returncode == 2
+    assert b"error: unknown residual of the package" in refused.stderr
+    assert b"\x1b" not in refused.stdout + refused.stderr
+    reading, writing = os.pipe()
+    os.close(reading)
+    unread = subprocess.run([*command, "--help"], stdout=writing, check=False)
+    os.close(writing)
+    assert unread.returncode == 141

@@ -152,6 +152,10 @@ NO_MESH = (
         ({"model": "none.xml"}, r"no model at none.xml; give a file of MJCF"),
         ({"model": 3}, r"model must be a file of MJCF"),
         ({"model": "<mujoco>"}, r"is no XML"),
+        (
+            {"joints": {"*": 1e12}},
+            r"too stiff.*explode with a physics step of 4e-06 s.*less stiffness, or more rotor",
+        ),
         ({"model": NO_HINGE}, r"the model has no hinge.*rotary joints"),
         ({"model": FLOATS}, r"joint 'a' is free or a ball joint; a fixed base"),
         (
@@ -327,7 +331,10 @@ def test_the_commands_play_a_robot_from_its_file(
         environment("no.yaml")
 
 
-@pytest.mark.parametrize(("env", "name"), [("arm.robot.yaml", "robot"), ("own.py:ARM", "arm")])
+@pytest.mark.parametrize(
+    ("env", "name"),
+    [("arm.robot.yaml", "robot"), pytest.param("own.py:ARM", "arm", marks=pytest.mark.slow)],
+)
 def test_a_residual_is_trained_on_a_robot_of_ones_own_and_compared(
     env: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

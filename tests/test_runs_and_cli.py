@@ -899,6 +899,7 @@ def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture
     assert "runs/speed/speed.json" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_speed_of_learning_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a PPO that collects in one place and is timed in another."""
     monkeypatch.setattr(train.speed.contenders, "PPO_DECISIONS", 32)

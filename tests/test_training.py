@@ -125,7 +125,9 @@ def interrupted_after(decisions: int) -> Callable[[int], None]:
     return progress
 
 
-@pytest.mark.parametrize("options", [PPO, SAC], ids=["PPO", "SAC"])
+@pytest.mark.parametrize(
+    "options", [PPO, pytest.param(SAC, marks=pytest.mark.slow)], ids=["PPO", "SAC"]
+)
 def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     options: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -284,6 +286,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
                 Training(config, 1, folder)
 
 
+@pytest.mark.slow
 def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
     code = (
@@ -369,6 +372,7 @@ def test_the_search_finds_the_stiffness_that_is_wrong(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_resumed_search_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     """Catches a search that begins anew, and one that forgets what it was told."""
     config = TrainConfig(**SEARCH)
@@ -601,6 +605,7 @@ def test_train_command_trains_every_seed_and_resumes(
     assert float(row["link_error_rms_rad"]) > 0.0
 
 
+@pytest.mark.slow
 def test_several_configurations_are_trained_in_one_pool(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
-from train.runs.import_path import look_last_in
+from train.runs.import_path import leave, look_last_in
 from train.runs.user_code import named_object
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,6 +91,7 @@ def elastic(folder: Path, *arguments: str, **more: str) -> "subprocess.Completed
     )
 
 
+@pytest.mark.slow
 def test_nothing_of_the_working_folder_stands_before_what_is_installed(tmp_path: Path) -> None:
     """Catches workers that import a user's multiprocessing.py, and a baselines.py that breaks
     every command."""
@@ -102,6 +103,40 @@ def test_nothing_of_the_working_folder_stands_before_what_is_installed(tmp_path:
     run = elastic(tmp_path, "compare", "mine.yaml", "--jobs", "2", COLUMNS="200")
     assert run.returncode == 0, run.stderr
     assert not said.exists(), said.read_text()
+
+
+PLUG_INS = ("pydantic", "gymnasium.envs", "torch.backends", "console_scripts")
+"""Groups of entry points, which packages import when they are imported themselves."""
+
+
+def test_what_calls_itself_a_plug_in_in_the_working_folder_is_not_imported(tmp_path: Path) -> None:
+    """Catches a folder that was unpacked beside the data, and whose "installed" package is
+    imported by pydantic or gymnasium before any file is named."""
+    said = tmp_path / "imported"
+    (tmp_path / "evil.py").write_text(f"open({str(said)!r}, 'a').write('evil')\n")
+    package = tmp_path / "evil-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: evil\nVersion: 1.0\n")
+    entries = "".join(f"[{group}]\nevil = evil:plug_in\n" for group in PLUG_INS)
+    (package / "entry_points.txt").write_text(entries)
+    run = elastic(tmp_path, "evaluate", "--help")
+    assert run.returncode == 0, run.stderr
+    assert not said.exists()
+
+
+def test_the_working_folder_names_no_cache_of_compiled_code(tmp_path: Path) -> None:
+    """Catches a cache in the working folder, which Numba would unpickle."""
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: here\n")
+    code = "import train.commands.entry as e; e._leave_working_folder(); import numba; "
+    run = subprocess.run(
+        [sys.executable, "-c", code + "print([numba.config.CACHE_DIR])"],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout == "['']\n"
 
 
 def test_a_file_that_stands_before_a_package_is_named(tmp_path: Path) -> None:
@@ -124,6 +159,8 @@ def test_the_path_keeps_its_order_but_for_the_working_folder(
     others = [entry for entry in sys.path if entry and Path(entry).resolve() != tmp_path]
     for first in ("", ".", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, *others])
+        leave(tmp_path)
+        assert tmp_path not in map(Path, sys.path)
         look_last_in(tmp_path)
         look_last_in(tmp_path)
         assert sys.path[-1] == str(tmp_path)

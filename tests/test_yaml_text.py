@@ -8,7 +8,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastic_env.core.yaml_text import DEEPEST_NESTING, parse_yaml, yaml_line, yaml_of
+from elastic_env.core.yaml_text import (
+    DEEPEST_NESTING,
+    LARGEST_TEXT,
+    parse_yaml,
+    yaml_line,
+    yaml_of,
+)
 
 LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9)
@@ -115,3 +121,13 @@ def test_names_and_numbers_are_read_as_they_were_written(names: list[str], numbe
     assert parse_yaml("\n".join(["# a head", *lines])) == content
     assert parse_yaml(yaml_of(content)) == content
     assert parse_yaml(yaml_line(names[0], "held", "not in the log")) == {names[0]: "held"}
+
+
+@pytest.mark.parametrize("sign", ["[", "[a, ", "{a: ", "- ", "*[", "[*"])
+def test_a_long_line_is_refused_at_once(sign: str) -> None:
+    """Catches a search for the cure that takes a time with the square of the line."""
+    text = (sign * LARGEST_TEXT)[:LARGEST_TEXT]
+    begin = time.process_time()
+    with pytest.raises(yaml.YAMLError):
+        parse_yaml(text)
+    assert time.process_time() - begin < 2.0

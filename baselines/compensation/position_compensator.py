@@ -10,6 +10,7 @@ it. Damping and friction of the model are not in it. What a motor encoder shows 
 link angle by Eq. 10.
 """
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -44,6 +45,7 @@ from elastic_env.joint.known_torque import (
     hinges_of,
     home_of,
     require_known_torque,
+    require_robot,
 )
 from elastic_env.joint.load_path import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
@@ -126,6 +128,7 @@ class PositionCompensator:
         period_s: float = 0.01,
     ) -> None:
         self._model = model
+        require_robot(model)
         is_free = joints is None
         if joints is None:
             joints = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
@@ -168,6 +171,7 @@ class PositionCompensator:
             UserWarning: See the class; or hinges are taken for rigid.
         """
         compiled = compiled_model(model)
+        require_robot(compiled)
         given: Any = stiffness
         if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
             given = _of_file(compiled, Path(stiffness), options.get("joints"))
@@ -395,7 +399,7 @@ class PositionCompensator:
         """Warn the caller of a public method, unless it was warned about the same before."""
         if about not in self._said:
             self._said.add(about)
-            warnings.warn(text, stacklevel=4)
+            _warn(text)
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
         return (
@@ -440,6 +444,16 @@ class PositionCompensator:
             self._links.set_load(self._carrier, self._load, self._place)
 
 
+def _warn(message: str) -> None:
+    """Warn at the line of the program that called this module."""
+    level = 2
+    frame = sys._getframe(1)
+    while frame is not None and frame.f_code.co_filename == __file__:
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, stacklevel=level)
+
+
 def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
@@ -462,10 +476,9 @@ def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None)
     said = [name for name in left_out if commanded is None or name in commanded]
     if not said or len(left_out) == len(names):
         return mapping
-    warnings.warn(
+    _warn(
         f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}:"
-        f" {HELD} or its stiffness K [N·m/rad] there",
-        stacklevel=4,
+        f" {HELD} or its stiffness K [N·m/rad] there"
     )
     return mapping | dict.fromkeys(said, RIGID)
 
@@ -571,11 +584,10 @@ def _servo_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], g
             unsaid[joint] = gain
     if unsaid:
         listed = ", ".join(f"{name}: {gain:g}" for name, gain in unsaid.items())
-        warnings.warn(
+        _warn(
             "the model has position servos that give way under a load, which is not compensated;"
             f" give position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that"
-            " hold their angle",
-            stacklevel=4,
+            " hold their angle"
         )
     return np.array(gains)
 

@@ -4,7 +4,6 @@ docs/identification.md describes it.
 """
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +33,6 @@ UNITS = {"theta": "rad", "direction": "1", **{name: unit for name, (_, unit) in 
 MOST_POSES = 10_000
 """Rows of a log."""
 
-_HEADER = re.compile(r"^\s*([^\s.\[\]]+)\.(.+?)\s*(?:\[\s*([^\]]*?)\s*\])?\s*$")
 _SPELT = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
 _BEYOND_RAD = 0.5  # homing errors and bent joints may exceed the range of the model by less
 _TURNS_RAD = 4.0 * math.pi  # of joints without a range
@@ -88,7 +86,8 @@ def read_log(
         for joint in names[quantity]:
             if joint not in ranges:
                 raise ConfigurationError(
-                    f"{path}, column {quantity}.{joint}: {unknown_name('joint', joint, ranges)}"
+                    f"{path}, column {quantity}.{quote(joint)[1:-1]}:"
+                    f" {unknown_name('joint', joint, ranges)}"
                 )
     joints = tuple(joint for joint in ranges if joint in names["theta"])
     if not joints:
@@ -173,16 +172,29 @@ def _columns(path: Path) -> dict[str, Array]:
     return dict(zip(names, table.values.T, strict=True))
 
 
+def _split_unit(text: str) -> tuple[str, str | None]:
+    """A name and the unit in brackets behind it; None where there is none.
+
+    A regular expression would take minutes for a long text.
+    """
+    if text.endswith("]"):
+        first = max(text.rfind("]", 0, -1) + 1, 1)
+        at = text.find("[", first)
+        if at > 0:
+            return text[:at].rstrip(), text[at + 1 : -1].strip()
+    return text, None
+
+
 def _name(path: Path, text: str) -> str:
     """A column's name without its unit."""
-    found = _HEADER.match(text)
-    if found is None or found[1] not in UNITS:
+    quantity, _, rest = text.strip().partition(".")
+    of, unit = _split_unit(rest)
+    if quantity not in UNITS or not of or "\n" in of:
         raise ConfigurationError(
             f"{path} has the column {quote(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
             " direction.JOINT, end_effector.x, .y, .z, marker.NAME.x, .y, .z, imu.roll and"
             " imu.pitch"
         )
-    quantity, of, unit = found.groups()
     if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
             f"{path}, column {quantity}.{quote(of)[1:-1]}: the unit must be [{UNITS[quantity]}],"

@@ -160,10 +160,16 @@ def require_plain_base(name: str) -> str:
     """The name of a base policy.
 
     Raises:
-        ValueError: It is itself a residual, which could name another, or itself.
+        ValueError: It is itself a residual, which could name another, or itself; or it is code,
+            which a folder from elsewhere must not run.
     """
     if name.startswith(RESIDUAL):
         raise ValueError(
             f"the base of a residual must be no residual itself, got {name!r}; name a baseline"
+        )
+    if ":" in name:
+        raise ValueError(
+            f"the base of a residual must be no residual and no code, got {quote(name)}; name a "
+            "baseline, as a residual plays without code of its own"
         )
     return name

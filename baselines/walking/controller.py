@@ -91,9 +91,7 @@ class LocalFrame:
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
-    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2)
-    [rad].
-    """
+    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch [rad]."""
     return LocalFrame(*biped.chains.com_and_feet(q, _sole(biped), attitude))
 
 

@@ -113,6 +113,8 @@ def parse_yaml(text: str) -> Any:
         loader.dispose()
 
 
+_NEAR = 200
+"""Characters around an error that are looked at: all of a long line would take minutes."""
 _PATTERN = re.compile(
     r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?"""
 )
@@ -125,8 +127,10 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
-        for found in _PATTERN.finditer(lines[mark.line]):
-            if not found.start() <= mark.column < found.end("key"):
+        begin = max(mark.column - _NEAR, 0)
+        near = lines[mark.line][begin : mark.column + _NEAR]
+        for found in _PATTERN.finditer(near):
+            if not found.start() <= mark.column - begin < found.end("key"):
                 continue
             key = found["key"][:40]
             key = key if "[" in key and "]" in key else key.strip("[]")

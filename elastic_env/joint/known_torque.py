@@ -65,19 +65,15 @@ def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list
         named: Joints that somebody names, which are commanded in any case.
 
     Raises:
-        ConfigurationError: There is no hinge, or one has no name.
+        ConfigurationError: See `require_robot`; or a hinge has no name.
 
     Warns:
         UserWarning: Fingers are held.
     """
-    names = hinges_of(model)
+    require_robot(model)
     if has_nameless_hinge(model):
         raise nameless_hinge()
-    if not names:
-        raise ConfigurationError(
-            "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
-        )
-    return without_fingers(model, names, named)
+    return without_fingers(model, hinges_of(model), named)
 
 
 def without_fingers(
@@ -121,18 +117,27 @@ def home_of(model: mujoco.MjModel) -> Array:
     return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
 
 
-def require_fixed_base(model: mujoco.MjModel) -> None:
-    """Refuse a robot that floats.
+def require_robot(model: mujoco.MjModel) -> None:
+    """Refuse a model of which no joint can be commanded, whatever is said of its joints.
 
     Raises:
-        ConfigurationError: A joint is free or a ball joint.
+        ConfigurationError: It contradicts itself; a joint is free or a ball joint, as of a base
+            that floats; or no hinge has a name.
     """
+    require_sound(model, "the model")
     for j in range(model.njnt):
         if model.jnt_type[j] not in (_HINGE, _SLIDE):
             raise ConfigurationError(
                 f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base, hinges and"
-                " slides are needed: the torque of a floating robot depends on its contacts"
+                " slides are needed: the torque of a floating robot depends on its contacts."
+                " Without compensation elastic_env.make_elastic takes it"
             )
+    if not _hinges(model):
+        raise ConfigurationError(
+            "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
+        )
+    if not hinges_of(model):
+        raise nameless_hinge()
 
 
 def require_few(joints: Collection[str]) -> None:
@@ -156,12 +161,11 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         joints: Hinges that are commanded; all others are held.
 
     Raises:
-        ConfigurationError: A joint does not exist, is no hinge or is named twice; the base floats;
-            or a constraint, a tendon, a drive that is not on a joint, a deformable body, a plugin,
-            wind or a flag acts on the joints.
+        ConfigurationError: See `require_robot`; a joint does not exist, is no hinge or is named
+            twice; or a constraint, a tendon, a drive that is not on a joint, a deformable body, a
+            plugin, wind or a flag acts on the joints.
     """
-    require_sound(model, "the model")
-    require_fixed_base(model)
+    require_robot(model)
     ids = _ids_of(model, joints)
     _require_flags(model)
     for e in _active(model):

@@ -62,6 +62,13 @@ def make_elastic(
     rotor and link each had the inertia D times the physics step more: choose a step for which that
     is small.
 
+    MuJoCo simulates whatever acts on the joints. So this function takes models that `Robot-v0` and
+    `PositionCompensator` refuse, since they have to know every torque in advance: floating bases
+    and ball joints; loops and other equality constraints; tendons that pull; drives by a tendon, a
+    site or a slider-crank; springs that are not linear; deformable bodies, plugins and wind; and
+    flags that turn gravity, springs or actuators off. What they refuse it for is in one place,
+    `elastic_env.joint.known_torque`. Models that contradict themselves nobody takes.
+
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
             `read_model`. It is not changed. Set its physics step before.

@@ -50,6 +50,8 @@ _READABLE = (".stl", ".obj")
 _PACKAGE = "package://"
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
+_REFERRING = ("actuators", "equalities", "sensors", "tendons", "excludes", "pairs", "tuples")
+"""Elements of a specification that refer to others by name."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     if isinstance(model, mujoco.MjSpec):
         given: Any = model
         name = "the specification"
-        return _without_lost_meshes(lambda: from_mujoco(given.copy, name, "copy"), name)
+        return _without_lost_meshes(lambda: _whole_copy(given, name), name)
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
             "a compiled model cannot be made elastic; give its file (.xml, .urdf) or its MjSpec"
@@ -229,7 +231,7 @@ def _of_urdf(text: ModelText, shapes: bool) -> ReadModel:
     bare = copy.deepcopy(text.root)
     keep_shapes(bare, None)
     spec = urdf_spec(bare, text.name)
-    model = compiled_spec(spec.copy(), text.name)
+    model = compiled_spec(_whole_copy(spec, text.name), text.name)
     if not shapes:
         return ReadModel(spec, model, text.name, [])
     named = [mesh.get("filename", "") for mesh in text.root.iter("mesh")]
@@ -300,8 +302,7 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
 def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
     """A specification that compiles, without its meshes and pictures where these prevent it.
 
-    What is compiled is read for that alone: a copy of a specification hides elements whose
-    references are wrong.
+    What is compiled is read for that alone: to compile a specification changes it.
     """
     try:
         model = compiled_spec(read(), name)
@@ -320,13 +321,27 @@ def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadMo
             body.mass = 1.0
             body.inertia = np.ones(3)
             body.explicitinertial = True
-    model = compiled_spec(spec.copy(), name)
+    model = compiled_spec(_whole_copy(spec, name), name)
     if heavy:
         raise ConfigurationError(
             f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give"
             f" the body an <inertial>, or bring the mesh. {problem}"
         )
     return ReadModel(spec, model, name, lost)
+
+
+def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
+    """A copy with all elements: MuJoCo's own leaves out those whose references are wrong.
+
+    Raises:
+        ConfigurationError: An element refers to what the specification does not have.
+    """
+    copied: Any = from_mujoco(spec.copy, name, "copy")
+    for kind in _REFERRING:
+        if len(getattr(copied, kind)) < len(getattr(spec, kind)):
+            from_mujoco(spec.compile, name, "compile")  # which says what is wrong
+            raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")
+    return copied
 
 
 def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:

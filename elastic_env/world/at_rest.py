@@ -14,6 +14,10 @@ An error of 2 % that fades by 1/s moves by as much.
 """
 _SMALLEST_RAD = 1e-5
 """Motion that is worth no word, even where a robot does not sag."""
+_SLOW_S = 0.15
+"""Lag of a servo with which it does not rest within the usual 1.5 s [s]."""
+_LAGS = 8.0
+"""Lags after which a servo is as near as 0.03 % of its way."""
 
 
 class RestWatch:
@@ -26,14 +30,20 @@ class RestWatch:
         static_torque: τ_g that holds the links, from (..., n) [rad] to (..., n) [N·m].
         stiffness: Of spring and servo together, (n,) [N·m/rad].
         joints: Names of the joints.
+        servo_lag: k_v/k_p of their servos, with which a damped one creeps to its command, (n,) [s].
     """
 
     def __init__(
-        self, static_torque: Callable[[Array], Array], stiffness: Array, joints: Sequence[str]
+        self,
+        static_torque: Callable[[Array], Array],
+        stiffness: Array,
+        joints: Sequence[str],
+        servo_lag: Array,
     ) -> None:
         self._static_torque = static_torque
         self._stiffness = stiffness
         self._joints = list(joints)
+        self._servo_lag = servo_lag
         self.is_said = False
         self._window: IntArray = np.empty(0, dtype=np.int64)
         self._least: Array = np.empty(0)
@@ -81,12 +91,23 @@ class RestWatch:
             return
         self.is_said = True
         worst = int(np.argmax(np.where(restless, links, 0.0)))
-        joint = self._joints[int(moved[0, worst].argmax())]
+        joint = int(moved[0, worst].argmax())
+        weight = f"and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad"
+        if sag[worst] < _SMALLEST_RAD:
+            weight = "and no weight bends the joints, so that nothing is there to compensate"
         warnings.warn(
-            f"joint {joint!r} does not rest where it is scored at rest: at position"
+            f"joint {self._joints[joint]!r} does not rest where it is scored at rest: at position"
             f" {window[worst] + 1} its link moves by {1e3 * links[worst]:.3g} mrad while it is"
-            f" measured, and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad. The score"
-            " holds this motion. Give the reference a longer settle_s, or joints and servos more"
-            " damping",
+            f" measured, {weight}. The score holds this motion. {self._cure(joint)}",
             stacklevel=6,
+        )
+
+    def _cure(self, joint: int) -> str:
+        """Advice for a joint that does not rest: damping makes a slow servo slower."""
+        lag_s = float(self._servo_lag[joint])
+        if lag_s < _SLOW_S:
+            return "Give the reference a longer settle_s, or joints and servos more damping"
+        return (
+            f"Its servo takes velocity_gain / position_gain = {lag_s:.2g} s to come near: give the"
+            f" reference a settle_s of {np.ceil(_LAGS * lag_s):g} s, or the servo less damping"
         )

@@ -193,7 +193,10 @@ class JointTask(Task):
         self._joint_names = joints
         self._true_model = plant.true.observed_by(self.observation_table)
         self._rest_watch = RestWatch(
-            plant.static_torque, plant.true.rest_stiffness(config.form), joints
+            plant.static_torque,
+            plant.true.rest_stiffness(config.form),
+            joints,
+            plant.true.servo_lag,
         )
         self._imu = _inertial_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)

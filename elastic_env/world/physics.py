@@ -319,7 +319,7 @@ def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Si
     return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
 
 
-_MOST_SUBSTEPS = 1000
+MOST_SUBSTEPS = 1000
 
 
 def substeps(control_period_s: float, timestep_s: float) -> int:
@@ -330,10 +330,10 @@ def substeps(control_period_s: float, timestep_s: float) -> int:
             of them.
     """
     ratio = control_period_s / timestep_s
-    if ratio > _MOST_SUBSTEPS:
+    if ratio > MOST_SUBSTEPS:
         raise ConfigurationError(
-            f"timestep_s must be at least {control_period_s / _MOST_SUBSTEPS:g} s, a"
-            f" {_MOST_SUBSTEPS}th of the control period, got {timestep_s:g} s"
+            f"timestep_s must be at least {control_period_s / MOST_SUBSTEPS:g} s, a"
+            f" {MOST_SUBSTEPS}th of the control period, got {timestep_s:g} s"
         )
     if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
         raise ConfigurationError(

@@ -97,6 +97,12 @@ class RobotModel:
             [0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos]
         )
 
+    @property
+    def servo_lag(self) -> Array:
+        """k_v/k_p, (n,) [s]: a strongly damped servo takes as long; 0 without one."""
+        servos = [joint.servo for joint in self.joints.values()]
+        return np.array([0.0 if s is None else s.velocity_gain / s.position_gain for s in servos])
+
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
         """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
 

@@ -5,6 +5,7 @@ import hashlib
 import importlib.util
 import json
 from collections.abc import Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,9 @@ def _source(module: str) -> Path | None:
     if not all(part.isidentifier() for part in (package, *parts)):
         return None
     try:
-        # of the outermost package: that of a name with dots would import the packages around it
+        # one name alone: of a name with dots it would import the packages around it
         found = importlib.util.find_spec(package)
+        found = found or PathFinder.find_spec(package, [str(Path.cwd())])
     except (ImportError, ValueError):
         return None
     if found is None:

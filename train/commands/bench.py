@@ -14,6 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from baselines.policies import is_saved
 from elastic_env.core.config import (
     LARGEST_SEED,
     MOST_ENTRIES,
@@ -33,6 +34,7 @@ from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
+from train.runs.user_code import load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
@@ -82,9 +84,9 @@ class Bench(Model):
     $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench --update
     """
 
-    config: Annotated[Path, tyro.conf.Positional] = USUAL
-    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml,
-    that of the package.
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """Configuration with rollouts and accepted figures. Without one configs/bench.yaml, whose code
+    does not run unless it is named; where that does not exist, the configuration of the package.
     """
     update: bool = False
     """Accept what is measured now: the figures in the configuration change, and nothing else of
@@ -95,8 +97,12 @@ class Bench(Model):
 
     def run(self, console: Console) -> None:
         """Play the rollouts, and write and print their figures."""
-        path = configuration(self.config, self.update)
-        config = load_yaml(path, BenchConfig)
+        path = configuration(self.config or USUAL, self.update)
+        if self.config is None:  # it was found, and nobody named it
+            cure = f"name it: elastic bench {path}"
+            config = load_without_code(path, BenchConfig, _names_of_code, cure)
+        else:
+            config = load_yaml(path, BenchConfig)
         with run_folder(config.name, config.model_dump(mode="json"), None, self.output) as folder:
             evaluations = run_conditions([case.condition for case in config.cases], console)
             figures = [
@@ -122,6 +128,12 @@ class Bench(Model):
             console.print(f"{one['case']}: {one['problem']}")
         if short:
             sys.exit(1)
+
+
+def _names_of_code(config: BenchConfig) -> list[str]:
+    """Names that may stand for code."""
+    policies = [case.policy for case in config.cases if not is_saved(case.policy)]
+    return [*policies, *(case.env for case in config.cases)]
 
 
 def configuration(path: Path, update: bool = False) -> Path:

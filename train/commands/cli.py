@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ import elastic_env
 from elastic_env.core.errors import shorten
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explain
-from train.runs.import_path import look_last_in
+from train.runs.import_path import leave
 from train.runs.progress import say_what_is_compiled
 
 COMMANDS = (
@@ -155,13 +155,27 @@ def _help_of(name: str) -> str | None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the command `elastic`."""
+    """The command `elastic`."""
+
+    def work() -> None:
+        command = parse(sys.argv[1:] if arguments is None else arguments)
+        with say_what_is_compiled(CONSOLE), visible_warnings():
+            command.run(CONSOLE)
+
+    run_program(work)
+
+
+def run_program(work: Callable[[], None]) -> None:
+    """Do the work of a program; say what fails, and end the program with its exit code.
+
+    Raises:
+        SystemExit: Something failed, and it was said.
+        BrokenPipeError: Nobody reads what the program says.
+    """
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            look_last_in(Path.cwd())  # for --policy module:function
-            command = parse(sys.argv[1:] if arguments is None else arguments)
-            with say_what_is_compiled(CONSOLE), visible_warnings():
-                command.run(CONSOLE)
+            leave(Path.cwd())
+            work()
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:

@@ -44,7 +44,7 @@ from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
-from train.runs.user_code import refuse_code, require_no_code
+from train.runs.user_code import TRUST, load_without_code
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -345,11 +345,13 @@ def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
     file = require_run(folder, "run", "compare wrote")
     if trust_code:
         return load_yaml(file, CompareConfig)
-    with refuse_code(file):
-        config = load_yaml(file, CompareConfig)
+    return load_without_code(file, CompareConfig, _names_of_code, TRUST)
+
+
+def _names_of_code(config: CompareConfig) -> list[str]:
+    """Names that may stand for code."""
     policies = [policy.name for policy in config.policies if not is_saved(policy.name)]
-    require_no_code(file, [config.env, *policies])
-    return config
+    return [config.env, *policies]
 
 
 @contextmanager

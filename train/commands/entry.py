@@ -1,26 +1,40 @@
-"""The command `elastic` around its modules: interrupts while they load, and closed output."""
+"""A program around its modules: what ends it while they load, and output that nobody takes."""
 
 import contextlib
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from train.runs.escaping import visible
 from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explain, is_interrupt, is_unread
-from train.runs.import_path import ShadowedError, look_last_in, safe_children
+from train.runs.import_path import ShadowedError, leave, safe_children
 
 _UNREAD = 128 + signal.SIGPIPE
 
 
 def main() -> None:
     """Entry point of the command `elastic`."""
+
+    def run() -> None:
+        from train.commands.cli import main as elastic
+
+        elastic()
+
+    start(run)
+
+
+def start(run: Callable[[], None]) -> None:
+    """Run a program, which ends with exit code 141 where nobody reads what it says.
+
+    Args:
+        run: The program. What it imports itself does not come from the working folder.
+    """
     _have_streams()
     try:
         try:
             _leave_working_folder()  # before anything else is imported
-            from train.commands.cli import main as run
-
             with safe_children():
                 run()
         finally:
@@ -42,14 +56,16 @@ def main() -> None:
 
 
 def _leave_working_folder() -> None:
-    """Import what is installed before files of the working folder, also in started processes."""
-    look_last_in(Path.cwd())
+    """Import nothing from the working folder, here and in the processes that are started."""
+    leave(Path.cwd())
     from elastic_env.hardware.safety.processes import child_environment
 
     kept = child_environment()
     if "PYTHONPATH" not in kept:
         os.environ.pop("PYTHONPATH", None)
     os.environ.update(kept)
+    # else Numba's configuration in the working folder could name a cache, and Numba unpickles it
+    os.environ.setdefault("NUMBA_CACHE_DIR", "")
 
 
 def _have_streams() -> None:

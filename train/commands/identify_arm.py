@@ -43,6 +43,7 @@ from baselines.identification.pose_plan import (
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.joint.joint_settings import SOFTEST
 from elastic_env.joint.known_torque import commanded_hinges, hinges_of
 from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
 from train.commands.identify_geometry import GeometryOptions, identify_geometry
@@ -54,6 +55,8 @@ from train.runs.progress import show_progress
 
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
+_STIFFEST = 1e9
+"""Largest K that can be assumed; a stiffer joint is rigid [N·m/rad]."""
 
 
 class ArmOptions(Model):
@@ -88,7 +91,7 @@ class ArmOptions(Model):
     """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this
     share.
     """
-    assume: float | None = quantity("N·m/rad", None, gt=0)
+    assume: float | None = quantity("N·m/rad", None, ge=SOFTEST, le=_STIFFEST)
     """K [N·m/rad] to write for joints whose interval reaches to rigid; default each joint's own
     estimate, or rigid.
     """

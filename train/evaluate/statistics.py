@@ -88,9 +88,8 @@ def change(mine: Array, base: Array) -> Array:
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
     """Mean of what is left without the lowest and the highest quarter, rounded down in number."""
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    # here: it takes half a second to load, and most programs need none of it
+    from scipy import stats
 
     return stats.trim_mean(values, _CUT, axis=axis)
 
@@ -158,9 +157,8 @@ def improvement(won: Array, played: Array) -> Estimate:
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
     """Percentile bootstrap over training seeds; the same sorted samples give the same interval."""
-    from scipy import (
-        stats,
-    )  # here: it takes half a second to load, and most programs need none of it
+    # here: it takes half a second to load, and most programs need none of it
+    from scipy import stats
 
     found = stats.bootstrap(
         samples,

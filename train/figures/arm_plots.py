@@ -9,7 +9,7 @@ from baselines.identification.arm_fit import ArmFit
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.pose_model import measurement_unit
 from elastic_env.core.signals import Array
-from train.figures.plots import MRAD, require_matplotlib, save
+from train.figures.plots import MRAD, label_text, require_matplotlib, save
 
 _COLUMNS = 4
 _LEAST_LEVER = 0.1  # of the largest: poses that show a joint less are left out of its panel
@@ -73,7 +73,7 @@ def _draw_residuals(axis: Any, fit: ArmFit) -> None:
     factor, shown = (1.0, unit) if unit == "N·m" else (1e3, f"m{unit}")
     poses = np.arange(1, len(fit.residual) + 1)
     for column, name in zip(fit.residual.T, _names(fit), strict=True):
-        axis.plot(poses, factor * column, ".", ms=4, label=name)
+        axis.plot(poses, factor * column, ".", ms=4, label=label_text(name))
     axis.axhline(0.0, color=_LINE, lw=0.8)
     spread = f"spread {factor * fit.spread:.3g} {shown}"
     axis.set_title(f"residual [{shown}] by pose\n{spread}", fontsize=9)

@@ -13,6 +13,7 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
+from train.runs.escaping import visible
 
 MRAD = 1e3
 """Factor from rad to what figures show."""
@@ -44,9 +45,17 @@ def require_matplotlib() -> Any:
             "axes.titlesize": 11,
             "axes.titleweight": "bold",
             "axes.titlelocation": "left",
+            "text.parse_math": False,  # a label of the user's is no formula
+            "text.usetex": False,
         }
     )
     return plt
+
+
+def label_text(name: str) -> str:
+    """A text of the user's as a label, which Matplotlib leaves out if it begins with "_"."""
+    shown = visible(name)
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def columns_of(entries: int, widest: int = 5) -> int:
@@ -57,6 +66,8 @@ def columns_of(entries: int, widest: int = 5) -> int:
 
 def save(figure: Any, path: Path) -> Path:
     """Write a figure and forget it."""
+    for text in figure.findobj(lambda part: hasattr(part, "set_text")):
+        text.set_text(visible(text.get_text()))
     content = io.BytesIO()
     figure.savefig(content, format=path.suffix[1:], bbox_inches="tight")
     write_whole(path, content.getvalue())
@@ -120,7 +131,7 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
     style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
     marker = {"marker": "o", "ms": 4} if curve.has_points else {}
-    name = curve.name or "_"  # without a name Matplotlib has it in no legend
+    name = label_text(curve.name) or "_"  # without a name Matplotlib has it in no legend
     axis.plot(curve.x, curve.y, color=curve.colour, lw=curve.width, ls=style, label=name, **marker)
     if curve.band is not None:
         axis.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.18, lw=0)
@@ -137,7 +148,7 @@ def _draw_failing(axis: Any, chart: Chart) -> None:
         faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
         style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": policy.colour}
         axis.scatter(policy.x, np.full(len(policy.x), row), lw=1.0, **style)
-    names = [policy.name for policy in reversed(chart.failing)]
+    names = [label_text(policy.name) for policy in reversed(chart.failing)]
     axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.set_ylim(-0.7, len(chart.failing) - 0.3)
     axis.set_ylabel(chart.failure)
@@ -195,7 +206,9 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     if is_one_scenario and known.quantity:
         axes[-1][0].set_xlabel(known.quantity)
     bar = axes.flat[0].bar
-    handles = [bar(np.nan, 0.0, color=shade, label=title) for title, shade in shades.items()]
+    labels = [label_text(title) for title in shades]
+    bars = zip(shades.values(), labels, strict=True)
+    handles = [bar(np.nan, 0.0, color=shade, label=label) for shade, label in bars]
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
         handles.append(axes.flat[0].scatter([], [], **cross))
@@ -234,6 +247,6 @@ def _draw_bars(
                 axis.scatter(x, 0.035, color=colour, transform=bottom, **cross)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
-    axis.set_xticks(range(len(groups)), list(groups), **slanted)
+    axis.set_xticks(range(len(groups)), [label_text(name) for name in groups], **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)

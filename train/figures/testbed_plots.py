@@ -15,7 +15,7 @@ from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.evaluate.episodes import Evaluation
 from train.figures.colours import policy_colours
-from train.figures.plots import MRAD, require_matplotlib, save
+from train.figures.plots import MRAD, label_text, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
@@ -87,7 +87,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
         style |= {"marker": "xosDv^"[index % 6], "s": 34, "linewidths": 1.3, "zorder": 3}
         low = error.min()
         high = error.max()
-        label = f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
+        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
         torque = link_torque(points, gravity, points.q)
         axis.scatter(torque, error, label=label, **style)
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)

@@ -19,7 +19,7 @@ from train.learn.trainer import Trainer
 from train.runs.console import make_table
 from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
-from train.runs.user_code import refuse_code, require_no_code
+from train.runs.user_code import TRUST, load_without_code
 from train.workers.calls import Outcome, Watch, run_calls
 from train.workers.executors import Executors
 
@@ -109,10 +109,12 @@ def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     file = require_run(folder, "training run", "train printed")
     if trust_code:
         return load_yaml(file, TrainConfig)
-    with refuse_code(file):
-        config = load_yaml(file, TrainConfig)
-    require_no_code(file, [config.algorithm, config.env, config.base])
-    return config
+    return load_without_code(file, TrainConfig, _names_of_code, TRUST)
+
+
+def _names_of_code(config: TrainConfig) -> list[str]:
+    """Names that may stand for code; that of the base never does."""
+    return [config.algorithm, config.env]
 
 
 def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:

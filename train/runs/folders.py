@@ -211,6 +211,9 @@ def _removed_without_result(folder: Path) -> Iterator[None]:
             for file in files:
                 file.unlink()
             folder.rmdir()
+            if folder.parent == RUNS:
+                with contextlib.suppress(OSError):  # it holds other runs
+                    RUNS.rmdir()
         raise
 
 

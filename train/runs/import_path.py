@@ -1,8 +1,9 @@
-"""The path of imports: what is installed comes first, in the working folder last.
+"""The path of imports: what is installed, and the working folder last where a name asks for it.
 
 Python puts the working folder, or a script's own, first: a user's `train.py` would then stand
 before our package, and a `multiprocessing.py` before the standard library, also in each process
-that is started.
+that is started. Behind everything else, it would still be searched for plug-ins of installed
+packages, whose code would run.
 """
 
 import importlib.util
@@ -21,8 +22,8 @@ class ShadowedError(ImportError):
     """A file of the user stands before one of our packages."""
 
 
-def look_last_in(folder: Path) -> None:
-    """Look for modules in a folder behind everything else, where it stands first too.
+def leave(folder: Path) -> None:
+    """Look for no modules in a folder.
 
     Args:
         folder: The working folder.
@@ -32,9 +33,20 @@ def look_last_in(folder: Path) -> None:
     """
     here = os.path.realpath(folder)
     others = [entry for entry in sys.path if os.path.realpath(entry or ".") != here]
-    root = str(_ROOT)  # before the folder: an editable installation is found behind the whole path
-    sys.path[:] = [*others, *([] if root in others or root == here else [root]), str(folder)]
+    root = str(_ROOT)  # an editable installation is found behind the whole path
+    sys.path[:] = others if root in others else [*others, root]
     _require_ours()
+
+
+def look_last_in(folder: Path) -> None:
+    """Look for modules in a folder too, behind everything else, unless it is on the path.
+
+    Args:
+        folder: The working folder, from which the user names a module.
+    """
+    here = os.path.realpath(folder)
+    if all(os.path.realpath(entry or ".") != here for entry in sys.path):
+        sys.path.append(str(folder))
 
 
 def _require_ours() -> None:

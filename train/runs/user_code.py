@@ -1,8 +1,8 @@
 """Code of the user that a name stands for: "module:function", or "FILE.py:function".
 
 Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual
-folder runs code. A configuration that was found in the folder of a run, rather than named by the
-user, is read within `refuse_code`: all imports go through `named_object`, which then imports
+folder runs code. A configuration that was found, as in the folder of a run, and not named by the
+user, is read by `load_without_code`: all imports go through `named_object`, which then imports
 nothing.
 """
 
@@ -10,49 +10,62 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
+from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, quote, shorten
+from train.runs.import_path import look_last_in
 
+_Config = TypeVar("_Config", bound=Model)
 _FILES = "elastic_user_file_"
-_REFUSED_IN: ContextVar[Path | None] = ContextVar("refused_in", default=None)
+_REFUSED_IN: ContextVar["_Untrusted | None"] = ContextVar("refused_in", default=None)
+TRUST = "say --trust-code, or name a configuration of yours"
+"""What the user can do who trusts the folder of a run."""
 
 
-@contextmanager
-def refuse_code(file: Path) -> Iterator[None]:
-    """Refuse to import within what names stand for.
+@dataclass(frozen=True)
+class _Untrusted:
+    """A file whose names must not run code, and what the user can do to let them."""
+
+    file: Path
+    cure: str
+
+    def error(self, name: str) -> ConfigurationError:
+        """The error for a name of the file that stands for code."""
+        return ConfigurationError(
+            f"{self.file} names {quote(name)}, whose code would run; look at it, then {self.cure}"
+        )
+
+
+def load_without_code(
+    file: Path, kind: type[_Config], names: Callable[[_Config], Iterable[str]], cure: str
+) -> _Config:
+    """A configuration that was found and not named by the user; nothing that it names is imported.
 
     Args:
-        file: Where the names come from.
-    """
-    before = _REFUSED_IN.set(file)
-    try:
-        yield
-    finally:
-        _REFUSED_IN.reset(before)
-
-
-def require_no_code(file: Path, names: Iterable[str]) -> None:
-    """Refuse names that stand for code; arguments as `refuse_code`, and the names.
+        file: Where it was found.
+        kind: Of the configuration.
+        names: Its names that may stand for code.
+        cure: What the user can do who trusts it, in words.
 
     Raises:
-        ConfigurationError: One of them does.
+        ConfigurationError: It is no such configuration, or names code.
     """
-    for name in names:
+    found = _Untrusted(file, cure)
+    before = _REFUSED_IN.set(found)
+    try:
+        config = load_yaml(file, kind)
+    finally:
+        _REFUSED_IN.reset(before)
+    for name in names(config):
         if ":" in name:
-            raise _trust_error(file, name)
-
-
-def _trust_error(file: Path, name: str) -> ConfigurationError:
-    return ConfigurationError(
-        f"{file} names {quote(name)}, whose code would run; look at it, then say --trust-code, or"
-        " name a configuration of yours"
-    )
+            raise found.error(name)
+    return config
 
 
 def named_object(name: str) -> Any:
@@ -66,9 +79,10 @@ def named_object(name: str) -> Any:
         ConfigurationError: There is no such module, file or attribute, or it fails while it is
             imported; or code is refused here, and nothing was imported.
     """
-    if (file := _REFUSED_IN.get()) is not None:
-        raise _trust_error(file, name)
+    if (untrusted := _REFUSED_IN.get()) is not None:
+        raise untrusted.error(name)
     place, _, attribute = name.rpartition(":")
+    look_last_in(Path.cwd())
     try:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
     except (Exception, SystemExit) as error:

@@ -19,7 +19,7 @@ from elastic_env.joint.known_torque import (
     has_nameless_hinge,
     hinges_of,
     nameless_hinge,
-    require_fixed_base,
+    require_robot,
     without_fingers,
 )
 from elastic_env.joint.model_file import GivenModel, compiled_spec
@@ -34,6 +34,7 @@ from elastic_env.robots.robot.model import RigidModel, read_robot
 from elastic_env.world.drawn_robot import stiffest_plant
 from elastic_env.world.joint_config import RewardWeights
 from elastic_env.world.joint_task import JointTask
+from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
@@ -114,10 +115,23 @@ def configure_robot(
             compiled_spec(robot.elastic(settings), "the model with elastic joints"),
             settings.scenario,
         )
-        settings = settings.replace(timestep_s=stable_timestep(played, settings.control_period_s))
+        timestep_s = stable_timestep(played, settings.control_period_s)
+        _require_step(timestep_s, settings.control_period_s)
+        settings = settings.replace(timestep_s=timestep_s)
     return RobotConfig(
         robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields}
     )
+
+
+def _require_step(timestep_s: float, control_period_s: float) -> None:
+    """Refuse joints that only a physics step follows which is too short to be played."""
+    shortest_s = control_period_s / MOST_SUBSTEPS
+    if timestep_s < shortest_s:
+        raise ConfigurationError(
+            "the joints are too stiff, or their links or rotors too light: they explode with a"
+            f" physics step of {shortest_s:g} s, the shortest that is played; give them less"
+            " stiffness, or more rotor_inertia"
+        )
 
 
 def joint_robot(
@@ -126,7 +140,7 @@ def joint_robot(
     """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
-    require_fixed_base(whole)
+    require_robot(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
     moving = hold_other_joints(spec, settings)
@@ -150,8 +164,6 @@ def joint_robot(
 def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
     hinges = hinges_of(model)
-    if has_nameless_hinge(model) and not hinges:
-        raise nameless_hinge()
     given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
     others = [name for j in range(model.njnt) if (name := model.joint(j).name) not in hinges]
     settings = elastic_settings(given, hinges, others)

@@ -74,10 +74,6 @@ def elastic_settings(
         ConfigurationError: As of `read_joints`; no joint is elastic; or a rigid joint has a servo
             that gives way.
     """
-    if not hinges:
-        raise ConfigurationError(
-            "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
-        )
     found: dict[str, JointSettings] = {}
     for name, own in read_joints(given, hinges, others).items():
         if own is None:
