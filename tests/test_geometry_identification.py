@@ -164,7 +164,7 @@ def made_up(
 def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, object]) -> None:
     """Of 95 % in at least 90 %: catches a wrong covariance, and a noise that is not estimated."""
     held = []
-    for seed in range(12):
+    for seed in range(6):
         problem, truth = made_up(geometry, seed, count=30, noise_m=5e-4, **options)
         fit = fit_geometry(problem)
         assert fit.noise_m == pytest.approx(5e-4, rel=0.25)

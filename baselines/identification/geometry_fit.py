@@ -25,7 +25,7 @@ from elastic_env.core.signals import Array, IntArray
 _MOST_EVALUATIONS = 400
 _LOST_M = 10.0
 """Error of a marker that counts where there is no posture at rest [m]."""
-_SETTLED = 1e-8
+_SETTLED = 1e-6
 """Relative change of the sum of squares below which it is least."""
 _FIRST_NOISE_M = 3e-3
 _NOISE_ROUNDS = 3
@@ -35,7 +35,7 @@ _TOLD = 0.9
 _FEWEST_POSES = 2
 _NOTHING = 1e-9
 """Prior of what counts as known."""
-_SMALLEST_MOMENT = 1e-3
+_SMALLEST_MOMENT = 0.05
 """Share of the largest moment in the arm that a joint is taken to carry at least."""
 QUANTILE = 1.96
 """Half-width of a 95 % interval in standard deviations."""
@@ -328,8 +328,7 @@ def _least(problem: GeometryProblem, x: Array, noise: float) -> Array:
         residual,
         x / prior,
         jac=jacobian,  # pyright: ignore[reportArgumentType]  a callable is meant to be here
-        method="lm",
-        x_scale="jac",
+        method="trf",  # its regions of trust are in units of the priors
         ftol=_SETTLED,
         max_nfev=_MOST_EVALUATIONS,
     )
