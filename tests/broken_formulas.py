@@ -82,7 +82,7 @@ BROKEN = (
         f"{JOINT} {COMPENSATION}",
     ),
     BrokenFormula(
-        "elastic_env/joint/load_path.py",
+        "elastic_env/joint/load_continuation.py",
         "q - self.theta + C * self.torque(q)",
         "q - self.theta - C * self.torque(q)",
         f"{JOINT} {COMPENSATION}",

@@ -26,7 +26,7 @@ from elastic_env.core.yaml_text import parse_yaml
 from train.commands.bench import BenchConfig
 from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.families import expand, origin
+from train.evaluate.residual_seeds import expand, origin
 from train.learn.train_config import TrainConfig, training_worlds
 
 ROOT = Path(__file__).parents[1]

@@ -37,8 +37,8 @@ from train.evaluate.changes import (
 )
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.families import expand
 from train.evaluate.progress import learning_curves
+from train.evaluate.residual_seeds import expand
 from train.evaluate.statistics import (
     Estimate,
     change,
@@ -51,8 +51,8 @@ from train.evaluate.table import EpisodeTable, score
 from train.figures.comparison_figures import has_swept_references
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
-from train.report.render import to_terminal
 from train.report.report_text import Results
+from train.report.table_formats import to_terminal
 from train.report.write import require_libraries, require_plotly, write_report
 from train.runs.folders import run_folder
 

@@ -24,9 +24,9 @@ from rich.text import Text
 from train.figures import plots
 from train.figures.chart import Chart, Curve, Failing, Panel
 from train.report.page import Page
-from train.report.render import Table as ReportTable
-from train.report.render import to_markdown
 from train.report.specs import PageChart
+from train.report.table_formats import Table as ReportTable
+from train.report.table_formats import to_markdown
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.escaping import (
     chart_text,

@@ -307,3 +307,34 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     assert held_out.held_out == 40
     assert held_out.is_ahead
     assert [point.poses for point in held_out.curve] == [15, 30]
+
+
+@pytest.mark.parametrize(
+    "option", ["--plan 20", "--payload hand", "--assume 900", "--end-effector hand"]
+)
+def test_an_option_without_use_is_refused(
+    geometry: GeometryModel, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    """Catches an option that is dropped without a word."""
+    problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
+    model = tmp_path / "arm.xml"
+    model.write_text(ARM)
+    log = log_of(tmp_path, problem)
+    with pytest.raises(SystemExit):
+        main(["identify", "--robot", str(model), "--log", str(log), *option.split()])
+    assert f"{option.split()[0]} is not for a fit of the geometry" in capsys.readouterr().err
+
+
+def test_millimetres_are_named(geometry: GeometryModel) -> None:
+    """Catches a fit that takes them for metres, and gives up after minutes."""
+    problem, _ = made_up(geometry, 7, count=20, noise_m=3e-4)
+    with pytest.raises(ConfigurationError, match="convert millimetres to metres"):
+        align_tracker(geometry, problem.theta, 1e3 * problem.measured)
+
+
+def test_a_joint_that_gravity_does_not_load_is_rigid(geometry: GeometryModel) -> None:
+    """The first axis is vertical: catches a K of chance in joints.yaml."""
+    problem, _ = made_up(geometry, 1, count=40, noise_m=5e-4, geometry="dh")
+    joints = {one.joint: one for one in describe_geometry(fit_geometry(problem), None).joints}
+    assert np.isinf(joints["pan"].stiffness_nm_per_rad)
+    assert np.isfinite(joints["lift"].stiffness_nm_per_rad)

@@ -18,8 +18,8 @@ import elastic_env  # noqa: F401  registers the environment
 from baselines import PositionCompensator
 from elastic_env import ElasticJoint, make_elastic
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.joint.known_torque import coupled_fingers
 from elastic_env.joint.model_file import compiled_model, read_model
+from elastic_env.joint.supported_models import coupled_fingers
 from train.commands.robot import Robot, robot_arguments, write_robot
 
 INERTIAL = (

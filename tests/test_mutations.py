@@ -24,7 +24,7 @@ from train.commands.bench import BenchConfig
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.families import expand
+from train.evaluate.residual_seeds import expand
 from train.evaluate.rollout import make_policy
 from train.learn.train_config import TrainConfig, training_worlds
 from train.runs.kinds import TELLING

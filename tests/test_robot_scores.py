@@ -21,7 +21,7 @@ from train.commands.compare import CompareConfig
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
-from train.evaluate.families import Origin
+from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, worst_share_mean

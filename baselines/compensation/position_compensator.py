@@ -40,16 +40,16 @@ from elastic_env.joint.joint_settings import (
     key_of,
     read_joints,
 )
-from elastic_env.joint.known_torque import (
+from elastic_env.joint.load_continuation import follow_load
+from elastic_env.joint.model_file import GivenModel, compiled_model
+from elastic_env.joint.model_servo import position_servo
+from elastic_env.joint.supported_models import (
     commanded_hinges,
     hinges_of,
     home_of,
     require_known_torque,
     require_robot,
 )
-from elastic_env.joint.load_path import follow_load
-from elastic_env.joint.model_file import GivenModel, compiled_model
-from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.rigid.rigid_body import RigidBody
 

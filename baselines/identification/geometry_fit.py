@@ -30,9 +30,11 @@ _SETTLED = 1e-6
 _FIRST_NOISE_M = 3e-3
 _NOISE_ROUNDS = 3
 _FINEST_M = 1e-5
-_TOLD = 0.9
+_TOLD = 0.5
 """Share of its prior's deviation above which the poses do not tell a parameter."""
 _FEWEST_POSES = 2
+_UNLIKE = 3.0
+"""Ratio of how far markers spread, measured and of the model."""
 _NOTHING = 1e-9
 """Prior of what counts as known."""
 _SMALLEST_MOMENT = 0.05
@@ -347,8 +349,17 @@ def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> Geomet
         model: The markers.
         theta: Motor encoders, (N, n) [rad].
         measured: Places of the markers, (N, k, 3) [m].
+
+    Raises:
+        ConfigurationError: They spread far more or less than those of the model.
     """
     own = model.measured(model.nominal_parameters(), theta).reshape(-1, 3)
     shown = measured.reshape(-1, 3)
+    own_m, shown_m = (float(np.std(points, axis=0).max()) for points in (own, shown))
+    if not own_m / _UNLIKE < shown_m < own_m * _UNLIKE:
+        raise ConfigurationError(
+            f"the markers spread over {shown_m:.3g} m, those of the model over {own_m:.3g} m:"
+            " convert millimetres to metres, or name the bodies that were measured"
+        )
     R = Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[0].as_matrix()
     return replace(model, alignment=R, origin=shown.mean(axis=0) - R @ own.mean(axis=0))

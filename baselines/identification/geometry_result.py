@@ -58,6 +58,8 @@ class GeometryIdentification(Model):
     """Result of an identification with geometry; written as `identification.json`."""
 
     poses: int
+    numbers: int
+    """Measured coordinates: three for each marker of a pose."""
     geometry: Geometry
     lateral: bool
     noise_mm: float
@@ -102,6 +104,7 @@ def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIde
     told = {estimate.name: estimate for estimate in fit.estimates if estimate.kind == "compliance"}
     return GeometryIdentification(
         poses=len(problem.theta),
+        numbers=problem.measured.size,
         geometry=problem.geometry,
         lateral=problem.lateral,
         noise_mm=1e3 * fit.noise_m,
@@ -158,8 +161,8 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
 
 
 def _joint(joint: str, estimate: Estimate | None) -> JointCompliance:
-    """Stiffness by a compliance; rigid where it is not sought or not above zero."""
-    if estimate is None or estimate.value <= 0.0:
+    """Stiffness by a compliance; rigid where it is not sought, not told, or not above zero."""
+    if estimate is None or estimate.value <= 0.0 or not estimate.is_told:
         return JointCompliance(
             joint=joint,
             stiffness_nm_per_rad=math.inf,

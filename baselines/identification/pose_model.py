@@ -25,7 +25,7 @@ from baselines.identification.pose_log import Kind, PoseLog
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.joint.load_path import follow_load
+from elastic_env.joint.load_continuation import follow_load
 
 Frame = Literal["known", "offset", "pose"]
 """Knowledge of the measurement's frame: all, its directions, or nothing."""

@@ -15,7 +15,7 @@ import yaml
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.episodes import group_by
-from train.report.render import Table, to_markdown
+from train.report.table_formats import Table, to_markdown
 from train.runs.escaping import write_csv
 
 Rows = Sequence[Mapping[str, str]]

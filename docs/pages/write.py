@@ -34,7 +34,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
 from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.render import Head, Row, Table, to_markdown
+from train.report.table_formats import Head, Row, Table, to_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = (

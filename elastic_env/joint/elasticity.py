@@ -18,7 +18,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.joint.load_path import TorqueFunction, follow_load
+from elastic_env.joint.load_continuation import TorqueFunction, follow_load
 
 _SINGULAR = float(np.finfo(np.float64).eps)
 """Determinant below which a matrix counts as singular."""

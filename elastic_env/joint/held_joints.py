@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.joint.known_torque import home_of, require_known_torque
 from elastic_env.joint.model_file import compiled_spec
+from elastic_env.joint.supported_models import home_of, require_known_torque
 
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

@@ -24,8 +24,8 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
-from elastic_env.joint.known_torque import require_few
 from elastic_env.joint.model_file import compiled_spec, read_model
+from elastic_env.joint.supported_models import require_few
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 
 Form = Literal["tendon", "rigid"]
@@ -67,7 +67,7 @@ def make_elastic(
     and ball joints; loops and other equality constraints; tendons that pull; drives by a tendon, a
     site or a slider-crank; springs that are not linear; deformable bodies, plugins and wind; and
     flags that turn gravity, springs or actuators off. What they refuse it for is in one place,
-    `elastic_env.joint.known_torque`. Models that contradict themselves nobody takes.
+    `elastic_env.joint.supported_models`. Models that contradict themselves nobody takes.
 
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see

@@ -23,12 +23,12 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.at_rest import RestWatch
 from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.rows import COURSE, REAL, WHOLE, Records, Sample, one, record_type
 from elastic_env.world.sensors import PendulumImu, is_due

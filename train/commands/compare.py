@@ -28,8 +28,8 @@ from train.evaluate.conditions import (
 )
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.episodes import Evaluation
-from train.evaluate.families import expand
 from train.evaluate.maps import MapConfig, heat_maps
+from train.evaluate.residual_seeds import expand
 from train.evaluate.robots import robot_scores
 from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import standings

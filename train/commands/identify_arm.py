@@ -44,8 +44,8 @@ from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.joint_settings import SOFTEST
-from elastic_env.joint.known_torque import commanded_hinges, hinges_of
 from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
+from elastic_env.joint.supported_models import commanded_hinges, hinges_of
 from train.commands.identify_geometry import GeometryOptions, identify_geometry
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
@@ -154,6 +154,7 @@ def run_arm_identification(
     plots.require_matplotlib()
     setting = _setting(options, compiled_model(options.robot), console, seed)
     if setting.seeks_geometry:
+        _require_no_plan(options, setting.log)
         spec = read_model(options.robot).spec
         return identify_geometry(
             options.markers,
@@ -292,6 +293,25 @@ def shaped_model(path: str) -> mujoco.MjModel:
     except ConfigurationError:
         return plain
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
+
+
+def _require_no_plan(options: ArmOptions, log: PoseLog) -> None:
+    """Refuse options that a fit of the geometry has no use for.
+
+    Raises:
+        ConfigurationError: One of them is given.
+    """
+    given = {
+        "--plan": bool(options.plan),
+        "--payload": options.payload is not None,
+        "--assume": options.assume is not None,
+        "--end-effector": options.end_effector is not None and log.kind == "markers",
+    }
+    if unused := [name for name, is_given in given.items() if is_given]:
+        raise ConfigurationError(
+            f"{', '.join(unused)} {'is' if len(unused) == 1 else 'are'} not for a fit of the"
+            " geometry from markers; leave it out"
+        )
 
 
 def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int) -> _Setting:

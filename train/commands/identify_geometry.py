@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
+import tyro
 from rich import box
 from rich.console import Console
 
@@ -47,7 +49,7 @@ class GeometryOptions(Model):
     """Hold each pose out once, in so many folds."""
     free: tuple[Title, ...] = ()
     """Joints whose frame the model only guesses: it may be off by a metre and a radian."""
-    priors: GeometryPriors = GeometryPriors()
+    priors: Annotated[GeometryPriors, tyro.conf.arg(name="")] = GeometryPriors()
 
 
 def identify_geometry(
@@ -164,8 +166,14 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
         ]
         for joint in result.joints
     ]
-    title = f"K [N·m/rad] from {result.poses} poses; markers within {result.noise_mm:.2f} mm"
+    console.print(f"unexplained: {result.noise_mm:.2f} mm in each coordinate of a marker")
+    title = f"K [N·m/rad] from {result.poses} poses"
     console.print(make_table(title, ["joint", "K", "from", "to"], rows, box=box.SIMPLE))
+    if result.numbers < len(result.parameters):
+        console.print(
+            f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
+            " on the priors; log more poses"
+        )
     if result.kept:
         console.print(
             f"{len(result.kept)} of {len(result.parameters)} parameters keep their prior, as the"

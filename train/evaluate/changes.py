@@ -16,7 +16,7 @@ from elastic_env.world.scenario import make_scenario
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.families import Origin
+from train.evaluate.residual_seeds import Origin
 from train.evaluate.statistics import (
     Estimate,
     change,

@@ -11,7 +11,7 @@ from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.families import Origin, origin
+from train.evaluate.residual_seeds import Origin, origin
 from train.evaluate.statistics import Estimate, over_seeds
 
 

@@ -18,6 +18,8 @@ _ROW = 0.24
 def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
     """Held-out errors beside rivals, the error over the number of poses, K of each joint."""
     plt = require_matplotlib()
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     shown = [joint for joint in result.joints if np.isfinite(joint.stiffness_nm_per_rad)]
     panels = 1 if result.held_out is None else 3
     height = max(_HEIGHT, _ROW * len(shown) + 1.2)
@@ -35,9 +37,17 @@ def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
         axis.plot(K, row, "o", color=_OWN, ms=5)
     axis.set_yticks(range(len(shown)), [joint.joint for joint in shown], fontsize=8)
     axis.set_xscale("log")
+    # plain numbers: ours are no formulas, and those between the decades would overlap
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+    axis.xaxis.set_major_formatter(FuncFormatter(_plain))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.invert_yaxis()
     figure.tight_layout()
     return save(figure, path)
+
+
+def _plain(value: float, _: int) -> str:
+    return f"{value:g}"
 
 
 def _draw_errors(axis: Any, held_out: HeldOut) -> None:
@@ -48,14 +58,19 @@ def _draw_errors(axis: Any, held_out: HeldOut) -> None:
     axis.bar_label(bars, [f"{value:.2f}" for value in values], padding=3, fontsize=9)
     axis.set_xlim(0.0, 1.18 * max(values))
     axis.invert_yaxis()
-    axis.set_title(f"held-out error, rms [mm]\n{held_out.held_out} poses")
+    axis.set_title(f"rms [mm] at {held_out.held_out} held-out poses")
 
 
 def _draw_curve(axis: Any, held_out: HeldOut) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     poses = [point.poses for point in held_out.curve]
     axis.plot(poses, [point.rms_mm for point in held_out.curve], "o-", color=_OWN)
     axis.axhline(held_out.errors[0].rms_mm, color=_OTHER, lw=1.0, ls="--")
     axis.text(poses[0], held_out.errors[0].rms_mm, "rigid, as given", fontsize=8, va="bottom")
-    axis.set_ylim(bottom=0.0)
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter(FuncFormatter(_plain))
+    axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_xlabel("poses that were fitted")
     axis.set_title("identified: rms [mm] over poses")

@@ -20,7 +20,7 @@ from train.evaluate.changes import (
 )
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
-from train.report.render import Cell, Head, Part, Row, Table, print_table
+from train.report.table_formats import Cell, Head, Part, Row, Table, print_table
 from train.runs.escaping import write_records
 
 _SIGNS = {"°": HELD_OUT, "(°)": PARTLY, "†": CEILING, "‡": SAME_ROBOT}

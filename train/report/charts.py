@@ -12,8 +12,8 @@ from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures, score
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
-from train.report.render import number_interval
 from train.report.specs import LONGEST_NAME, PageChart, Spec, base_axis
+from train.report.table_formats import number_interval
 from train.runs.escaping import chart_text
 
 

@@ -18,8 +18,8 @@ from train.evaluate.maps import best_of
 from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
 from train.report.page import Page
-from train.report.render import Head, Part, Row, Table, print_table, to_markdown
 from train.report.report_text import capital
+from train.report.table_formats import Head, Part, Row, Table, print_table, to_markdown
 from train.runs.escaping import write_records
 
 _SCORE = ("mean", "low", "high")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from train.figures.map_plots import Panel, panel_rows
-from train.report.render import Table, load_template, to_markdown
+from train.report.table_formats import Table, load_template, to_markdown
 from train.runs.escaping import markdown_text
 
 Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]

@@ -22,15 +22,15 @@ from train.evaluate.changes import (
 )
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.families import Origin
 from train.evaluate.maps import HeatMap, best_of, ranking
 from train.evaluate.progress import Curves, learning_curves
+from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
 from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures, per_seed
 from train.figures.colours import policy_colours
-from train.report.render import load_template
+from train.report.table_formats import load_template
 
 
 @dataclass(frozen=True)

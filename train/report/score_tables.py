@@ -13,7 +13,7 @@ from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.table import EpisodeTable, score
 from train.figures.chart import spread
-from train.report.render import Head, Row, Table, number_interval, print_table
+from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
 SCORES = (

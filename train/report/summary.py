@@ -14,8 +14,8 @@ from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation
 from train.report.page import bullets
-from train.report.render import Head, Row, Table, print_table, to_markdown
 from train.report.report_text import capital
+from train.report.table_formats import Head, Row, Table, print_table, to_markdown
 from train.runs.escaping import write_records
 
 

@@ -22,10 +22,10 @@ from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
 from train.report.leaderboard import add_leaderboard
 from train.report.page import Page
-from train.report.render import Table, load_template
 from train.report.report_text import Results, capital, facts, headline, in_short, notes
 from train.report.score_tables import ROBOTS, SCORES, learning_table, robots_table, scores_table
 from train.report.specs import page_chart
+from train.report.table_formats import Table, load_template
 
 _LONG = 40
 """Rows from which on a table is folded away."""

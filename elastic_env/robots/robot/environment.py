@@ -15,14 +15,14 @@ from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
-from elastic_env.joint.known_torque import (
+from elastic_env.joint.model_file import GivenModel, compiled_spec
+from elastic_env.joint.supported_models import (
     has_nameless_hinge,
     hinges_of,
     nameless_hinge,
     require_robot,
     without_fingers,
 )
-from elastic_env.joint.model_file import GivenModel, compiled_spec
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot

@@ -17,8 +17,8 @@ from elastic_env.joint.joint_settings import (
     ServoSettings,
     read_joints,
 )
-from elastic_env.joint.known_torque import home_of
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
+from elastic_env.joint.supported_models import home_of
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.world.robot_model import joint_ranges
