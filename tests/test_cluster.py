@@ -62,6 +62,7 @@ def always_killed(kills: bool, report: Callable[[int], None]) -> str:
     return "fine"
 
 
+@pytest.mark.slow
 def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone(
     dask: Executors, tmp_path: Path
 ) -> None:

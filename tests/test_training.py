@@ -339,6 +339,7 @@ SEARCH: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_the_search_finds_the_stiffness_that_is_wrong(tmp_path: Path) -> None:
     """Catches a search up the hill, candidates mixed up among worlds, and constants that are
     exported wrongly.
