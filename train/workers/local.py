@@ -39,6 +39,10 @@ def num_processes(jobs: int, calls: int) -> int:
     return min(jobs or os.cpu_count() or 1, calls)
 
 
+_LATEST_REPORT_S = 5.0
+"""Time in which the last report of a call arrives, or never."""
+
+
 @contextmanager
 def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
     """Processes of this machine, which end with what is within.
@@ -107,8 +111,11 @@ class Processes(Executor):
         """In a thread: a call in the thread's process."""
         try:
             with self._lock:  # no process begins behind `end`
-                future = self._worker().pool.submit(fn, *args, **kwargs)
-            return future.result()
+                worker = self._worker()
+                future = worker.pool.submit(_count_reports, fn, *args, **kwargs)
+            value, sent = future.result()
+            worker.wait_for(sent)
+            return value
         except BrokenProcessPool:
             lost = self._own.worker
             self._own.worker = None
@@ -142,8 +149,15 @@ class _Worker:
         (self.process,) = cast("dict[int, SpawnProcess]", self.pool._processes).values()
         end.close()  # with that of the process the pipe ends too
         self._has_begun = False
+        self._handed_on = 0
+        self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, args=(reports, events), daemon=True)
         self._reader.start()
+
+    def wait_for(self, reports: int) -> None:
+        """Wait until so many reports were handed on: a result has its own way and may be faster."""
+        with self._news:
+            self._news.wait_for(lambda: self._handed_on >= reports, timeout=_LATEST_REPORT_S)
 
     def why(self) -> Exception:
         """Why a call in it was lost."""
@@ -160,6 +174,9 @@ class _Worker:
             self._has_begun = reports.recv()
             while True:
                 events.put(reports.recv())
+                with self._news:
+                    self._handed_on += 1
+                    self._news.notify_all()
 
 
 def _nothing() -> None:
@@ -179,10 +196,21 @@ _own_end: "Connection[Any, Any] | None" = None
 """In a worker: its end of the pipe for reports."""
 
 
+_sent = 0
+"""In a worker: how many reports it has sent."""
+
+
 def _report(number: int, value: Any) -> None:
     """In a worker: report on a call."""
+    global _sent
     if _own_end is not None:
         _own_end.send((number, value))
+        _sent += 1
+
+
+def _count_reports(fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> tuple[Any, int]:
+    """In a worker: the result of a call, and how many reports were sent up to its end."""
+    return fn(*args, **kwargs), _sent
 
 
 def _begin(end: "Connection[Any, Any]") -> None:
