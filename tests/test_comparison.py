@@ -759,6 +759,12 @@ def test_without_its_packages_the_comparison_says_what_to_install(
         require_libraries()
 
 
+def test_a_change_is_of_the_means_over_scenarios() -> None:
+    """Catches a median, which one bad scenario of three would not move."""
+    mine = np.array([[1.0, 2.0, 6.0]])
+    assert change(mine, np.full((1, 3), 2.0)).tolist() == [0.5]
+
+
 # elastic compare with residuals.
 
 
