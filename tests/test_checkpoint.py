@@ -165,3 +165,14 @@ def test_a_full_disk_is_one_sentence_and_the_training_goes_on(
                 file,
             )
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_file_of_a_terabyte_is_refused_unread(tmp_path: Path) -> None:
+    """Catches minutes of hashing holes, where somebody else wrote the folder."""
+    checkpoint = tmp_path / "checkpoint"
+    with write_checkpoint(checkpoint) as fresh:
+        (fresh / "model.pt").write_bytes(b"x")
+    with (checkpoint / "model.pt").open("r+b") as file:
+        file.truncate(2**40)
+    with pytest.raises(ElasticError, match=r"model.pt must have at most 2e\+09 bytes"):
+        require_whole(checkpoint)

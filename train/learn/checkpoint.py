@@ -17,6 +17,8 @@ from elastic_env.core.files import flush, read_bounded
 from elastic_env.core.json_text import LARGEST_JSON
 
 _DIGESTS = "sha256.json"
+_MOST_BYTES = 2 * 10**9
+"""Size of a file of a checkpoint, such as a replay buffer."""
 
 
 @contextmanager
@@ -91,6 +93,10 @@ def _digests(checkpoint: Path) -> dict[str, str]:
     found = {}
     for file in sorted(checkpoint.iterdir()):
         if file.name != _DIGESTS:
+            if (size := file.stat().st_size) > _MOST_BYTES:
+                raise ValueError(
+                    f"{shorten(file.name)} must have at most {_MOST_BYTES:.0e} bytes, not {size:g}"
+                )
             with file.open("rb") as content:
                 found[file.name] = hashlib.file_digest(content, "sha256").hexdigest()
     return found
