@@ -31,7 +31,7 @@ _FIRST_NOISE_M = 3e-3
 _NOISE_ROUNDS = 3
 _FINEST_M = 1e-5
 _TOLD = 0.5
-"""Share of its prior's deviation above which the poses do not tell a parameter."""
+"""Share of its prior's deviation from which on the poses do not tell a parameter."""
 _FEWEST_POSES = 2
 _UNLIKE = 3.0
 """Ratio of how far markers spread, measured and of the model."""
@@ -84,7 +84,7 @@ class Estimate:
 
     @property
     def is_told(self) -> bool:
-        """Whether the poses tell more of it than the prior does."""
+        """True if the poses narrow its deviation to less than half of the prior's."""
         return self.deviation < _TOLD * self.prior
 
 
@@ -144,9 +144,7 @@ class GeometryProblem:
     def as_rigid(self) -> "GeometryProblem":
         """The same poses of the rigid arm as it is given: only tracker and markers are sought."""
         priors = self.priors.replace(offset_rad=_NOTHING)
-        other = replace(self, geometry="offsets", elastic=(), lateral=False, priors=priors)
-        other.__dict__.pop("unknowns", None)
-        return other
+        return replace(self, geometry="offsets", elastic=(), lateral=False, priors=priors)
 
     @cached_property
     def largest_moment(self) -> Array:

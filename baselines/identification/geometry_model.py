@@ -271,7 +271,9 @@ class GeometryModel:
         def by(twists: Twists) -> Array:
             """Derivatives of the measurement by twists, (N, k, 3, P)."""
             direct = self._marker_change(posture, twists)
-            turned = np.linalg.solve(bent.matrix, self._moment_change(posture, twists, bent))
+            turned = np.linalg.solve(
+                bent.matrix, self._moment_change(posture, twists, bent.compliance)
+            )
             return R @ (direct + np.einsum("nkaq,nqp->nkap", bent.marker, turned))
 
         moments = self.moments(posture)
@@ -286,7 +288,7 @@ class GeometryModel:
             )
         return shown, Parameters(
             translation=np.broadcast_to(np.eye(3), (count, k, 3, 3)),
-            rotation=-_cross_matrix(shown - self.origin - parameters.translation)
+            rotation=-cross_matrix(shown - self.origin - parameters.translation)
             @ _left_jacobian(parameters.rotation),
             marker=of_marker,
             offset=-by(self._about_axes(posture)),
@@ -398,8 +400,8 @@ class GeometryModel:
         )
         marker = self._marker_change(posture, twists)
         compliance = parameters.compliance.reshape(3 * n, 1)
-        bent = _Bent(np.eye(3 * n)[None], marker, compliance)
-        return _Bent(np.eye(3 * n) - self._moment_change(posture, twists, bent), marker, compliance)
+        change = self._moment_change(posture, twists, compliance)
+        return _Bent(np.eye(3 * n) - change, marker, compliance)
 
     def _marker_change(self, posture: Posture, twists: Twists) -> Array:
         """Velocities of the markers in the base, (N, k, 3, P)."""
@@ -411,7 +413,7 @@ class GeometryModel:
             changes.append(moved * np.reshape(carried, (-1, 1)))
         return np.stack(changes, axis=1).transpose(0, 1, 3, 2)
 
-    def _moment_change(self, posture: Posture, twists: Twists, bent: "_Bent") -> Array:
+    def _moment_change(self, posture: Posture, twists: Twists, compliance: Array) -> Array:
         """C times the change of the moments in the axes of the housings, (N, 3 n, P) [rad]."""
         count = posture.link.shape[1]
         changes = np.empty((self.num_joints, count, len(twists.joint), 3))
@@ -430,7 +432,7 @@ class GeometryModel:
             moment = moment - np.where(turns, np.cross(twists.axis, own), 0.0)
             changes[j] = moment @ posture.housing[j]
         stacked = changes.transpose(1, 0, 3, 2).reshape(count, 3 * self.num_joints, -1)
-        return bent.compliance * stacked
+        return compliance * stacked
 
 
 class _Bent(NamedTuple):
@@ -467,13 +469,13 @@ def _left_jacobian(vectors: Array) -> Array:
     """Angular velocity by the rate of a rotation vector, (..., 3) to (..., 3, 3)."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     safe = np.where(angle < _SMALL_RAD, 1.0, angle)
-    W = _cross_matrix(vectors)
+    W = cross_matrix(vectors)
     first = np.where(angle < _SMALL_RAD, 0.5, (1.0 - np.cos(safe)) / safe**2)
     second = np.where(angle < _SMALL_RAD, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
     return np.eye(3) + first * W + second * (W @ W)
 
 
-def _cross_matrix(vectors: Array) -> Array:
+def cross_matrix(vectors: Array) -> Array:
     """Matrices of the cross product with vectors from the left, (..., 3) to (..., 3, 3)."""
     W = np.zeros((*np.shape(vectors), 3))
     x, y, z = np.moveaxis(vectors, -1, 0)

@@ -40,7 +40,7 @@ class GeometryEstimate(Model):
     """Half of the 95 % interval."""
     unit: str
     is_told: bool
-    """Whether the poses tell more of it than its prior does."""
+    """Whether the poses narrow it to less than half of its prior's deviation."""
 
 
 class JointCompliance(Model):

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from baselines.identification.geometry_model import cross_matrix
 from baselines.identification.pose_log import Kind, PoseLog
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ElasticError
@@ -284,7 +285,7 @@ class PoseModel:
         gradient = R @ at.position_gradient @ dq
         gradient[..., own["translation"]] = np.eye(3)[:, : 3 * self.unknowns.translation]
         if self.unknowns.rotation:
-            gradient[..., own["rotation"]] = -_cross(turned)
+            gradient[..., own["rotation"]] = -cross_matrix(turned)
         shift = unknowns[own["translation"]]
         return turned + (shift if len(shift) else 0.0), gradient
 
@@ -297,9 +298,9 @@ class PoseModel:
         across = _across(vertical(self.log.measured))
         back = R @ at.rotation.transpose(0, 2, 1)
         seen = back @ up
-        gradient = back @ _cross(np.broadcast_to(up, seen.shape)) @ at.rotation_gradient @ dq
+        gradient = back @ cross_matrix(np.broadcast_to(up, seen.shape)) @ at.rotation_gradient @ dq
         if self.unknowns.rotation:
-            gradient[..., own["rotation"]] = -_cross(seen)
+            gradient[..., own["rotation"]] = -cross_matrix(seen)
         return (across @ seen[..., None])[..., 0], across @ gradient
 
     def _torques(self, unknowns: Array, q: Array, dq: Array, at: list[int]) -> tuple[Array, Array]:
@@ -344,12 +345,3 @@ def _across(directions: Array) -> Array:
     first = np.cross(directions, least)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(directions, first)], axis=-2)
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices of the cross product with vectors from the left, (N, 3) to (N, 3, 3)."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    o = np.zeros_like(x)
-    return np.stack(
-        [np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2
-    )
