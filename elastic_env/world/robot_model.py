@@ -19,6 +19,7 @@ from elastic_env.rigid.biped import Biped
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Key of K in an identification file."""
+_UNLIMITED_RAD = 200.0 * np.pi
 
 
 @dataclass(frozen=True)
@@ -162,10 +163,14 @@ def with_stiffness(
 
 
 def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit."""
+    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit.
+
+    A limit of more than a hundred turns, as exporters write it for a joint without one, is none.
+    """
     at = [model.joint(name).id for name in joints]
-    limited = model.jnt_limited[at].astype(bool)[:, None]
-    lowest, highest = np.where(limited, model.jnt_range[at], [-np.inf, np.inf]).T
+    limits = model.jnt_range[at]
+    limited = model.jnt_limited[at].astype(bool)[:, None] & (np.abs(limits) < _UNLIMITED_RAD)
+    lowest, highest = np.where(limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
 
