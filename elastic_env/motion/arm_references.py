@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, require_known
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import (
     REFERENCES,
@@ -120,11 +120,11 @@ class Poses(_Drawn):
         """A plan of all joints, (T, n), from the first pose through the others."""
         period = self.move_s + self.settle_s + self.measure_s
         t = control_times(STAND_S + self.positions * period, control_period_s)
-        since = t[:, None] - STAND_S - period * np.arange(self.positions)
-        settled = self.move_s + self.settle_s
-        at_rest = (since > settled + 1e-9) & (since <= settled + self.measure_s + 1e-9)
-        rest = np.where(at_rest.any(axis=1), at_rest.argmax(axis=1), -1)
-        return Plan(*_moved(visits, since / self.move_s, self.move_s), rest >= 0, rest)
+        number = _numbers(t, period, self.positions)
+        since = t - STAND_S - period * number
+        is_at_rest = (since > self.move_s + self.settle_s + 1e-9) & (since <= period + 1e-9)
+        rest = np.where(is_at_rest, number, -1)
+        return Plan(*_moved(visits, t, period, self.move_s), is_at_rest, rest)
 
 
 class Moves(_Drawn):
@@ -137,8 +137,7 @@ class Moves(_Drawn):
     def through(self, visits: Array, control_period_s: float) -> Plan:
         """A plan of all joints, (T, n), from the first pose through the others."""
         t = control_times(STAND_S + self.positions * self.move_s, control_period_s)
-        since = t[:, None] - STAND_S - self.move_s * np.arange(self.positions)
-        return _scored(t, *_moved(visits, since / self.move_s, self.move_s))
+        return _scored(t, *_moved(visits, t, self.move_s, self.move_s))
 
 
 class _Path(RepeatableReference):
@@ -332,11 +331,24 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     return list(names[1:]), rows
 
 
-def _moved(visits: Array, share: Array, move_s: float) -> tuple[Array, Array, Array]:
-    """Motion between poses, (T, n) each, from the shares of the moves, (T, moves)."""
-    blend, blend_dot, blend_ddot = quintic(share)
+def _numbers(t: Array, period_s: float, count: int) -> IntArray:
+    """Which of the moves each time belongs to, (T,): one begins at the end of the one before."""
+    past = np.ceil((t - STAND_S - 1e-9) / period_s) - 1.0
+    return past.clip(0, count - 1).astype(np.int64)
+
+
+def _moved(visits: Array, t: Array, period_s: float, move_s: float) -> tuple[Array, Array, Array]:
+    """Motion between poses, (T, n) each: one move at the beginning of each period."""
     steps = np.diff(visits, axis=0)
-    return visits[0] + blend @ steps, blend_dot @ steps / move_s, blend_ddot @ steps / move_s**2
+    number = _numbers(t, period_s, len(steps))
+    share = (t - STAND_S - period_s * number) / move_s
+    blend, blend_dot, blend_ddot = (x[:, None] for x in quintic(share))
+    step = steps[number]
+    return (
+        visits[number] + blend * step,
+        blend_dot * step / move_s,
+        blend_ddot * step / move_s**2,
+    )
 
 
 def _scored(t: Array, q: Array, q_dot: Array, q_ddot: Array) -> Plan:

@@ -112,6 +112,10 @@ class Planned(Protocol):
         ...
 
 
+LARGEST_TABLE = 250_000_000
+"""Memory of the plans of all worlds [B]: 64 worlds of six joints for 100 s take a tenth."""
+
+
 class PlanTable:
     """Plans of all worlds as tables, one row per control step; one that repeats is held once.
 
@@ -119,6 +123,9 @@ class PlanTable:
         reference: Makes plans of all joints, (T, n).
         control_period_s: Time between commands [s].
         num_worlds: How many.
+
+    Raises:
+        ConfigurationError: No step is scored, or the tables would take more than `LARGEST_TABLE`.
 
     Attributes:
         motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3,
@@ -141,7 +148,15 @@ class PlanTable:
         self.plan_of_world = (
             np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
         )
-        self.motion = np.tile(_stacked(probe), (1 if self._is_shared else num_worlds, 1, 1, 1))
+        plans = 1 if self._is_shared else num_worlds
+        motion = _stacked(probe)
+        if plans * motion.nbytes > LARGEST_TABLE:
+            raise ConfigurationError(
+                f"{plans} motions of {self.num_steps} control steps take"
+                f" {plans * motion.nbytes / 1e6:.0f} MB, at most {LARGEST_TABLE / 1e6:.0f} MB;"
+                " take a shorter motion, fewer worlds or episodes, or one motion for all by `seed`"
+            )
+        self.motion = np.tile(motion, (plans, 1, 1, 1))
         self.scored = probe.scored
         self.rest = probe.rest
 
