@@ -19,6 +19,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.joint.load_continuation import TorqueFunction, follow_load
+from elastic_env.joint.motor import Motor
 
 _SINGULAR = float(np.finfo(np.float64).eps)
 """Determinant below which a matrix counts as singular."""
@@ -39,6 +40,12 @@ class Servo(Model):
     A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like
     this PID. The integrator lets it hold its angle without steady-state error. Against wind-up it
     is clamped to what it can be needed for: the torque limit on top of k_v θ̇ at the speed limit.
+
+    With a `motor` the PID sets the duty cycle of the pulse-width modulation. The gains are those at
+    rest, where the duty cycle u gives the torque k_t V u / R. The back-EMF takes from it:
+
+    .. math::
+        \tau_m = \mathrm{clip}(\tau_{PID}, \pm k_t V u_{max} / R) - k_t k_e \dot\theta / R
     """  # noqa: E501
 
     position_gain: float = quantity("N·m/rad", gt=0)
@@ -51,6 +58,8 @@ class Servo(Model):
     """Largest torque of the servo at the output [N·m]."""
     speed_limit: float = quantity("rad/s", gt=0)
     """No-load speed of the servo at the output [rad/s]."""
+    motor: Motor | None = quantity("1", None)
+    """DC motor with back-EMF and PWM limit; None for a torque that does not depend on speed [1]."""
 
     @property
     def integral_limit(self) -> float:
@@ -80,6 +89,12 @@ class ElasticJoint(Model):
     """Dry friction on the link side of the spring [N·m]."""
     viscous_friction: float = quantity("N·m·s/rad", 0.0, ge=0)
     """Viscous friction on the link side [N·m·s/rad]."""
+    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
+    """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
+    static_friction: float = quantity("N·m", 0.0, ge=0)
+    """F_s, what dry friction has more at rest than in motion [N·m]."""
+    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
+    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
     """Motor encoder, counts per turn of the output; None for continuous [1]."""
     servo: Servo | None = quantity("1", None)
@@ -90,6 +105,15 @@ class ElasticJoint(Model):
         if self.backlash >= np.pi:
             raise ValueError(
                 f"backlash must be below half a turn, {np.pi:.4f} rad, got {self.backlash}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _static_friction_fades(self) -> Self:
+        if self.static_friction > 0.0 and self.stribeck_speed == 0.0:
+            raise ValueError(
+                f"static_friction = {self.static_friction} N·m needs a stribeck_speed above 0"
+                " [rad/s], by which it falls to 37 %; 0.05 rad/s is usual for gears"
             )
         return self
 
