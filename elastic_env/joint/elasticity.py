@@ -45,7 +45,10 @@ class Servo(Model):
     rest, where the duty cycle u gives the torque k_t V u / R. The back-EMF takes from it:
 
     .. math::
-        \tau_m = \mathrm{clip}(\tau_{PID}, \pm k_t V u_{max} / R) - k_t k_e \dot\theta / R
+        \tau_m = \mathrm{clip}(\mathrm{clip}(\tau_{PID}, \pm k_t V u_{max} / R)
+        - k_t k_e \dot\theta / R, \pm \tau_{max})
+
+    The torque limit is that of the current, k_t i_max; give the stall torque where there is none.
     """  # noqa: E501
 
     position_gain: float = quantity("N·m/rad", gt=0)
@@ -62,12 +65,28 @@ class Servo(Model):
     """DC motor with back-EMF and PWM limit; None for a torque that does not depend on speed [1]."""
 
     @property
+    def braking(self) -> float:
+        """k_v and what the back-EMF adds to it [N·m·s/rad]."""
+        return self.velocity_gain + (0.0 if self.motor is None else self.motor.damping)
+
+    @property
     def integral_limit(self) -> float:
         """Largest magnitude of the position error's integral [rad·s]; 0 without one."""
         if self.integral_gain == 0.0:
             return 0.0
-        most = self.torque_limit + self.velocity_gain * self.speed_limit
+        most = self.torque_limit + self.braking * self.speed_limit
         return most / self.integral_gain
+
+    def largest_torque(self, speed: Parameter = 0.0) -> Array:
+        """Torque that the servo has at a speed, broadcast from (..., n) [rad/s] to [N·m].
+
+        The motor's torque falls with the speed; without a motor it is the limit throughout.
+        """
+        limit = np.full(np.shape(speed), self.torque_limit)
+        if self.motor is None:
+            return limit
+        left = self.motor.stall_torque - self.motor.damping * np.abs(speed)
+        return np.minimum(limit, left.clip(min=0.0))
 
 
 class ElasticJoint(Model):

@@ -47,3 +47,28 @@ def dry_friction(
         relative = np.abs(speed) / np.where(has_width, width, 1.0)
         excess = np.where(has_width, np.exp(-np.square(relative)), np.equal(speed, 0.0))
     return coulomb + load_ratio * np.abs(load) + static * excess
+
+
+def passed_torque(
+    torque: Array, direction: Parameter, friction: Parameter, load_ratio: Parameter = 0.0
+) -> Array:
+    r"""Torque that a transmission must pass to move a link against friction that grows with it.
+
+    It solves :math:`\tau_J = \tau + s (F + c |\tau_J|)`:
+
+    .. math:: \tau_J = \frac{\tau + s F}{1 - s c \,\mathrm{sign}(\tau + s F)}
+
+    Up a slope of load that is (τ + F)/(1 − c), down it (τ − F)/(1 + c).
+
+    Args:
+        torque: τ that the link needs, gravity and inertia, (..., n) [N·m].
+        direction: s, the sign of the motion or, where the friction turns round, a share between −1
+            and 1, broadcast against (..., n) [1].
+        friction: F without the share of the load, likewise [N·m].
+        load_ratio: c, below 1, likewise [1].
+
+    Returns:
+        τ_J, (..., n) [N·m].
+    """
+    needed = torque + direction * friction
+    return needed / (1.0 - direction * load_ratio * np.sign(needed))

@@ -9,6 +9,7 @@ import numpy as np
 from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.joint_names import spring_name
+from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.world.scenario import Scenario
 
 
@@ -41,6 +42,9 @@ def set_joints(
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
     for name in ("dof_frictionloss", "dof_damping"):
         field(name)[links] = getattr(model, name)[links] * robot.friction
+    if (varying := VaryingFriction.of(model)) is not None:
+        terms = varying.numbers[:, :-1]  # all but the speed
+        field("numeric_data")[terms] = model.numeric_data[terms] * robot.friction
 
 
 def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
