@@ -125,7 +125,8 @@ class DisturbanceObserver(PolicyAround):
         ramp_s: Time in which the compensation grows from zero [s].
 
     Raises:
-        ConfigurationError: The observation does not have the IMU.
+        ConfigurationError: The observation does not have the IMU, or friction changes with load or
+            speed.
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class DisturbanceObserver(PolicyAround):
         self._follow_share = 1.0 - float(np.exp(-self._dt / self._gains.time_constant_s))
         self._smooth_share = 1.0 - float(np.exp(-self._dt / self._gains.rate_filter_s))
         self._zero_steps = round(self._gains.zero_s / self._dt)
+        model.require_constant_friction("the disturbance observer")
         self._coulomb = self._gains.friction * model.coulomb_friction
         self._ramp = Ramp(model, ramp_s).table
 

@@ -84,10 +84,14 @@ class StiffnessRegression:
     Args:
         model: Assumed robot.
         prior: What is known before.
+
+    Raises:
+        ConfigurationError: Friction changes with load or speed.
     """
 
     def __init__(self, model: RobotModel, prior: StiffnessPrior) -> None:
         self._prior = prior
+        model.require_constant_friction("the estimate of the stiffness")
         self._coulomb = model.coulomb_friction
 
     def begin(self, num_worlds: int) -> RegressionMemory:

@@ -18,6 +18,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
+from elastic_env.joint.friction import require_fading
 from elastic_env.joint.load_continuation import TorqueFunction, follow_load
 from elastic_env.joint.motor import Motor
 
@@ -129,11 +130,7 @@ class ElasticJoint(Model):
 
     @model_validator(mode="after")
     def _static_friction_fades(self) -> Self:
-        if self.static_friction > 0.0 and self.stribeck_speed == 0.0:
-            raise ValueError(
-                f"static_friction = {self.static_friction} N·m needs a stribeck_speed above 0"
-                " [rad/s], by which it falls to 37 %; 0.05 rad/s is usual for gears"
-            )
+        require_fading(self.static_friction, self.stribeck_speed)
         return self
 
 

@@ -72,3 +72,16 @@ def passed_torque(
     """
     needed = torque + direction * friction
     return needed / (1.0 - direction * load_ratio * np.sign(needed))
+
+
+def require_fading(static_friction: float, stribeck_speed: float) -> None:
+    """Refuse friction at rest without the speed by which it falls [N·m], [rad/s].
+
+    Raises:
+        ValueError: It is such.
+    """
+    if static_friction > 0.0 and stribeck_speed == 0.0:
+        raise ValueError(
+            f"static_friction = {static_friction:g} N·m needs a stribeck_speed above 0 [rad/s], by"
+            " which it falls to 37 %; 0.05 rad/s is usual for gears"
+        )

@@ -14,6 +14,8 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
+from elastic_env.joint.friction import require_fading
+from elastic_env.joint.motor import Motor
 
 GivenJoints = str | Path | Mapping[str, Any]
 """A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad],
@@ -55,7 +57,9 @@ class ServoSettings(Model):
     rad/s² [N·m].
     """
     speed_limit: float | None = quantity("rad/s", None, gt=0)
-    """No-load speed; default a turn a second [rad/s]."""
+    """No-load speed; default that of the motor, else a turn a second [rad/s]."""
+    motor: Motor | None = quantity("1", None)
+    """DC motor, with which the torque falls with the speed; default none [1]."""
 
     @model_validator(mode="after")
     def _pushes(self) -> Self:
@@ -118,6 +122,12 @@ class JointSettings(Model):
     """Viscous friction on the link; default the joint's damping, unless it damps the servo
     [N·m·s/rad].
     """
+    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
+    """c, share of the torque passed that is lost to dry friction; default none [1]."""
+    static_friction: float = quantity("N·m", 0.0, ge=0)
+    """F_s, what dry friction has more at rest; default none [N·m]."""
+    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
+    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
     backlash: float = quantity("rad", 0.0, ge=0)
     """Dead band; default none, as the scenario has one [rad]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
@@ -130,6 +140,7 @@ class JointSettings(Model):
             raise ValueError(
                 f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}"
             )
+        require_fading(self.static_friction, self.stribeck_speed)
         return self
 
     @property

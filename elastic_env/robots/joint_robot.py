@@ -294,7 +294,9 @@ def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
     if config.scenario.friction_scale > 0.0:
         return config.joints
     return {
-        name: one.replace(coulomb_friction=0.0, viscous_friction=0.0)
+        name: one.replace(
+            coulomb_friction=0.0, viscous_friction=0.0, load_friction=0.0, static_friction=0.0
+        )
         for name, one in config.joints.items()
     }
 
@@ -339,10 +341,8 @@ def _workspace(
 
 def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
     """True if servos hold poses with a fifth of their torque to spare, (..., n) [rad] to (...)."""
-    limits = np.array([servo.torque_limit for servo in robot.servos])
-    return np.all(
-        np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1
-    )
+    needed = robot.largest_passed_torque(body.gravity_torque(q))
+    return np.all(needed < _SPARE * robot.largest_torque(np.zeros_like(q)), axis=-1)
 
 
 def _require_torque(
@@ -359,8 +359,9 @@ def _require_torque(
     needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(
         axis=0
     )
-    needed += robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
-    limits = np.array([servo.torque_limit for servo in robot.servos])
+    fastest = np.abs(q_dot).max(axis=0)
+    needed = robot.largest_passed_torque(needed + robot.viscous_friction * fastest)
+    limits = robot.largest_torque(fastest)
     if not isinstance(config.reference, OfArm):
         require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):

@@ -50,12 +50,18 @@ class JointConfig(Model):
         return self
 
     def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A known joint as the plant of the scenario has it."""
+        """A known joint as the plant of the scenario has it.
+
+        Raises:
+            ConfigurationError: With more friction it passes no torque at all.
+        """
         scenario = self.scenario
         return joint.replace(
             stiffness=joint.stiffness * scenario.stiffness_scale,
             coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
             viscous_friction=joint.viscous_friction * scenario.friction_scale,
+            load_friction=joint.load_friction * scenario.friction_scale,
+            static_friction=joint.static_friction * scenario.friction_scale,
             backlash=joint.backlash + scenario.backlash_rad,
         )
 

@@ -213,6 +213,9 @@ class _Assumed:
                 own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])
             ),
             viscous_friction=_first(own.viscous_friction, damping),
+            load_friction=own.load_friction,
+            static_friction=own.static_friction,
+            stribeck_speed=own.stribeck_speed,
             backlash=own.backlash,
             encoder_counts_per_turn=own.encoder_counts_per_turn,
             servo=self._servo(servo, rotor, ratio, is_given),
@@ -274,9 +277,12 @@ class _Assumed:
                     " nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
+        motor = known.motor
         limit = known.torque_limit
         if limit is None:
             limit = force_limit(self._model, self._name)
+        if limit is None and motor is not None:
+            limit = motor.stall_torque
         # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh
         # bounds by k_v/(B + M)
         rate = min(DECAY_RATE_PER_S, kv / (4.0 * (rotor + links.most)))
@@ -285,7 +291,12 @@ class _Assumed:
             velocity_gain=kv,
             integral_gain=_first(known.integral_gain, rate * kp),
             torque_limit=_first(limit, enough),
-            speed_limit=_first(known.speed_limit, _SPEED_LIMIT_RAD_S),
+            speed_limit=_first(
+                known.speed_limit,
+                None if motor is None else motor.no_load_speed,
+                _SPEED_LIMIT_RAD_S,
+            ),
+            motor=motor,
         )
 
 
