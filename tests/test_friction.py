@@ -1,5 +1,7 @@
 """Dry friction and the DC motor, against closed forms, limits and the balance of power."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -118,7 +120,7 @@ def test_at_its_terminal_speed_the_motor_balances_the_load(load: float, viscous:
         ({"static_friction": 0.2}, r"static_friction = 0\.2 N·m needs a stribeck_speed above 0"),
     ],
 )
-def test_a_friction_that_cannot_be_is_refused(change: dict[str, float], problem: str) -> None:
+def test_a_friction_that_cannot_be_is_refused(change: dict[str, Any], problem: str) -> None:
     """Catches a joint that passes nothing, and a Stribeck excess of no width."""
     with pytest.raises(ConfigurationError, match=problem):
         ElasticJoint(stiffness=100.0, rotor_inertia=0.1, **change)
@@ -135,7 +137,7 @@ def test_a_friction_that_cannot_be_is_refused(change: dict[str, float], problem:
         ({"pwm_limit": 0.0}, r"pwm_limit must be .* > 0 and <= 1, got 0\.0"),
     ],
 )
-def test_a_motor_that_cannot_be_is_refused(change: dict[str, float], problem: str) -> None:
+def test_a_motor_that_cannot_be_is_refused(change: dict[str, Any], problem: str) -> None:
     """Catches a bound that is missing; a PWM limit in percent is one."""
     with pytest.raises(ConfigurationError, match=problem):
         MOTOR.replace(**change)

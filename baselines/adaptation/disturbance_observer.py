@@ -41,7 +41,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import GravityCompensator, presliding_friction
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
 from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs

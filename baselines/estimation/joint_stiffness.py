@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.compensation.compensators import presliding_friction
+from baselines.compensation.dry_friction import presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import RobotModel

@@ -69,6 +69,11 @@ class ServoSettings(Model):
             )
         return self
 
+    @property
+    def braking(self) -> float:
+        """k_v and what the back-EMF adds to it, as far as they are known [N·m·s/rad]."""
+        return (self.velocity_gain or 0.0) + (0.0 if self.motor is None else self.motor.damping)
+
     def over(self, found: "ServoSettings") -> "ServoSettings":
         """These settings where they say something, else what was found in the model.
 
