@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.dry_friction import DEAD_ZONE_RAD, FrictionCompensation, FrictionMemory
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Array
 from elastic_env.joint.friction import dry_friction
 from elastic_env.world.scenario import make_scenario
@@ -138,3 +140,38 @@ def test_the_policy_friction_takes_off_what_dynamic_leaves(
     taken = largest_errors("friction", **settings)
     assert np.sqrt(np.mean(left**2)) > 5e-3
     assert np.sqrt(np.mean(taken**2)) < share * np.sqrt(np.mean(left**2))
+
+
+def test_worlds_of_a_small_servo_are_its_single_world_bit_for_bit() -> None:
+    """Catches friction, motor or bound of another world in the whole environment."""
+    settings = {**SMALL, "scenario": "nominal", "reference": "multisine", "action_bound_rad": 1.0}
+    rows: list[Array] = []
+    for num_envs in (1, 3):
+        env: Any = gymnasium.make_vec("elastic_env/Testbed-v0", num_envs=num_envs, **settings)
+        observation, _ = env.reset(seed=4)
+        seen = [observation[0]]
+        for step in range(40):
+            action = np.full((num_envs, 1), 0.8 * np.sin(0.2 * step), dtype=np.float32)
+            seen.append(env.step(action)[0][0])
+        rows.append(np.array(seen))
+    np.testing.assert_array_equal(rows[0], rows[1])
+
+
+def test_policies_that_know_constant_friction_alone_refuse_another() -> None:
+    """Catches a friction that is ignored in silence."""
+    env: Any = gymnasium.make_vec(
+        "elastic_env/Testbed-v0", num_envs=1, sensors=("link_imu",), **SMALL
+    )
+    with pytest.raises(ConfigurationError, match=r"observer knows constant dry friction only"):
+        baselines.make("disturbance_observer", env)
+    drawn = make_scenario("ideal").replace(
+        name="rough", friction_scale=1.0, ranges=(RobotRanges(friction=(1.0, 4.0)),)
+    )
+    with pytest.raises(ConfigurationError, match=r"draws up to 4 times .* load_friction = 0\.3"):
+        gymnasium.make_vec("elastic_env/Testbed-v0", num_envs=1, scenario=drawn, **SMALL)
+
+
+def test_the_walker_refuses_what_its_plan_does_not_know() -> None:
+    """Catches a walker with load friction that its policies take for constant."""
+    with pytest.raises(ConfigurationError, match=r"neither load_friction nor static_friction"):
+        gymnasium.make("elastic_env/WalkInPlace-v0", joint={"load_friction": 0.2})

@@ -1,10 +1,15 @@
 """Named servos against their makers' sheets, in MuJoCo: units at the output shaft."""
 
+from typing import Any
+
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
 
+import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.joint_settings import read_joints
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 from elastic_env.world.physics import SingleWorld
@@ -71,3 +76,18 @@ def test_an_unknown_servo_names_those_that_are_known() -> None:
     """Catches a name that leads nowhere."""
     with pytest.raises(ConfigurationError, match=r"unknown servo 'XL-330'.*XL330-M288"):
         small_servo("XL-330")
+
+
+def test_a_name_stands_for_the_joint_in_files_and_environments() -> None:
+    """Catches a parameter that is lost on the way to Robot-v0, the testbed or a live robot."""
+    joint = small_servo("STS3250")
+    (own,) = read_joints({"*": "STS3250"}, ["elbow"]).values()
+    assert own is not None
+    assert (own.stiffness, own.load_friction) == (joint.stiffness, joint.load_friction)
+    assert joint.servo is not None
+    assert own.servo.motor == joint.servo.motor
+    load = {"gravity_torque": 1.33, "mass": 1.13, "gyration_radius": 0.01}
+    env = gymnasium.make("elastic_env/Testbed-v0", joint="STS3250", pendulum=load)
+    config: Any = env.unwrapped
+    assert config.task.config.joint == joint
+    env.close()

@@ -10,13 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.robot_ranges import RobotRanges, draw_robot
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.friction import passed_torque
 from elastic_env.joint.joint_names import motor_name, servo_name
 from elastic_env.joint.make_elastic import Form, make_elastic, transform_hinges
+from elastic_env.joint.model_servo import position_servo
 from elastic_env.joint.motor import Motor, terminal_speed
 from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.world.drawn_robot import set_joints
 from elastic_env.world.physics import ManyWorlds, SingleWorld, simulate
 
 MOTOR = Motor(torque_constant=0.4, back_emf=0.5, resistance=3.0, voltage=5.0, pwm_limit=0.9)
@@ -260,3 +264,26 @@ def test_a_servo_with_a_motor_keeps_its_name() -> None:
     """Catches an actuator that policies do not find."""
     model = plant(STEADY.replace(servo=SERVO.replace(motor=MOTOR)))
     assert model.actuator(0).name == servo_name("q")
+
+
+def test_a_motor_of_the_model_is_not_read_in_silence() -> None:
+    """Catches a DC motor that is taken for no servo, and replaced by an assumed one."""
+    text = """<mujoco><worldbody><body name="link"><joint name="q"/>
+      <inertial mass="0.5" pos="0 0 -0.1" diaginertia="0.001 0.001 0.001"/></body></worldbody>
+      <actuator><dcmotor joint="q" motorconst="0.4 0.5" resistance="3" input="pos"
+        controller="5 0 0.2 0 0 4"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    with pytest.raises(ConfigurationError, match=r"joint 'q' has a dcmotor.*`motor`.*`servo`"):
+        position_servo(model, "q")
+
+
+def test_a_drawn_robot_has_its_own_varying_friction() -> None:
+    """Catches draws that reach constant friction alone, or another world."""
+    model = plant(JOINT)
+    many = ManyWorlds(model, 2)
+    drawn = draw_robot([RobotRanges(friction=(0.5, 0.5))], 1, np.random.default_rng(1))
+    links = np.array([model.joint("q").dofadr[0]])
+    set_joints(lambda name: many.vary(name)[1], model, np.array([0]), links, drawn)
+    friction = VaryingFriction(model)
+    limits = friction.limits(many._field, many.bind)[:, 0]
+    np.testing.assert_allclose(limits, [0.08, 0.04])

@@ -14,12 +14,14 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
+from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.friction import require_fading
 from elastic_env.joint.motor import Motor
+from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 
 GivenJoints = str | Path | Mapping[str, Any]
 """A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad],
-"rigid" or "held".
+the name of one of `SMALL_SERVOS`, "rigid" or "held".
 """
 HELD = "held"
 """Value of a joint that nobody commands: it stays where the model's first keyframe has it."""
@@ -215,6 +217,8 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return None
     if isinstance(value, JointSettings):
         return value
+    if isinstance(value, str) and value in SMALL_SERVOS:
+        return _settings_of(small_servo(value))
     own = (
         value
         if isinstance(value, Mapping)
@@ -233,3 +237,11 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return JointSettings(**settings)
     except ConfigurationError as error:
         raise ConfigurationError(f"joint {name!r}: {error}") from None
+
+
+def _settings_of(joint: ElasticJoint) -> JointSettings:
+    """A known joint with its servo, as settings."""
+    known = {name: getattr(joint, name) for name in JointSettings.model_fields if name != "servo"}
+    assert joint.servo is not None
+    servo = {name: getattr(joint.servo, name) for name in ServoSettings.model_fields}
+    return JointSettings(**known, servo=ServoSettings(**servo))
