@@ -9,9 +9,11 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.joint.joint_settings import read_joints
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
+from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.world.physics import SingleWorld
 from tests.test_varying_friction import rigid_spec
 
@@ -91,3 +93,10 @@ def test_a_name_stands_for_the_joint_in_files_and_environments() -> None:
     config: Any = env.unwrapped
     assert config.task.config.joint == joint
     env.close()
+
+
+def test_an_emulated_servo_refuses_a_motor() -> None:
+    """Catches a torque that the emulator cannot switch off."""
+    config = TestbedConfig(joint=small_servo("STS3250"))
+    with pytest.raises(ConfigurationError, match=r"emulated servo controls its current"):
+        Joints(config, num_joints=1, start_s=0.0)

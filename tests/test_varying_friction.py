@@ -95,6 +95,13 @@ def test_a_load_that_slides_up_or_down_takes_its_share(
         assert 40.0 * data.ten_length[0] == pytest.approx(up, rel=1e-3, abs=1e-4)
 
 
+def test_a_dead_band_carries_no_load() -> None:
+    """Catches a load that is taken from the whole deflection."""
+    data, _ = turn(plant(STEADY.replace(backlash=0.02)), speed=0.07, load=0.6)
+    wound = data.ten_length[0] - 0.01
+    assert 40.0 * wound == pytest.approx((0.6 + 0.05) / 0.6, rel=1e-3)
+
+
 @pytest.mark.parametrize("beyond", [0.98, 1.02])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("preload", [0.5, -0.3, 0.0])
@@ -223,7 +230,7 @@ def test_a_copy_goes_on_as_its_original(num_worlds: int, copied: Any) -> None:
 
 def test_a_loop_of_the_user_is_the_simulation() -> None:
     """Catches an update that forgets a joint or a term, and a warning that is not said."""
-    with pytest.warns(UserWarning, match=r"friction of q changes .* VaryingFriction\(model\)"):
+    with pytest.warns(UserWarning, match=r"friction of q changes .*VaryingFriction\(model\)"):
         model = make_elastic(rigid_spec(9.81), {"q": JOINT}).compile()
     known = swing(SingleWorld(plant(JOINT, gravity=9.81)))[:, 0]
     data = mujoco.MjData(model)

@@ -100,8 +100,8 @@ def make_elastic(
     if changing:
         warnings.warn(
             f"the dry friction of {', '.join(changing)} changes with load or speed, which MuJoCo"
-            " does not simulate by itself: call VaryingFriction(model).update(model, data) of"
-            " elastic_env.joint.varying_friction before every mj_step",
+            " does not simulate by itself: make friction = elastic_env.VaryingFriction(model), and"
+            " call friction.update(model, data) before every mj_step",
             stacklevel=2,
         )
     return elastic

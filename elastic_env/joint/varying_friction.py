@@ -81,6 +81,8 @@ class VaryingFriction:
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Self | None:
         """The same; None where no friction varies."""
+        if model.nnumeric == 0:
+            return None
         found = cls(model)
         return found if found.joints else None
 
