@@ -1,4 +1,4 @@
-"""Thirty formulas, each broken once: the tests must notice.
+"""Thirty-two formulas, each broken once: the tests must notice.
 
     python -m tests.broken_formulas            the tests that every commit runs
     python -m tests.broken_formulas --all      all tests, also the slow ones

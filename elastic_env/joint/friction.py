@@ -41,12 +41,15 @@ def dry_friction(
     Returns:
         F, (..., n) [N·m]; never negative.
     """
+    steady = coulomb + load_ratio * np.abs(load) + np.zeros_like(speed)
+    if not np.asarray(static).any():
+        return steady
     width = np.asarray(stribeck_speed)
     has_width = width > 0.0
     with np.errstate(over="ignore"):
         relative = np.abs(speed) / np.where(has_width, width, 1.0)
         excess = np.where(has_width, np.exp(-np.square(relative)), np.equal(speed, 0.0))
-    return coulomb + load_ratio * np.abs(load) + static * excess
+    return steady + static * excess
 
 
 def passed_torque(

@@ -58,7 +58,7 @@ class VaryingFriction:
     Attributes:
         joints: Names of these joints; empty where no friction varies.
         links: Their degrees of freedom, (n,).
-        numbers: Places of F₀, c, F_s and ω_s in `numeric_data`, (n, 4).
+        numbers: Places of F₀, c, F_s and ω_s in `numeric_data`, (4, n).
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -69,7 +69,7 @@ class VaryingFriction:
         at = JointAddresses.of(model, self.joints)
         self.links = at.q_dot
         first = [model.numeric_adr[model.numeric(friction_name(j)).id] for j in self.joints]
-        self.numbers = np.array(first, dtype=np.int64)[:, None] + np.arange(_TERMS)
+        self.numbers = np.array(first, dtype=np.int64) + np.arange(_TERMS)[:, None]
         is_sprung = at.theta != at.q
         self._sprung = np.flatnonzero(is_sprung)
         self._rigid = np.flatnonzero(~is_sprung)
@@ -104,8 +104,14 @@ class VaryingFriction:
             state: Rows of a field of the states.
         """
         terms = field("numeric_data")[:, self.numbers]
-        speed = state("qvel")[:, self.links]
-        return dry_friction(speed, self._load(field, state), *np.moveaxis(terms, -1, 0))
+        return dry_friction(
+            speed=state("qvel")[:, self.links],
+            load=self._load(field, state),
+            coulomb=terms[:, 0],
+            load_ratio=terms[:, 1],
+            static=terms[:, 2],
+            stribeck_speed=terms[:, 3],
+        )
 
     def _load(self, field: Callable[[str], Array], state: Callable[[str], Array]) -> Array:
         """τ_J, (num_worlds, n) [N·m].

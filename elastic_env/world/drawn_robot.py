@@ -45,7 +45,7 @@ def set_joints(
     for name in ("dof_frictionloss", "dof_damping"):
         field(name)[links] = getattr(model, name)[links] * robot.friction
     if (varying := VaryingFriction.of(model)) is not None:
-        terms = varying.numbers[:, :-1]  # all but the speed
+        terms = varying.numbers[:-1]  # all but the speed
         field("numeric_data")[terms] = model.numeric_data[terms] * robot.friction
 
 
