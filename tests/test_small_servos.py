@@ -1,5 +1,6 @@
 """Named servos against their makers' sheets, in MuJoCo: units at the output shaft."""
 
+import warnings
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.joint.joint_settings import read_joints
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
+from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.world.physics import SingleWorld
 from tests.test_varying_friction import rigid_spec
@@ -89,9 +91,13 @@ def test_a_name_stands_for_the_joint_in_files_and_environments() -> None:
     assert joint.servo is not None
     assert own.servo.motor == joint.servo.motor
     load = {"gravity_torque": 1.33, "mass": 1.13, "gyration_radius": 0.01}
-    env = gymnasium.make("elastic_env/Testbed-v0", joint="STS3250", pendulum=load)
+    env = gymnasium.make(
+        "elastic_env/Testbed-v0", joint="STS3250", pendulum=load, action_bound_rad=1.2
+    )
     config: Any = env.unwrapped
     assert config.task.config.joint == joint
+    space: Any = env.action_space
+    assert space.high == pytest.approx(1.2)
     env.close()
 
 
@@ -100,3 +106,21 @@ def test_an_emulated_servo_refuses_a_motor() -> None:
     config = TestbedConfig(joint=small_servo("STS3250"))
     with pytest.raises(ConfigurationError, match=r"emulated servo controls its current"):
         Joints(config, num_joints=1, start_s=0.0)
+
+
+def test_the_back_emf_is_part_of_the_damping_that_is_assumed() -> None:
+    """Catches a servo that is damped twice, by its motor and by an assumed velocity gain."""
+    motor = SMALL_SERVOS["STS3215"].motor
+    text = """<mujoco><worldbody><body name="link"><joint name="q" axis="0 -1 0"/>
+      <inertial mass="1" pos="0 0 -0.1" diaginertia="0.001 0.001 0.001"/></body></worldbody>
+    </mujoco>"""
+    braking = []
+    for servo in ({"position_gain": 20.0}, {"position_gain": 20.0, "motor": motor}):
+        own = {"stiffness": 400.0, "rotor_inertia": 0.02, "servo": {"torque_limit": 3.0, **servo}}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            config = configure_robot(text, {"q": own})
+        made = config.joints["q"].servo
+        assert made is not None
+        braking.append(made.braking)
+    assert braking[1] == pytest.approx(max(braking[0], motor.damping))

@@ -266,11 +266,13 @@ class _Assumed:
         links = self._links
         kp = _first(known.position_gain, ratio * self._own.stiffness)
         kv = known.velocity_gain
+        back_emf = 0.0 if known.motor is None else known.motor.damping
         if kv is None:
             carries_links = (
                 known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
             )
-            kv = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
+            critical = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
+            kv = max(critical - back_emf, 0.0)
             if known.position_gain is not None and not is_given:
                 self.said.append(
                     f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as"
@@ -285,7 +287,7 @@ class _Assumed:
             limit = motor.stall_torque
         # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh
         # bounds by k_v/(B + M)
-        rate = min(DECAY_RATE_PER_S, kv / (4.0 * (rotor + links.most)))
+        rate = min(DECAY_RATE_PER_S, (kv + back_emf) / (4.0 * (rotor + links.most)))
         return Servo(
             position_gain=kp,
             velocity_gain=kv,
