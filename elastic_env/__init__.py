@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError
     from elastic_env.joint.elasticity import ElasticJoint, Servo
     from elastic_env.joint.make_elastic import make_elastic
+    from elastic_env.joint.motor import Motor
+    from elastic_env.joint.small_servos import small_servo
+    from elastic_env.joint.varying_friction import VaryingFriction
     from elastic_env.robots.joint_robot import JointRobot
 
 __version__ = "0.1.0"
@@ -25,8 +28,11 @@ __all__ = [
     "ElasticError",
     "ElasticJoint",
     "JointRobot",
+    "Motor",
     "Servo",
+    "VaryingFriction",
     "make_elastic",
+    "small_servo",
 ]
 
 _ENVIRONMENTS = (
@@ -43,8 +49,11 @@ _HOMES = {
     "ElasticError": "elastic_env.core.errors",
     "ElasticJoint": "elastic_env.joint.elasticity",
     "JointRobot": "elastic_env.robots.joint_robot",
+    "Motor": "elastic_env.joint.motor",
     "Servo": "elastic_env.joint.elasticity",
+    "VaryingFriction": "elastic_env.joint.varying_friction",
     "make_elastic": "elastic_env.joint.make_elastic",
+    "small_servo": "elastic_env.joint.small_servos",
 }
 
 

@@ -1,4 +1,4 @@
-"""Thirty formulas, each broken once: the tests must notice.
+"""Thirty-two formulas, each broken once: the tests must notice.
 
     python -m tests.broken_formulas            the tests that every commit runs
     python -m tests.broken_formulas --all      all tests, also the slow ones
@@ -68,8 +68,8 @@ BROKEN = (
     ),
     BrokenFormula(
         _ELASTICITY,
-        "self.torque_limit + self.velocity_gain * self.speed_limit",
-        "self.torque_limit + self.velocity_gain",
+        "self.torque_limit + self.braking * self.speed_limit",
+        "self.torque_limit + self.braking",
         f"{JOINT} sensors testbed",
     ),
     BrokenFormula(
@@ -113,10 +113,22 @@ BROKEN = (
         COMPENSATION,
     ),
     BrokenFormula(
-        _COMPENSATORS,
+        "baselines/compensation/dry_friction.py",
         "full = coulomb * np.sign(displacement)",
         "full = -coulomb * np.sign(displacement)",
         COMPENSATION,
+    ),
+    BrokenFormula(
+        "elastic_env/joint/friction.py",
+        "1.0 - direction * load_ratio * np.sign(needed)",
+        "1.0 - direction * load_ratio",
+        "varying_friction dry_friction",
+    ),
+    BrokenFormula(
+        "elastic_env/joint/varying_friction.py",
+        "ends[..., 1] - ends[..., 0]",
+        "ends[..., 1]",
+        "varying_friction",
     ),
     BrokenFormula(
         _COMPENSATORS,

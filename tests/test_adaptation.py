@@ -12,7 +12,7 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.estimators import mean_load
 from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
-from baselines.compensation.compensators import PRESLIDING_RAD, presliding_friction
+from baselines.compensation.dry_friction import PRESLIDING_RAD, presliding_friction
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.estimation.joint_stiffness import StiffnessPrior, regress

@@ -18,6 +18,7 @@ from baselines.compensation.compensators import (
     newton_link_angle,
     taylor_link_angle,
 )
+from baselines.compensation.dry_friction import FrictionMemory
 from baselines.compensation.gravity_torque import RigidBody, make_gravity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -240,6 +241,13 @@ def test_unknown_output_method_names_itself_and_the_choices() -> None:
         GravityCompensator(pendulum(), output="tailor")
 
 
+def arrays_of(memory: Any) -> list[Array]:
+    """All arrays of a memory."""
+    if isinstance(memory, np.ndarray):
+        return [memory]
+    return [array for part in memory for array in arrays_of(part)]
+
+
 @pytest.mark.parametrize("compensator", [GravityCompensator, DynamicCompensator])
 def test_memory_has_a_row_for_every_world(compensator: type) -> None:
     """Catches a compensator whose rows do not fit the state that `Compensated` keeps for it."""
@@ -247,8 +255,9 @@ def test_memory_has_a_row_for_every_world(compensator: type) -> None:
     motion = Motion(*np.zeros((3, 5, 1)))
     memory = made.begin(motion)
     offset, kept = made.offset(motion, memory)
-    assert [part.shape for part in kept] == [part.shape for part in memory]
-    assert all(len(part) == 5 for part in ([memory] if isinstance(memory, np.ndarray) else memory))
+    rows = [arrays_of(one) for one in (memory, kept)]
+    assert [part.shape for part in rows[0]] == [part.shape for part in rows[1]]
+    assert all(len(part) == 5 for part in rows[0])
     assert offset.shape == (5, 1)
 
 
@@ -329,7 +338,7 @@ def test_friction_turns_round_with_the_motion_and_stays_at_rest() -> None:
     frictions = []
     for rate in [0.5] * 20 + [0.0] * 5 + [-0.5] * 20:
         _, memory = compensator.offset(at(0.0, rate), memory)
-        frictions.append(float(memory.friction[0, 0]))
+        frictions.append(float(memory.friction.coulomb[0, 0]))
     assert frictions[19] == pytest.approx(5.4, abs=1e-6)
     assert frictions[20:25] == frictions[19:20] * 5
     assert -5.4 < frictions[25] < 0.0  # 2 mrad after the turn: past zero, not yet turned round
@@ -338,7 +347,7 @@ def test_friction_turns_round_with_the_motion_and_stays_at_rest() -> None:
 
 def test_without_friction_the_compensator_ignores_the_friction_of_the_model() -> None:
     """Catches friction that the `dynamic` policy is not meant to know."""
-    memory = DriveMemory(*np.zeros((4, 1, 1)))
+    memory = DriveMemory(*np.zeros((3, 1, 1)), FrictionMemory(*np.zeros((3, 1, 1))))
     offsets = []
     for friction in (0.0, 5.4):
         offsets.append(

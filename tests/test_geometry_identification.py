@@ -18,7 +18,7 @@ from baselines.identification.geometry_result import correct_model, describe_geo
 from baselines.identification.holdout import FITTED, HeldOut, HeldOutError, judge, split
 from baselines.identification.pose_log import read_log, write_poses
 from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.links import Tree
 from train.commands.cli import main
@@ -53,7 +53,7 @@ def tree(model: mujoco.MjModel) -> Tree:
 @pytest.fixture(scope="module")
 def geometry(model: mujoco.MjModel, tree: Tree) -> GeometryModel:
     places = [(name, int(model.site(name).bodyid[0]), model.site(name).pos) for name in SITES]
-    return GeometryModel.of(tree, model.opt.gravity, places)
+    return GeometryModel.of(tree, JOINTS, model.opt.gravity, places)
 
 
 def draw(seed: int, count: int = 6) -> tuple[np.random.Generator, Array]:
@@ -120,6 +120,15 @@ def test_deflection_about_the_axis_is_that_of_the_elastic_joint(geometry: Geomet
     torque = -geometry.moments(geometry.posture(soft, theta))[..., 2]
     rigid = geometry.measured(nominal, theta - torque * compliance[:, 2])
     np.testing.assert_allclose(geometry.measured(soft, theta), rigid, atol=1e-9)
+
+
+def test_a_joint_that_gravity_overcomes_is_named(geometry: GeometryModel) -> None:
+    """Catches a number in the place of the joint's name."""
+    nominal = geometry.nominal_parameters()
+    compliance = np.zeros((len(JOINTS), 3))
+    compliance[1, 2] = 50.0
+    with pytest.raises(ElasticError, match=rf"gravity overcomes joint '{JOINTS[1]}' at .* 50 rad"):
+        geometry.posture(nominal._replace(compliance=compliance), draw(3)[1])
 
 
 def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: GeometryModel) -> None:

@@ -41,7 +41,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import GravityCompensator, presliding_friction
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
 from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
@@ -125,7 +126,8 @@ class DisturbanceObserver(PolicyAround):
         ramp_s: Time in which the compensation grows from zero [s].
 
     Raises:
-        ConfigurationError: The observation does not have the IMU.
+        ConfigurationError: The observation does not have the IMU, or friction changes with load or
+            speed.
     """
 
     def __init__(
@@ -146,6 +148,7 @@ class DisturbanceObserver(PolicyAround):
         self._follow_share = 1.0 - float(np.exp(-self._dt / self._gains.time_constant_s))
         self._smooth_share = 1.0 - float(np.exp(-self._dt / self._gains.rate_filter_s))
         self._zero_steps = round(self._gains.zero_s / self._dt)
+        model.require_constant_friction("the disturbance observer")
         self._coulomb = self._gains.friction * model.coulomb_friction
         self._ramp = Ramp(model, ramp_s).table
 

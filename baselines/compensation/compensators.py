@@ -3,8 +3,6 @@ r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), ful
 An input compensator says by how much the motor side has to lead so that the link is where it should
 be; an output compensator says where the link is when the motor encoder shows θ. All work on (...,
 n) arrays.
-
-[Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 """
 
 import math
@@ -15,6 +13,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import LegTorque, WrenchTorque, shift_plan
+from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
 from baselines.compensation.gravity_torque import (
     FixedTorque,
     GravityMethod,
@@ -223,13 +222,13 @@ class DriveMemory(NamedTuple):
         deflection: δ, by which the motor side leads [rad].
         rate: δ̇ [rad/s].
         windup: Integral of the servo error, ∫e [rad·s].
-        friction: Coulomb friction that holds the link back [N·m].
+        friction: That of the dry friction.
     """
 
     deflection: Array
     rate: Array
     windup: Array
-    friction: Array
+    friction: FrictionMemory
 
 
 class DynamicCompensator(Compensator):
@@ -244,7 +243,8 @@ class DynamicCompensator(Compensator):
         model: Assumed robot, with a servo on every joint.
         output: Method for the rate estimate and for the start, as in `GravityCompensator`.
         method: How the static torque is computed; None for the robot's default.
-        friction: Whether the model's Coulomb friction is part of the joint torque.
+        friction: Whether the model's dry friction is part of the joint torque: Coulomb friction,
+            and what grows with the load or falls from rest.
     """
 
     def __init__(
@@ -262,11 +262,17 @@ class DynamicCompensator(Compensator):
         self._stiffness = model.stiffness[None]
         self._backlash: Parameter = model.backlash if model.backlash.any() else 0.0
         self._viscous = model.viscous_friction
-        self._coulomb = model.coulomb_friction if friction else None
+        self._friction = FrictionCompensation(
+            coulomb=model.coulomb_friction,
+            load_ratio=model.load_friction,
+            static=model.static_friction,
+            stribeck_speed=model.stribeck_speed,
+        )
+        self._rubs = friction
         self._drives: Any = np.zeros(len(model.joint_names), DRIVE)
         self._drives["damping"] = model.damping
         self._drives["rotor_inertia"] = model.rotor_inertia
-        for name in ("position_gain", "velocity_gain", "integral_gain"):
+        for name in ("position_gain", "braking", "integral_gain"):
             self._drives[name] = [getattr(servo, name) for servo in model.servos]
 
     @override
@@ -292,7 +298,8 @@ class DynamicCompensator(Compensator):
         zero = np.zeros_like(torque)
         windup = np.divide(torque, integral_gain, out=zero.copy(), where=integral_gain > 0.0)
         deflection = static_deflection(torque, self._stiffness, self._backlash)
-        return DriveMemory(deflection, rate=zero, windup=windup, friction=zero)
+        friction = self._friction.begin(torque.shape)
+        return DriveMemory(deflection, rate=zero, windup=windup, friction=friction)
 
     @override
     def offset(self, motion: Motion, memory: DriveMemory) -> tuple[Array, DriveMemory]:
@@ -303,9 +310,9 @@ class DynamicCompensator(Compensator):
         torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
         torque = torque + self._viscous * motion.q_dot
         friction = memory.friction
-        if self._coulomb is not None:
-            friction = presliding_friction(friction, motion.q_dot * self._dt, self._coulomb)
-            torque = torque + friction
+        if self._rubs:
+            friction = self._friction.follow(motion.q_dot * self._dt, friction)
+            torque = self._friction.passed(torque, motion.q_dot, friction)
         target = static_deflection(torque, self._stiffness, self._backlash)
         deflection = settle(memory.deflection, target, self._stiffness, self._drives, self._dt)
         rate = (deflection - memory.deflection) / self._dt
@@ -338,7 +345,7 @@ DRIVE = record_type(
     damping=(),  # D [N·m·s/rad]
     rotor_inertia=(),  # B [kg·m²]
     position_gain=(),  # [N·m/rad]
-    velocity_gain=(),  # [N·m·s/rad]
+    braking=(),  # k_v and the motor's back-EMF [N·m·s/rad]
     integral_gain=(),  # [N·m/(rad·s)]
 )
 """Rotor, damper and servo of a joint."""
@@ -389,7 +396,7 @@ def servo_error(
         for i in range(len(drives)):
             drive = drives[i]
             effort = drive.rotor_inertia * theta_ddot[world, i] + torque[world, i]
-            effort += drive.velocity_gain * theta_dot[world, i]
+            effort += drive.braking * theta_dot[world, i]
             if drive.integral_gain > 0.0:  # k_p e + k_i ∫e = effort
                 time_s = drive.position_gain / drive.integral_gain
                 integrals[world, i] = follow_lag(
@@ -407,26 +414,6 @@ def follow_lag(state: float, target: float, time_constant_s: float, period_s: fl
     There is no lag for a time constant of zero.
     """
     return target + math.exp(-period_s / time_constant_s) * (state - target)
-
-
-PRESLIDING_RAD = 1e-3
-"""Displacement over which Coulomb friction turns round [rad]."""
-
-
-def presliding_friction(friction: Array, displacement: Array, coulomb: Array) -> Array:
-    r"""Coulomb friction with presliding [Dahl1968].
-
-    It turns round over a displacement, and stays at rest.
-
-    .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
-
-    Args:
-        friction: f, that holds the link back, before the displacement, (..., n) [N·m].
-        displacement: Δq, (..., n) [rad].
-        coulomb: F, (n,) [N·m].
-    """
-    full = coulomb * np.sign(displacement)
-    return full + (friction - full) * np.exp(-np.abs(displacement) / PRESLIDING_RAD)
 
 
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:

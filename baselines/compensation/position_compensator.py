@@ -8,6 +8,12 @@ Eq. 9 is the case at rest of a servo that holds its angle. τ is the torque that
 deliver: gravity, inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowers
 it. Damping and friction of the model are not in it. What a motor encoder shows is turned into the
 link angle by Eq. 10.
+
+Where dry friction grows with the load, or falls from rest, the joints have to deliver that, too:
+τ_J = τ + s (F + c |τ_J|), with the direction s of the last motion. It turns round with the desired
+angles, stays at rest, and leaves out a dead zone in which these may tremble, see
+`baselines.compensation.dry_friction`. Such a joint stays where it stops, so that the lag of its
+servo is taken off, too.
 """
 
 import sys
@@ -21,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import get_lapack_funcs
 
+from baselines.compensation.dry_friction import FrictionCompensation
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import (
     ActionError,
@@ -58,6 +65,8 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 "wrist_*": 300}.
 """
 
+_Motion = tuple[Array, Array | None, Array | None]
+"""Angles, rates and accelerations of the links, (n,) each; None for none."""
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's
 steps shrink.
@@ -94,8 +103,9 @@ class PositionCompensator:
         model: Compiled rigid model on a fixed base.
         stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number,
             `rigid`, `held`, or a mapping as `elastic_env.joint.joint_settings` reads it. Of such a
-            mapping K and the servo's k_p and k_i are used. Damping, friction and rotor inertia act
-            on the way to rest alone, and backlash is refused.
+            mapping K and the servo's k_p and k_i are used; with `friction` also dry and viscous
+            friction, and by how much k_v and the back-EMF let the servo lag. Otherwise these act on
+            the way to rest alone, as damping and rotor inertia do. Backlash is refused.
         joints: Hinges that are commanded, in the order of the arrays; None for all that are not
             held, in the order of the model. The other joints are held where the model's first
             keyframe has them, or at its reference.
@@ -105,7 +115,10 @@ class PositionCompensator:
         limit_rad: Largest offset between command and desired angle [rad].
         ramp_s: Time in which offsets grow from zero after the start, and in which a payload is
             taken over [s].
-        period_s: Time between two commands, for the ramp [s].
+        period_s: Time between two commands, for the ramp, and for the rate of desired angles
+            without one [s].
+        friction: True to compensate the dry friction that `stiffness` says; None where any of it
+            grows with the load or falls from rest.
 
     Raises:
         ConfigurationError: The model or a value cannot be used; the message says which.
@@ -126,6 +139,7 @@ class PositionCompensator:
         limit_rad: float = 0.2,
         ramp_s: float = 0.0,
         period_s: float = 0.01,
+        friction: bool | None = None,
     ) -> None:
         self._model = model
         require_robot(model)
@@ -146,10 +160,14 @@ class PositionCompensator:
         self._limit = limits.limit_rad
         self._ramp = limits.ramp_s
         self._steps = max(int(np.ceil(limits.ramp_s / limits.period_s)), 1)
+        self._period_s = limits.period_s
+        self._friction = _friction(settings, friction)
+        self._viscous = np.array([one.viscous_friction or 0.0 for one in settings.values()])
+        self._lag_s = np.array([one.servo.braking for one in settings.values()]) / gains
         self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[max(at, key=lambda j: int(model.jnt_bodyid[j]))])
         self.reset()
-        needed = self._of_command * self._heaviest()
+        needed = self._of_command * self._most_passed(self._heaviest())
         if (needed > self._limit).any():
             self._warn_of_offset(needed, "at some pose within the joint ranges")
 
@@ -180,11 +198,13 @@ class PositionCompensator:
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
         self._count = 0
-        self._asked: tuple[Array, Array | None, Array | None] | None = None
+        self._asked: _Motion | None = None
         self._load = self._load_wanted = self._load_step = 0.0
         self._carrier = self._tip
         self._place = np.zeros(3)
         self._links.set_load(self._carrier, 0.0, self._place)
+        if self._friction is not None:
+            self._rubbed = self._friction.begin((len(self.joints),))
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(
@@ -260,7 +280,7 @@ class PositionCompensator:
         """
         motion = self._motion(q_desired, q_dot, q_ddot)
         self._take_load()
-        offset = self._of_command * self._torque(*motion)
+        offset = self._lead(motion)
         if self._count < self._steps and self._ramp > 0.0:
             self._count += 1
             offset *= minimum_jerk(np.array(self._count / self._steps))
@@ -277,6 +297,8 @@ class PositionCompensator:
     def link_angle(self, theta: npt.ArrayLike) -> Array:
         """Link angles for motor encoders that show θ, at rest: Eq. 10.
 
+        Friction that is compensated holds the link back from the side of the last commands.
+
         Args:
             theta: Motor side, (n,) [rad].
 
@@ -289,7 +311,7 @@ class PositionCompensator:
                 leads to, or there are several.
         """
         shown_angle = self._checked("theta", theta, "rad")
-        gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
+        gradient = self._compliance[:, None] * self._passed_gradient(shown_angle)
         size = gradient.ravel()
         # by the Frobenius norm, which is fast: there may be other equilibria
         is_soft = size.dot(size) >= 1.0
@@ -302,7 +324,7 @@ class PositionCompensator:
             return self._soft_link_angle(shown_angle, None)
         q = shown_angle
         for _ in range(_MOST_ITERATIONS):
-            residual = q - shown_angle + self._compliance * self._torque(q, None, None)
+            residual = q - shown_angle + self._compliance * self._passed_at_rest(q)
             step, _ = _solved(factors, pivots, residual)
             q = q - step
             missing = residual.dot(residual)
@@ -315,13 +337,49 @@ class PositionCompensator:
                 break
         return self._soft_link_angle(shown_angle, None)
 
+    def _lead(self, motion: _Motion) -> Array:
+        """Offset along a motion, (n,) [rad]; the friction follows its direction."""
+        torque = self._torque(*motion)
+        if self._friction is None:
+            return self._of_command * torque
+        q, q_dot, _ = motion
+        displacement = np.zeros_like(q) if self._asked is None else q - self._asked[0]
+        slack = self._rubbed.slack
+        self._rubbed = self._friction.follow(displacement, self._rubbed)
+        if q_dot is None:  # without what trembles
+            q_dot = (displacement + slack - self._rubbed.slack) / self._period_s
+        passed = self._friction.passed(torque + self._viscous * q_dot, q_dot, self._rubbed)
+        return self._of_command * passed + self._lag_s * q_dot
+
+    def _most_passed(self, torque: Array) -> Array:
+        """Largest torque that is passed to links under loads of either sign, (n,) [N·m]."""
+        if self._friction is None:
+            return torque
+        return self._friction.most_passed(torque)
+
+    def _passed_at_rest(self, q: Array) -> Array:
+        """Torque that is passed to links at rest, (..., n) [rad] to (..., n) [N·m]."""
+        torque = self._links.gravity_torque(q)
+        if self._friction is None:
+            return torque
+        return self._friction.passed(torque, np.zeros_like(q), self._rubbed)
+
+    def _passed_gradient(self, q: Array) -> Array:
+        """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        gradient = self._links.gravity_gradient(q)
+        if self._friction is None:
+            return gradient
+        torque = self._links.gravity_torque(q)
+        share = self._friction.share(torque, np.zeros_like(q), self._rubbed)
+        return share[..., None] * gradient
+
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
         """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
         found = follow_load(
             theta,
             self._compliance,
-            lambda q: self._torque(q, None, None),
-            self._links.gravity_gradient,
+            self._passed_at_rest,
+            self._passed_gradient,
             tolerance=_LAST_RESIDUAL_RAD,
             within=(self._lowest, self._highest),
         )
@@ -401,7 +459,7 @@ class PositionCompensator:
             self._said.add(about)
             _warn(text)
 
-    def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
+    def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> _Motion:
         return (
             self._checked("q_desired", q, "rad"),
             None if q_dot is None else self._checked("q_dot", q_dot, "rad/s"),
@@ -590,6 +648,23 @@ def _servo_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], g
             " hold their angle"
         )
     return np.array(gains)
+
+
+def _friction(
+    settings: Mapping[str, JointSettings], wanted: bool | None
+) -> FrictionCompensation | None:
+    """Compensation of the dry friction of joints; None where it is not wanted."""
+    joints = list(settings.values())
+    if wanted is None:
+        wanted = any(one.load_friction > 0.0 or one.static_friction > 0.0 for one in joints)
+    if not wanted:
+        return None
+    return FrictionCompensation(
+        coulomb=np.array([one.coulomb_friction or 0.0 for one in joints]),
+        load_ratio=np.array([one.load_friction for one in joints]),
+        static=np.array([one.static_friction for one in joints]),
+        stribeck_speed=np.array([one.stribeck_speed for one in joints]),
+    )
 
 
 def _is_said(servo: ServoSettings) -> bool:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.compensation.compensators import presliding_friction
+from baselines.compensation.dry_friction import presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.robot_model import RobotModel
@@ -84,10 +84,14 @@ class StiffnessRegression:
     Args:
         model: Assumed robot.
         prior: What is known before.
+
+    Raises:
+        ConfigurationError: Friction changes with load or speed.
     """
 
     def __init__(self, model: RobotModel, prior: StiffnessPrior) -> None:
         self._prior = prior
+        model.require_constant_friction("the estimate of the stiffness")
         self._coulomb = model.coulomb_friction
 
     def begin(self, num_worlds: int) -> RegressionMemory:

@@ -123,6 +123,7 @@ class GeometryModel:
     """Markers as a function of parameters, at given motor encoders.
 
     Attributes:
+        joints: Names of the joints, (n,).
         parent: Joint before each joint, -1 for the base; parents come before their children, (n,).
         nominal: Frames in those of the parents where the joints are drawn, (n, 3, 3).
         anchor: Anchors in the frames of the parents, (n, 3) [m].
@@ -135,6 +136,7 @@ class GeometryModel:
             is, (3,) [m].
     """
 
+    joints: tuple[str, ...]
     parent: IntArray
     nominal: Array
     anchor: Array
@@ -147,11 +149,18 @@ class GeometryModel:
     origin: Array
 
     @classmethod
-    def of(cls, tree: Tree, gravity: Array, markers: Sequence[tuple[str, int, Array]]) -> Self:
+    def of(
+        cls,
+        tree: Tree,
+        joints: Sequence[str],
+        gravity: Array,
+        markers: Sequence[tuple[str, int, Array]],
+    ) -> Self:
         """Of the links of a rigid model.
 
         Args:
             tree: Links whose joints are in the model's order.
+            joints: Names of these joints.
             gravity: Acceleration of gravity in the base, (3,) [m/s²].
             markers: Name, body and place in the body's frame [m] of each marker.
         """
@@ -162,6 +171,7 @@ class GeometryModel:
             for name, body, place in markers
         ]
         return cls(
+            joints=tuple(joints),
             parent=links["parent"] - 1,
             nominal=links["R"],
             anchor=links["anchor"],
@@ -250,7 +260,7 @@ class GeometryModel:
                 return posture
         worst = int(np.abs(turn).max(axis=(0, 2)).argmax())
         raise ElasticError(
-            f"gravity overcomes joint {worst + 1} of {self.num_joints} at a compliance of"
+            f"gravity overcomes joint {self.joints[worst]!r} at a compliance of"
             f" {parameters.compliance[worst].max():.3g} rad/(N·m): there is no posture at rest"
         )
 

@@ -228,6 +228,7 @@ class PoseModel:
             tolerance=_LAST_STEP_RAD,
             rows=rows,
             unique=False,
+            names_rest=False,
             finest=_FINEST_STEP,
         )
         if path.lost.any():

@@ -18,7 +18,9 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
+from elastic_env.joint.friction import require_fading
 from elastic_env.joint.load_continuation import TorqueFunction, follow_load
+from elastic_env.joint.motor import Motor
 
 _SINGULAR = float(np.finfo(np.float64).eps)
 """Determinant below which a matrix counts as singular."""
@@ -39,6 +41,15 @@ class Servo(Model):
     A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like
     this PID. The integrator lets it hold its angle without steady-state error. Against wind-up it
     is clamped to what it can be needed for: the torque limit on top of k_v θ̇ at the speed limit.
+
+    With a `motor` the PID sets the duty cycle of the pulse-width modulation. The gains are those at
+    rest, where the duty cycle u gives the torque k_t V u / R. The back-EMF takes from it:
+
+    .. math::
+        \tau_m = \mathrm{clip}(\mathrm{clip}(\tau_{PID}, \pm k_t V u_{max} / R)
+        - k_t k_e \dot\theta / R, \pm \tau_{max})
+
+    The torque limit is that of the current, k_t i_max; give the stall torque where there is none.
     """  # noqa: E501
 
     position_gain: float = quantity("N·m/rad", gt=0)
@@ -51,14 +62,32 @@ class Servo(Model):
     """Largest torque of the servo at the output [N·m]."""
     speed_limit: float = quantity("rad/s", gt=0)
     """No-load speed of the servo at the output [rad/s]."""
+    motor: Motor | None = quantity("1", None)
+    """DC motor with back-EMF and PWM limit; None for a torque that does not depend on speed [1]."""
+
+    @property
+    def braking(self) -> float:
+        """k_v and what the back-EMF adds to it [N·m·s/rad]."""
+        return self.velocity_gain + (0.0 if self.motor is None else self.motor.damping)
 
     @property
     def integral_limit(self) -> float:
         """Largest magnitude of the position error's integral [rad·s]; 0 without one."""
         if self.integral_gain == 0.0:
             return 0.0
-        most = self.torque_limit + self.velocity_gain * self.speed_limit
+        most = self.torque_limit + self.braking * self.speed_limit
         return most / self.integral_gain
+
+    def largest_torque(self, speed: Parameter = 0.0) -> Array:
+        """Torque that the servo has at a speed, broadcast from (..., n) [rad/s] to [N·m].
+
+        The motor's torque falls with the speed; without a motor it is the limit throughout.
+        """
+        limit = np.full(np.shape(speed), self.torque_limit)
+        if self.motor is None:
+            return limit
+        left = self.motor.stall_torque - self.motor.damping * np.abs(speed)
+        return np.minimum(limit, left.clip(min=0.0))
 
 
 class ElasticJoint(Model):
@@ -80,6 +109,12 @@ class ElasticJoint(Model):
     """Dry friction on the link side of the spring [N·m]."""
     viscous_friction: float = quantity("N·m·s/rad", 0.0, ge=0)
     """Viscous friction on the link side [N·m·s/rad]."""
+    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
+    """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
+    static_friction: float = quantity("N·m", 0.0, ge=0)
+    """F_s, what dry friction has more at rest than in motion [N·m]."""
+    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
+    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
     """Motor encoder, counts per turn of the output; None for continuous [1]."""
     servo: Servo | None = quantity("1", None)
@@ -91,6 +126,11 @@ class ElasticJoint(Model):
             raise ValueError(
                 f"backlash must be below half a turn, {np.pi:.4f} rad, got {self.backlash}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _static_friction_fades(self) -> Self:
+        require_fading(self.static_friction, self.stribeck_speed)
         return self
 
 
@@ -196,12 +236,8 @@ def static_link_angle(
     found = follow_load(
         theta, 1.0 / K, torque, torque_gradient, tolerance=tolerance, rows=is_soft, unique=unique
     )
-    if (lost := found.lost).any():
-        worst = float(np.abs(residual / K)[lost[..., 0]].max())
-        raise ElasticError(
-            f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {worst:.3g} rad,"
-            f" required {tolerance:.3g} rad; {found.reason(1.0 / K)}"
-        )
+    if found.lost.any():
+        raise ElasticError(f"the link angle at rest is not clear, Eq. 10: {found.reason(1.0 / K)}")
     is_same = ~open_rows & (np.abs(found.q - q).max(axis=-1, keepdims=True) < _SAME_RAD)
     return np.where(is_soft & ~is_same, found.q, q)
 

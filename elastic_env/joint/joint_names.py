@@ -24,6 +24,14 @@ def servo_name(joint: str) -> str:
     return f"{joint}_servo"
 
 
+FRICTION_SUFFIX = "_dry_friction"
+
+
+def friction_name(joint: str) -> str:
+    """Name of the numbers of a dry friction that varies."""
+    return f"{joint}{FRICTION_SUFFIX}"
+
+
 @dataclass(frozen=True)
 class JointAddresses:
     """Indices of motor and link angles of the elastic joints in `qpos` and `qvel`, each (n,)."""

@@ -14,10 +14,14 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.friction import require_fading
+from elastic_env.joint.motor import Motor
+from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 
 GivenJoints = str | Path | Mapping[str, Any]
 """A YAML file, or a mapping from joint names or patterns to `JointSettings`, K alone [N·m/rad],
-"rigid" or "held".
+the name of one of `SMALL_SERVOS`, "rigid" or "held".
 """
 HELD = "held"
 """Value of a joint that nobody commands: it stays where the model's first keyframe has it."""
@@ -55,7 +59,9 @@ class ServoSettings(Model):
     rad/s² [N·m].
     """
     speed_limit: float | None = quantity("rad/s", None, gt=0)
-    """No-load speed; default a turn a second [rad/s]."""
+    """No-load speed; default that of the motor, else a turn a second [rad/s]."""
+    motor: Motor | None = quantity("1", None)
+    """DC motor, with which the torque falls with the speed; default none [1]."""
 
     @model_validator(mode="after")
     def _pushes(self) -> Self:
@@ -64,6 +70,11 @@ class ServoSettings(Model):
                 f"position_gain must be at least {SOFTEST:g} [N·m/rad], got {self.position_gain:g}"
             )
         return self
+
+    @property
+    def braking(self) -> float:
+        """k_v and what the back-EMF adds to it, as far as they are known [N·m·s/rad]."""
+        return (self.velocity_gain or 0.0) + (0.0 if self.motor is None else self.motor.damping)
 
     def over(self, found: "ServoSettings") -> "ServoSettings":
         """These settings where they say something, else what was found in the model.
@@ -118,6 +129,12 @@ class JointSettings(Model):
     """Viscous friction on the link; default the joint's damping, unless it damps the servo
     [N·m·s/rad].
     """
+    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
+    """c, share of the torque passed that is lost to dry friction; default none [1]."""
+    static_friction: float = quantity("N·m", 0.0, ge=0)
+    """F_s, what dry friction has more at rest; default none [N·m]."""
+    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
+    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
     backlash: float = quantity("rad", 0.0, ge=0)
     """Dead band; default none, as the scenario has one [rad]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
@@ -130,6 +147,7 @@ class JointSettings(Model):
             raise ValueError(
                 f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}"
             )
+        require_fading(self.static_friction, self.stribeck_speed)
         return self
 
     @property
@@ -199,6 +217,8 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return None
     if isinstance(value, JointSettings):
         return value
+    if isinstance(value, str) and value in SMALL_SERVOS:
+        return _settings_of(small_servo(value))
     own = (
         value
         if isinstance(value, Mapping)
@@ -217,3 +237,11 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return JointSettings(**settings)
     except ConfigurationError as error:
         raise ConfigurationError(f"joint {name!r}: {error}") from None
+
+
+def _settings_of(joint: ElasticJoint) -> JointSettings:
+    """A known joint with its servo, as settings."""
+    known = {name: getattr(joint, name) for name in JointSettings.model_fields if name != "servo"}
+    assert joint.servo is not None
+    servo = {name: getattr(joint.servo, name) for name in ServoSettings.model_fields}
+    return JointSettings(**known, servo=ServoSettings(**servo))

@@ -36,7 +36,8 @@ class LoadPath:
         q: Last stable link angles on the path, (..., n) [rad].
         load: Share of the load there, (..., 1); 1 where the path leads to an equilibrium.
         joint: Joint that gives way most easily there, (...).
-        other: Another stable equilibrium of that joint, nan where none is known, (...) [rad].
+        other: Up to two other stable equilibria of that joint, nan where none is known, (..., 2)
+            [rad].
         lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others
             may not be complete.
     """
@@ -61,16 +62,17 @@ class LoadPath:
         if names is not None:
             name = names[joint]
         question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
+        others = [f"at {angle:.4g} rad" for angle in self.other[row] if not np.isnan(angle)]
         if self.load[row] < 1.0:
+            there = "which pose it comes to rest in is not known"
+            if others:
+                there = f"it can rest {' and '.join(others)}"
             return (
                 f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q"
-                " becomes singular: the link tips over, and which pose it comes to rest in is not"
-                " known"
+                f" becomes singular: the link tips over, and {there}"
             )
-        return (
-            f"{question} The pose is bistable: the link can rest at {self.q[(*row, joint)]:.4g} rad"
-            f" and at {self.other[row]:.4g} rad"
-        )
+        here = f"at {self.q[(*row, joint)]:.4g} rad"
+        return f"{question} The pose is bistable: the link can rest {' and '.join([here, *others])}"
 
 
 def follow_load(
@@ -83,6 +85,7 @@ def follow_load(
     rows: BoolArray | None = None,
     within: tuple[Array, Array] | None = None,
     unique: bool = True,
+    names_rest: bool = True,
     finest: float = 1e-8,
 ) -> LoadPath:
     """Follow the equilibrium from no load to the whole one.
@@ -98,6 +101,7 @@ def follow_load(
         rows: Rows to follow, (..., 1); the others stay at θ with the whole load. None for all.
         within: Lowest and highest angles of other equilibria that count, (n,) each [rad].
         unique: Whether to look for other equilibria.
+        names_rest: Whether to look where a link that tips over can rest.
         finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
     """
     C = np.broadcast_to(compliance, theta.shape)
@@ -121,13 +125,16 @@ def follow_load(
     else:
         lost = is_open
     joint = np.zeros(theta.shape[:-1], dtype=np.int64)
-    other = np.full(theta.shape[:-1], np.nan)
+    other = np.full((*theta.shape[:-1], 2), np.nan)
     if lost.any():
         joint = springs.softest(q, load)
+        if names_rest:
+            found, other = springs.others(q, lost, within)
+            joint = np.where(np.isnan(other[..., 0]), joint, found)
     elif unique:
         rows = np.ones_like(lost) if rows is None else rows
         joint, other = springs.others(q, rows, within)
-        lost = ~np.isnan(other)[..., None]
+        lost = ~np.isnan(other[..., :1])
     return LoadPath(q, load, joint, other, lost)
 
 
@@ -177,18 +184,20 @@ class _Springs:
     def others(
         self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None
     ) -> tuple[IntArray, Array]:
-        """Joints that can rest elsewhere, and where, nan for none.
+        """Joints that can rest elsewhere, (...), and where, (..., 2), nan for none.
 
         They are found along each joint alone, then of all joints.
         """
         n = q.shape[-1]
         lowest, highest = within or (np.full(n, -np.inf), np.full(n, np.inf))
-        other = np.full(q.shape[:-1], np.nan)
+        other = np.full((*q.shape[:-1], 2), np.nan)
         joint = np.zeros(q.shape[:-1], dtype=np.int64)
         whole = np.ones_like(rows, dtype=np.float64)
         for i in range(n):
             for start in self._crossings(q, i):
-                is_new = rows & np.isnan(other)[..., None] & ~np.isnan(start)[..., None]
+                is_of_other_joint = ~np.isnan(other[..., :1]) & (joint != i)[..., None]
+                is_open = np.isnan(other[..., 1:]) & ~is_of_other_joint
+                is_new = rows & is_open & ~np.isnan(start)[..., None]
                 if not is_new.any():
                     continue
                 begin = q.copy()
@@ -198,9 +207,13 @@ class _Springs:
                 is_allowed = np.abs(found - self.theta) <= _WOUND_RAD
                 is_allowed = is_allowed & (found >= lowest) & (found <= highest)
                 is_allowed = is_allowed.all(axis=-1, keepdims=True)
-                is_other = is_new & is_stable & is_apart & is_allowed
-                other = np.where(is_other[..., 0], found[..., i], other)
-                joint = np.where(is_other[..., 0], i, joint)
+                # NaN is apart from nothing
+                is_known = np.abs(found[..., i] - other[..., 0]) <= _OTHER_RAD
+                is_other = (is_new & is_stable & is_apart & is_allowed)[..., 0] & ~is_known
+                is_first = is_other & np.isnan(other[..., 0])
+                joint = np.where(is_first, i, joint)
+                other[..., 1] = np.where(is_other & ~is_first, found[..., i], other[..., 1])
+                other[..., 0] = np.where(is_first, found[..., i], other[..., 0])
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:

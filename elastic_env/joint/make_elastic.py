@@ -22,11 +22,13 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
+from elastic_env.joint.motor import Motor
 from elastic_env.joint.supported_models import require_few
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
+from elastic_env.joint.varying_friction import add_terms, varies
 
 Form = Literal["tendon", "rigid"]
 ActuatorRule = Literal["keep", "replace"]
@@ -87,13 +89,21 @@ def make_elastic(
             which it does.
 
     Warns:
-        UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its
-            actuators.
+        UserWarning: The integrator was changed, a servo is left out because the hinge keeps its
+            actuators, or friction changes with load or speed, which needs a call before every step.
     """
     require_few(joints)
     elastic = transform_hinges(read_model(spec).spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
+    changing = [name for name, joint in joints.items() if varies(joint)]
+    if changing:
+        warnings.warn(
+            f"the dry friction of {', '.join(changing)} changes with load or speed, which MuJoCo"
+            " does not simulate by itself: make friction = elastic_env.VaryingFriction(model), and"
+            " call friction.update(model, data) before every mj_step",
+            stacklevel=2,
+        )
     return elastic
 
 
@@ -161,7 +171,8 @@ def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
     require_known("hinge", [name], hinges)
     taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
     taken |= {motor_name(name)} & {body.name for body in spec.bodies}
-    for derived in (motor_name(name), spring_name(name), servo_name(name)):
+    taken |= {number.name for number in spec.numerics}
+    for derived in (motor_name(name), spring_name(name), servo_name(name), friction_name(name)):
         if derived in taken:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"
@@ -180,7 +191,7 @@ def _transform(
         hinge.armature = 0.0
         _add_rotor(spec, hinge, joint)
         _add_spring(spec, name, joint)
-    _add_friction(hinge, joint)
+    _add_friction(spec, hinge, joint)
     _drive(spec, name, driven, joint.servo, rule)
     _follow_actuators(spec, name, driven)
 
@@ -274,11 +285,13 @@ def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
     spring.springlength = np.array([-joint.backlash / 2, joint.backlash / 2])
 
 
-def _add_friction(hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+def _add_friction(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
     """Friction on the link angle, on top of what the hinge has."""
     hinge.damping = hinge.damping + np.array([joint.viscous_friction, 0.0, 0.0])
-    if joint.coulomb_friction > 0.0:
-        hinge.frictionloss += joint.coulomb_friction
+    hinge.frictionloss += joint.coulomb_friction
+    if varies(joint):
+        add_terms(spec, hinge, joint)
+    if joint.coulomb_friction > 0.0 or varies(joint):
         hinge.solref_friction[:] = _FRICTION_SOLREF
         hinge.solimp_friction[:] = _FRICTION_SOLIMP
 
@@ -340,14 +353,41 @@ def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> Non
     actuator.inheritrange = 0.0
     actuator.ctrlrange = np.zeros(2)
     actuator.cranklength = 0.0
-    actuator.set_to_pid(
-        kp=servo.position_gain,
-        kv=servo.velocity_gain,
-        ki=servo.integral_gain,
-        imax=servo.integral_limit,
-        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
-    )
+    if servo.motor is None:
+        actuator.set_to_pid(
+            kp=servo.position_gain,
+            kv=servo.velocity_gain,
+            ki=servo.integral_gain,
+            imax=servo.integral_limit,
+            ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+        )
+    else:
+        _set_to_motor(actuator, servo, servo.motor)
     actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
+
+
+def _set_to_motor(actuator: mujoco.MjsActuator, servo: Servo, motor: Motor) -> None:
+    """MuJoCo's DC motor with the servo's PID on its voltage.
+
+    MuJoCo has one motor constant K = k_t = k_e, of a gear without losses. With K = sqrt(k_t k_e)
+    and the voltage scaled by sqrt(k_t / k_e), torque at rest and back-EMF are those of the motor.
+    Its controller takes the back-EMF off the torque, as a driver that controls the current does;
+    the velocity gain gives it back.
+    """
+    limit = motor.voltage * motor.pwm_limit
+    actuator.set_to_dcmotor(
+        motorconst=[np.sqrt(motor.torque_constant * motor.back_emf), 0.0],
+        resistance=motor.resistance,
+        controller=[
+            servo.position_gain,
+            servo.integral_gain,
+            servo.braking,
+            0.0,
+            servo.integral_limit,
+            limit * np.sqrt(motor.torque_constant / motor.back_emf),
+        ],
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+    )

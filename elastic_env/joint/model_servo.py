@@ -36,6 +36,12 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
         ConfigurationError: There are several, or it has a law that a `Servo` has not.
     """
     actuators = _actuators(model, joint)
+    if (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_DCMOTOR).any():
+        raise ConfigurationError(
+            f"joint {joint!r} has a dcmotor, whose gains are not read; say position_gain, and"
+            " `motor` with torque_constant, back_emf, resistance and voltage, under `servo` of this"
+            " joint in `joints`"
+        )
     position = [i for i in actuators if model.actuator_biasprm[i, 1] != 0.0]
     if not position:
         return None  # a motor or a velocity servo: a position servo takes its place

@@ -22,6 +22,7 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
+from elastic_env.joint.friction import passed_torque
 from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.motion.arm_references import (
     AnyArmReference,
@@ -117,6 +118,7 @@ class JointRobot:
         sensors: Sequence[str] = (),
         reward: RewardWeights | dict[str, float] | None = None,
         timestep_s: float | None = None,
+        action_bound_rad: float = ACTION_BOUND_RAD,
     ) -> JointRobotConfig:
         """The configuration from the arguments of `gymnasium.make`.
 
@@ -132,6 +134,7 @@ class JointRobot:
                 `elastic_env.world.further_sensors`.
             reward: Weights of the reward terms, or a mapping of what differs from the default.
             timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
+            action_bound_rad: Largest command offset [rad].
 
         Raises:
             ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -146,6 +149,7 @@ class JointRobot:
             form=form,
             sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
             reward=as_model("reward", reward, RewardWeights()),
+            action_bound_rad=action_bound_rad,
             **({} if timestep_s is None else {"timestep_s": timestep_s}),
         )
 
@@ -294,7 +298,9 @@ def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
     if config.scenario.friction_scale > 0.0:
         return config.joints
     return {
-        name: one.replace(coulomb_friction=0.0, viscous_friction=0.0)
+        name: one.replace(
+            coulomb_friction=0.0, viscous_friction=0.0, load_friction=0.0, static_friction=0.0
+        )
         for name, one in config.joints.items()
     }
 
@@ -339,10 +345,8 @@ def _workspace(
 
 def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
     """True if servos hold poses with a fifth of their torque to spare, (..., n) [rad] to (...)."""
-    limits = np.array([servo.torque_limit for servo in robot.servos])
-    return np.all(
-        np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1
-    )
+    needed = robot.largest_passed_torque(body.gravity_torque(q))
+    return np.all(needed < _SPARE * robot.largest_torque(np.zeros_like(q)), axis=-1)
 
 
 def _require_torque(
@@ -359,8 +363,9 @@ def _require_torque(
     needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(
         axis=0
     )
-    needed += robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
-    limits = np.array([servo.torque_limit for servo in robot.servos])
+    fastest = np.abs(q_dot).max(axis=0)
+    needed = robot.largest_passed_torque(needed + robot.viscous_friction * fastest)
+    limits = robot.largest_torque(fastest)
     if not isinstance(config.reference, OfArm):
         require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
@@ -381,16 +386,18 @@ def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: A
         torque: Gravity torque along the reference, (T, n) [N·m].
     """
     stiffness = known.rest_stiffness(config.form)
-    needed = np.abs(torque).max(axis=0) / stiffness
+    most = passed_torque(np.abs(torque).max(axis=0), 1.0, 0.0, known.load_friction)
+    needed = most / stiffness
     worst = int(needed.argmax())
-    if needed[worst] > ACTION_BOUND_RAD:
-        enough = np.abs(torque[:, worst]).max() / ACTION_BOUND_RAD
+    bound = config.action_bound_rad
+    if needed[worst] > bound:
+        enough = most[worst] / bound
         warnings.warn(
             f"the weight along the reference {config.reference.kind!r} bends joint"
             f" {known.joint_names[worst]!r} by up to {needed[worst]:.3g} rad, and actions are cut"
-            f" at ±{ACTION_BOUND_RAD:g} rad: no policy can take all of it back. Spring and servo"
-            f" together need {enough:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them more,"
-            " or choose poses with less load",
+            f" at ±{bound:g} rad: no policy can take all of it back. Spring and servo together"
+            f" need {enough:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them more, raise"
+            " action_bound_rad, or choose poses with less load",
             stacklevel=4,
         )
 

@@ -6,9 +6,12 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.joint_names import spring_name
+from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.scenario import Scenario
 
 
@@ -41,6 +44,26 @@ def set_joints(
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
     for name in ("dof_frictionloss", "dof_damping"):
         field(name)[links] = getattr(model, name)[links] * robot.friction
+    if (varying := VaryingFriction.of(model)) is not None:
+        terms = varying.numbers[:-1]  # all but the speed
+        field("numeric_data")[terms] = model.numeric_data[terms] * robot.friction
+
+
+def require_passing(robot: RobotModel, scenario: Scenario) -> None:
+    """Refuse a scenario whose draws let a joint pass no torque at all.
+
+    Raises:
+        ConfigurationError: Friction takes the whole load of a joint.
+    """
+    factor = max((own.friction[1] for own in scenario.ranges), default=1.0)
+    worst = int(robot.load_friction.argmax())
+    share = float(robot.load_friction[worst])
+    if factor * share >= 1.0:
+        raise ConfigurationError(
+            f"the scenario {scenario.name!r} draws up to {factor:g} times the friction, and joint"
+            f" {robot.joint_names[worst]!r} has load_friction = {share:g}: its friction would take"
+            f" the whole load; draw less than {1.0 / share:.3g} times, or choose another scenario"
+        )
 
 
 def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:

@@ -11,6 +11,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
 from elastic_env.world.scenario import WALKER_FIELDS, Scenario, make_scenario, scenario_names
+from elastic_env.world.task import ACTION_BOUND_RAD
 
 
 class RewardWeights(Model):
@@ -38,6 +39,8 @@ class JointConfig(Model):
     timestep_s: float = quantity("s", 5e-4, gt=0)
     """Physics step [s]."""
     reward: RewardWeights = RewardWeights()
+    action_bound_rad: float = quantity("rad", ACTION_BOUND_RAD, gt=0, lt=np.pi)
+    """Largest command offset; servos that give way far need more than the default [rad]."""
 
     @model_validator(mode="after")
     def _scenario_acts(self) -> Self:
@@ -50,12 +53,18 @@ class JointConfig(Model):
         return self
 
     def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A known joint as the plant of the scenario has it."""
+        """A known joint as the plant of the scenario has it.
+
+        Raises:
+            ConfigurationError: With more friction it passes no torque at all.
+        """
         scenario = self.scenario
         return joint.replace(
             stiffness=joint.stiffness * scenario.stiffness_scale,
             coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
             viscous_friction=joint.viscous_friction * scenario.friction_scale,
+            load_friction=joint.load_friction * scenario.friction_scale,
+            static_friction=joint.static_friction * scenario.friction_scale,
             backlash=joint.backlash + scenario.backlash_rad,
         )
 

@@ -23,7 +23,12 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
+from elastic_env.world.drawn_robot import (
+    require_passing,
+    set_joints,
+    spring_ids,
+    stiffest_plant,
+)
 from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.metrics import Metric
@@ -168,6 +173,7 @@ class JointTask(Task):
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
         reference = PlanTable(plant.motion, period_s, num_worlds)
+        require_passing(plant.true, scenario)
         require_stable(stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
@@ -188,6 +194,7 @@ class JointTask(Task):
                 *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
             ),
             rules=joint_rules(period_s, [(counts, False), (counts, True)]),
+            action_bound_rad=config.action_bound_rad,
         )
         self._plant = plant
         self._joint_names = joints

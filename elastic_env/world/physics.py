@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.joint.varying_friction import VaryingFriction
 
 
 class Simulation(Protocol):
@@ -104,13 +105,36 @@ _OTHERS = {
 
 
 class _Worlds(Simulation):
-    """Bound fields and warnings of both simulations."""
+    """Bound fields, warnings and varying friction of both simulations."""
 
     _counts: IntArray
     """Numbers of all warnings, (num_worlds, kinds)."""
     _said: set[str]
     """Warnings of MuJoCo that were passed on, once."""
     _views: dict[tuple[str, ...], tuple[Array, ...]]
+    _friction: VaryingFriction | None
+    """Friction that is set before every physics step; None where it does not vary."""
+
+    @override
+    def advance(self, num_substeps: int) -> None:
+        if self._friction is None:
+            self._step(num_substeps)
+            return
+        for _ in range(num_substeps):
+            self._rub(self._friction)
+            self._step(1)
+
+    def _step(self, num_substeps: int) -> None:
+        raise NotImplementedError
+
+    def _field(self, name: str) -> Array:
+        """A field of the models, (num_worlds, ...) or (1, ...)."""
+        raise NotImplementedError
+
+    def _rub(self, friction: VaryingFriction) -> None:
+        """Set the friction of all worlds by their states."""
+        limits = friction.limits(self._field, self.bind)
+        self.vary("dof_frictionloss")[:, friction.links] = limits
 
     @override
     def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
@@ -154,6 +178,7 @@ class SingleWorld(_Worlds):
         self._is_own = is_own
         self._counts = data.warning.number[None]
         self._views = {}
+        self._friction = VaryingFriction.of(model)
         self.qpos = data.qpos[None]
         self.qvel = data.qvel[None]
         self.act = data.act[None]
@@ -191,7 +216,11 @@ class SingleWorld(_Worlds):
         return self.model
 
     @override
-    def advance(self, num_substeps: int) -> None:
+    def _field(self, name: str) -> Array:
+        return getattr(self.model, name)[None]
+
+    @override
+    def _step(self, num_substeps: int) -> None:
         mujoco.mj_step(self.model, self._data, num_substeps)
 
     @override
@@ -202,6 +231,8 @@ class SingleWorld(_Worlds):
     @override
     def refresh(self, worlds: BoolArray) -> None:
         if worlds[0]:
+            if self._friction is not None:
+                self._rub(self._friction)
             mujoco.mj_forward(self.model, self._data)
 
 
@@ -230,6 +261,7 @@ class ManyWorlds(_Worlds):
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views = {}
+        self._friction = VaryingFriction.of(model)
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
         self._counts = self._batch.warning[..., 1]
         self.qpos = self._batch.bind("qpos")
@@ -294,7 +326,11 @@ class ManyWorlds(_Worlds):
         return self._ready().get_model(world)
 
     @override
-    def advance(self, num_substeps: int) -> None:
+    def _field(self, name: str) -> Array:
+        return self.vary(name) if name in self._varied else getattr(self.model, name)[None]
+
+    @override
+    def _step(self, num_substeps: int) -> None:
         self._ready().step(nstep=num_substeps)
 
     @override
@@ -305,6 +341,8 @@ class ManyWorlds(_Worlds):
     @override
     def refresh(self, worlds: BoolArray) -> None:
         if worlds.any():
+            if self._friction is not None:
+                self._rub(self._friction)
             self._ready().forward(worlds)
 
 

@@ -14,6 +14,8 @@ from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
 from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.friction import passed_torque
+from elastic_env.joint.varying_friction import varies
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rigid.biped import Biped
 
@@ -72,6 +74,52 @@ class RobotModel:
         return self._values("viscous_friction")
 
     @property
+    def load_friction(self) -> Array:
+        """Shares of the torques passed that are lost to dry friction, (n,) [1]."""
+        return self._values("load_friction")
+
+    @property
+    def static_friction(self) -> Array:
+        """What dry friction has more at rest, (n,) [N·m]."""
+        return self._values("static_friction")
+
+    @property
+    def stribeck_speed(self) -> Array:
+        """Speeds by which that falls to 37 %, (n,) [rad/s]."""
+        return self._values("stribeck_speed")
+
+    def require_constant_friction(self, who: str) -> None:
+        """Refuse friction that changes with load or speed, for one who does not know it.
+
+        Raises:
+            ConfigurationError: A joint has such friction.
+        """
+        changing = [name for name, joint in self.joints.items() if varies(joint)]
+        if changing:
+            raise ConfigurationError(
+                f"{who} knows constant dry friction only, and that of {', '.join(changing)} has"
+                " load_friction or static_friction; the policy 'friction' knows both"
+            )
+
+    def largest_passed_torque(self, torque: Array) -> Array:
+        """Largest torque that servos need to move links against friction, (..., n) [N·m].
+
+        Args:
+            torque: What the links need, of either sign, (..., n) [N·m].
+        """
+        friction = self.coulomb_friction + self.static_friction
+        return passed_torque(np.abs(torque), 1.0, friction, self.load_friction)
+
+    def largest_torque(self, speed: Array) -> Array:
+        """Torques that the servos have at speeds, (..., n) [rad/s] to (..., n) [N·m].
+
+        Raises:
+            ConfigurationError: A joint has no servo.
+        """
+        each = [servo.largest_torque(speed[..., i]) for i, servo in enumerate(self.servos)]
+        return np.stack(each, axis=-1)
+
+    @property
     def encoder_counts_per_turn(self) -> int | None:
         """Counts of the encoders, which are all alike; None for continuous ones."""
         return next(iter(self.joints.values())).encoder_counts_per_turn
@@ -100,9 +148,12 @@ class RobotModel:
 
     @property
     def servo_lag(self) -> Array:
-        """k_v/k_p, (n,) [s]: a strongly damped servo takes as long; 0 without one."""
+        """k_v/k_p, (n,) [s]: a strongly damped servo takes as long; 0 without one.
+
+        The back-EMF of a motor damps like k_v.
+        """
         servos = [joint.servo for joint in self.joints.values()]
-        return np.array([0.0 if s is None else s.velocity_gain / s.position_gain for s in servos])
+        return np.array([0.0 if s is None else s.braking / s.position_gain for s in servos])
 
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
         """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.

@@ -71,14 +71,12 @@ be.
 """
 
 
-def action_table(joints: Sequence[str]) -> SignalTable:
-    """The action: an offset for every joint."""
+def action_table(joints: Sequence[str], bound_rad: float = ACTION_BOUND_RAD) -> SignalTable:
+    """The action: an offset for every joint, within ± a bound."""
     offsets = SignalGroup.of(
         "command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command"
     ).signals
-    return SignalTable(
-        tuple(replace(own, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for own in offsets)
-    )
+    return SignalTable(tuple(replace(own, low=-bound_rad, high=bound_rad) for own in offsets))
 
 
 def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
@@ -130,6 +128,7 @@ class Task(ABC):
         scenarios: Of every world.
         metrics: Figures of an episode.
         rules: Records of `elastic_env.world.rows.RULES`, one for every kind of world.
+        action_bound_rad: Largest command offset [rad].
 
     Attributes:
         failure_names: Reasons, beside `DIVERGED`, why an episode can be terminated.
@@ -155,6 +154,7 @@ class Task(ABC):
         scenarios: Sequence[Scenario],
         metrics: Sequence[Metric],
         rules: Records,
+        action_bound_rad: float = ACTION_BOUND_RAD,
     ) -> None:
         joints = assumed.joint_names
         num_worlds = len(reference.plan_of_world)
@@ -165,7 +165,7 @@ class Task(ABC):
         self.num_steps = reference.num_steps
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         self.observation_table = SignalTable((*table, *sensors.signals))
-        self.action_table = action_table(joints)
+        self.action_table = action_table(joints, action_bound_rad)
         self.assumed_model = assumed.observed_by(self.observation_table)
         self.metrics = metrics
         self._reference = reference

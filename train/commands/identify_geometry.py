@@ -120,7 +120,7 @@ def pose_problem(
     markers = [(name, *place_of(model, name)) for name in names]
     measured = log.measured.reshape(len(log), len(names), 3)
     geometry = align_tracker(
-        GeometryModel.of(tree, model.opt.gravity, markers), log.theta, measured
+        GeometryModel.of(tree, log.joints, model.opt.gravity, markers), log.theta, measured
     )
     problem = GeometryProblem(
         model=geometry,

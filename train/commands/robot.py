@@ -23,6 +23,7 @@ from elastic_env.core.errors import ConfigurationError, ElasticError, quote
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
 from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.friction import dry_friction
 from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
@@ -306,7 +307,16 @@ def joint_shares(plant: JointPlant) -> pd.DataFrame:
     error = parts.sum(axis=-1)
     whole = max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
     lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
-    friction = lever * plant.true.coulomb_friction / plant.true.rest_stiffness("tendon")
+    joints = plant.true
+    friction = dry_friction(
+        speed=np.zeros_like(q),
+        load=plant.static_torque(q),
+        coulomb=joints.coulomb_friction,
+        load_ratio=joints.load_friction,
+        static=joints.static_friction,
+        stribeck_speed=joints.stribeck_speed,
+    )
+    friction = lever * friction / joints.rest_stiffness("tendon")
     with np.errstate(divide="ignore"):
         position_gain = 1.0 / plant.true.servo_compliance
     return pd.DataFrame(

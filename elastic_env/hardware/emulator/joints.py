@@ -28,6 +28,11 @@ class Joints:
         joint = config.true_joint
         if joint.servo is None:
             raise ConfigurationError("an emulated joint needs a servo, got None")
+        if joint.servo.motor is not None:
+            raise ConfigurationError(
+                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
+                " its servo out"
+            )
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         model = spec.compile()
         self._simulation = simulate(model, num_joints, num_threads=1)

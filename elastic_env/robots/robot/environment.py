@@ -36,6 +36,7 @@ from elastic_env.world.joint_config import RewardWeights
 from elastic_env.world.joint_task import JointTask
 from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
+from elastic_env.world.task import ACTION_BOUND_RAD
 
 EXAMPLE = Path(__file__).with_name("example.xml")
 """The made-up arm that is played where no model is named; its joints are in the YAML file beside
@@ -69,6 +70,7 @@ def configure_robot(
     sensors: Sequence[str] = (),
     reward: RewardWeights | dict[str, float] | None = None,
     timestep_s: float | None = None,
+    action_bound_rad: float = ACTION_BOUND_RAD,
 ) -> RobotConfig:
     """The configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
 
@@ -94,6 +96,7 @@ def configure_robot(
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where
             the joints explode with it the largest stable one [s].
+        action_bound_rad: Largest command offset [rad].
 
     Raises:
         ConfigurationError: A file, a name, a parameter or a combination that does not exist, or a
@@ -109,7 +112,16 @@ def configure_robot(
     robot = replace(
         robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg})
     )
-    settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
+    settings = robot.configure(
+        reference=reference,
+        scenario=scenario,
+        stiffness=stiffness,
+        form=form,
+        sensors=sensors,
+        reward=reward,
+        timestep_s=timestep_s,
+        action_bound_rad=action_bound_rad,
+    )
     if timestep_s is None:
         played = stiffest_plant(
             compiled_spec(robot.elastic(settings), "the model with elastic joints"),

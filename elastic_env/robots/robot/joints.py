@@ -213,6 +213,9 @@ class _Assumed:
                 own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])
             ),
             viscous_friction=_first(own.viscous_friction, damping),
+            load_friction=own.load_friction,
+            static_friction=own.static_friction,
+            stribeck_speed=own.stribeck_speed,
             backlash=own.backlash,
             encoder_counts_per_turn=own.encoder_counts_per_turn,
             servo=self._servo(servo, rotor, ratio, is_given),
@@ -263,29 +266,39 @@ class _Assumed:
         links = self._links
         kp = _first(known.position_gain, ratio * self._own.stiffness)
         kv = known.velocity_gain
+        back_emf = 0.0 if known.motor is None else known.motor.damping
         if kv is None:
             carries_links = (
                 known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
             )
-            kv = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
+            critical = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
+            kv = max(critical - back_emf, 0.0)
             if known.position_gain is not None and not is_given:
                 self.said.append(
                     f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as"
                     " nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
+        motor = known.motor
         limit = known.torque_limit
         if limit is None:
             limit = force_limit(self._model, self._name)
+        if limit is None and motor is not None:
+            limit = motor.stall_torque
         # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh
         # bounds by k_v/(B + M)
-        rate = min(DECAY_RATE_PER_S, kv / (4.0 * (rotor + links.most)))
+        rate = min(DECAY_RATE_PER_S, (kv + back_emf) / (4.0 * (rotor + links.most)))
         return Servo(
             position_gain=kp,
             velocity_gain=kv,
             integral_gain=_first(known.integral_gain, rate * kp),
             torque_limit=_first(limit, enough),
-            speed_limit=_first(known.speed_limit, _SPEED_LIMIT_RAD_S),
+            speed_limit=_first(
+                known.speed_limit,
+                None if motor is None else motor.no_load_speed,
+                _SPEED_LIMIT_RAD_S,
+            ),
+            motor=motor,
         )
 
 

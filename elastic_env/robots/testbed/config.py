@@ -80,10 +80,14 @@ def require_feasible(config: TestbedConfig) -> None:
     needed = (
         abs(float(pendulum.torque(np.array(worst_angle))))
         + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
-        + joint.coulomb_friction
         + joint.viscous_friction * extent.q_dot
     )
-    require_torque(config.reference, np.array([needed]), np.array([joint.servo.torque_limit]))
+    robot = RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), config.control_period_s)
+    require_torque(
+        config.reference,
+        robot.largest_passed_torque(np.array([needed])),
+        robot.largest_torque(np.array([extent.q_dot])),
+    )
 
 
 def _rest_angle(

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.small_servos import small_servo
 from elastic_env.motion.references import AnyReference, make_reference
 from elastic_env.registration import Robot, as_model
 from elastic_env.robots.testbed import ID, NAME
@@ -16,19 +17,21 @@ from elastic_env.robots.testbed.task import TestbedTask
 from elastic_env.world.joint_config import RewardWeights
 from elastic_env.world.robot_model import read_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
+from elastic_env.world.task import ACTION_BOUND_RAD
 
 
 def configure_testbed(
     reference: str | dict[str, Any] | AnyReference = "hold",
     scenario: str | Scenario = "nominal",
     stiffness: float | str | Path | None = None,
-    joint: ElasticJoint | dict[str, Any] | None = None,
+    joint: ElasticJoint | dict[str, Any] | str | None = None,
     pendulum: Pendulum | dict[str, Any] | None = None,
     form: Literal["tendon", "rigid"] = "tendon",
     observe_link: bool = False,
     reward: RewardWeights | dict[str, float] | None = None,
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
+    action_bound_rad: float = ACTION_BOUND_RAD,
 ) -> TestbedConfig:
     """The testbed's configuration from the arguments of `gymnasium.make`.
 
@@ -38,8 +41,8 @@ def configure_testbed(
         scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that
             of the joint.
-        joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the
-            default.
+        joint: Elastic joint, a mapping of what differs from the paper's H54-200-S500-R, the
+            default, or the name of one of `elastic_env.joint.small_servos`.
         pendulum: The load, or a mapping of what differs from the default of 60 N·m at the
             horizontal.
         form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
@@ -49,11 +52,13 @@ def configure_testbed(
         sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
             "accelerometer", see `elastic_env.world.further_sensors`, and "link_imu", which is the
             same as `observe_link`.
+        action_bound_rad: Largest command offset [rad].
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    chosen = as_model("joint", joint, H54_200_S500_R)
+    given = small_servo(joint) if isinstance(joint, str) else joint
+    chosen = as_model("joint", given, H54_200_S500_R)
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
     return TestbedConfig(
@@ -65,6 +70,7 @@ def configure_testbed(
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         observe_link=observe_link,
         reward=as_model("reward", reward, RewardWeights()),
+        action_bound_rad=action_bound_rad,
         **({} if timestep_s is None else {"timestep_s": timestep_s}),
     )
 

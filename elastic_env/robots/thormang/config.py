@@ -15,6 +15,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.time_step import require_stable
+from elastic_env.joint.varying_friction import varies
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
 from elastic_env.robots.thormang.model import (
@@ -82,6 +83,15 @@ class WalkConfig(Model):
     """Bank of robots that a scenario draws from [1]."""
     spare_bodies: int = quantity("1", 0, ge=0)
     """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
+
+    @model_validator(mode="after")
+    def _joints_are_plain(self) -> Self:
+        if any(varies(one) or (one.servo and one.servo.motor) for one in self.joints):
+            raise ValueError(
+                "joints of the walker must have neither load_friction nor static_friction nor a"
+                " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
+            )
+        return self
 
     @model_validator(mode="after")
     def _worlds_know_the_same(self) -> Self:

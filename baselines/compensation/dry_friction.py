@@ -1,0 +1,121 @@
+r"""Dry friction along a desired motion: its direction, and the torque that overcomes it.
+
+At rest nobody knows the sign of dry friction, only that of the motion before. So the direction s
+follows the reference: it turns round over a displacement [Dahl1968], stays at rest, and leaves out
+a dead zone in which the reference may tremble. What the transmission has to pass solves
+
+.. math:: \tau_J = \tau + s (F_0 + F_s e^{-(\omega / \omega_s)^2} + c |\tau_J|)
+
+[Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from elastic_env.core.signals import Array, Parameter
+from elastic_env.joint.friction import dry_friction, passed_torque
+
+PRESLIDING_RAD = 1e-3
+"""Displacement over which dry friction turns round [rad]."""
+DEAD_ZONE_RAD = 1.6e-3
+"""Displacement to either side that leaves the direction as it is, for joints whose friction varies:
+more than a count of small servos, which have 4096 a turn [rad].
+"""
+
+
+def presliding_friction(friction: Array, displacement: Array, coulomb: Parameter) -> Array:
+    r"""Coulomb friction with presliding [Dahl1968].
+
+    It turns round over a displacement, and stays at rest.
+
+    .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
+
+    Args:
+        friction: f, that holds the link back, before the displacement, (..., n) [N·m].
+        displacement: Δq, (..., n) [rad].
+        coulomb: F, (n,) [N·m].
+    """
+    full = coulomb * np.sign(displacement)
+    return full + (friction - full) * np.exp(-np.abs(displacement) / PRESLIDING_RAD)
+
+
+class FrictionMemory(NamedTuple):
+    """Memory of the friction, (..., n) each.
+
+    Attributes:
+        coulomb: Coulomb friction that holds the link back [N·m].
+        direction: s, from −1 to 1 [1].
+        slack: Way of the reference within the dead zone [rad].
+    """
+
+    coulomb: Array
+    direction: Array
+    slack: Array
+
+
+class FrictionCompensation:
+    """Torque that moves links against the dry friction of their joints.
+
+    Args:
+        coulomb: F₀, (n,) [N·m].
+        load_ratio: c, (n,) [1].
+        static: F_s, (n,) [N·m].
+        stribeck_speed: ω_s, (n,) [rad/s].
+    """
+
+    def __init__(
+        self, coulomb: Array, load_ratio: Array, static: Array, stribeck_speed: Array
+    ) -> None:
+        self._coulomb = coulomb
+        self._load_ratio = load_ratio
+        self._static = static
+        self._stribeck_speed = stribeck_speed
+        self._dead_zone = DEAD_ZONE_RAD * ((load_ratio > 0.0) | (static > 0.0))
+
+    def begin(self, shape: tuple[int, ...]) -> FrictionMemory:
+        """Memory before any motion, for links of this shape: friction holds neither side."""
+        zero = np.zeros(shape)
+        return FrictionMemory(zero, zero, zero)
+
+    def follow(self, displacement: Array, memory: FrictionMemory) -> FrictionMemory:
+        """Memory after the reference has moved by Δq, (..., n) [rad]."""
+        way = memory.slack + displacement
+        moved = way - way.clip(-self._dead_zone, self._dead_zone)
+        return FrictionMemory(
+            coulomb=presliding_friction(memory.coulomb, moved, self._coulomb),
+            direction=presliding_friction(memory.direction, moved, 1.0),
+            slack=way - moved,
+        )
+
+    def passed(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+        """τ_J, (..., n) [N·m].
+
+        Args:
+            torque: τ that the links need, (..., n) [N·m].
+            speed: ω of the reference, (..., n) [rad/s].
+            memory: After the displacement.
+        """
+        known = self._known(torque, speed, memory)
+        return passed_torque(known, memory.direction, 0.0, self._load_ratio)
+
+    def share(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+        """∂τ_J/∂τ, (..., n) [1]; arguments as of `passed`."""
+        known = self._known(torque, speed, memory)
+        return 1.0 / (1.0 - memory.direction * self._load_ratio * np.sign(known))
+
+    def most_passed(self, torque: Array) -> Array:
+        """Largest τ_J under loads of either sign at rest, (..., n) [N·m] to (..., n) [N·m]."""
+        friction = self._coulomb + self._static
+        return passed_torque(np.abs(torque), 1.0, friction, self._load_ratio)
+
+    def _known(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
+        """Load with the friction that does not grow with it, (..., n) [N·m]."""
+        excess = dry_friction(
+            speed,
+            load=torque,
+            coulomb=0.0,
+            static=self._static,
+            stribeck_speed=self._stribeck_speed,
+        )
+        return torque + memory.coulomb + memory.direction * excess

@@ -1,0 +1,90 @@
+r"""Dry friction of a joint: constant, growing with the load, and higher at rest.
+
+Small servos with worm, planetary or cheap spur gears lose a share of the torque that they pass. The
+teeth are pressed together by the load, so friction grows with it [Rhoban2025]; it falls from rest
+to motion [ArmstrongHelouvry1994].
+
+[Rhoban2025] M. Duclusaud, G. Passault, V. Padois, O. Ly, "Extended Friction Models for the Physics
+Simulation of Servo Actuators", ICRA 2025. [ArmstrongHelouvry1994] B. Armstrong-Hélouvry, P. Dupont,
+C. Canudas de Wit, "A survey of models, analysis tools and compensation methods for the control of
+machines with friction", Automatica 30(7).
+"""
+
+import numpy as np
+
+from elastic_env.core.signals import Array, Parameter
+
+
+def dry_friction(
+    speed: Array,
+    load: Array,
+    coulomb: Parameter,
+    load_ratio: Parameter = 0.0,
+    static: Parameter = 0.0,
+    stribeck_speed: Parameter = 0.0,
+) -> Array:
+    r"""Largest torque by which dry friction opposes motion [ArmstrongHelouvry1994].
+
+    .. math:: F = F_0 + c |\tau_J| + F_s \exp(-(\omega / \omega_s)^2)
+
+    A link that moves feels all of it against its speed. A link at rest feels what balances the
+    other torques, up to this at zero speed.
+
+    Args:
+        speed: ω of the link, (..., n) [rad/s].
+        load: τ_J, the torque that the transmission passes, (..., n) [N·m].
+        coulomb: F₀, broadcast against (..., n) [N·m].
+        load_ratio: c, share of the load that is lost to friction, likewise [1].
+        static: F_s, what friction at rest has more, likewise [N·m].
+        stribeck_speed: ω_s, by which F_s falls to 37 %, likewise; 0 for F_s at rest only [rad/s].
+
+    Returns:
+        F, (..., n) [N·m]; never negative.
+    """
+    steady = coulomb + load_ratio * np.abs(load) + np.zeros_like(speed)
+    if not np.asarray(static).any():
+        return steady
+    width = np.asarray(stribeck_speed)
+    has_width = width > 0.0
+    with np.errstate(over="ignore"):
+        relative = np.abs(speed) / np.where(has_width, width, 1.0)
+        excess = np.where(has_width, np.exp(-np.square(relative)), np.equal(speed, 0.0))
+    return steady + static * excess
+
+
+def passed_torque(
+    torque: Array, direction: Parameter, friction: Parameter, load_ratio: Parameter = 0.0
+) -> Array:
+    r"""Torque that a transmission must pass to move a link against friction that grows with it.
+
+    It solves :math:`\tau_J = \tau + s (F + c |\tau_J|)`:
+
+    .. math:: \tau_J = \frac{\tau + s F}{1 - s c \,\mathrm{sign}(\tau + s F)}
+
+    Up a slope of load that is (τ + F)/(1 − c), down it (τ − F)/(1 + c).
+
+    Args:
+        torque: τ that the link needs, gravity and inertia, (..., n) [N·m].
+        direction: s, the sign of the motion or, where the friction turns round, a share between −1
+            and 1, broadcast against (..., n) [1].
+        friction: F without the share of the load, likewise [N·m].
+        load_ratio: c, below 1, likewise [1].
+
+    Returns:
+        τ_J, (..., n) [N·m].
+    """
+    needed = torque + direction * friction
+    return needed / (1.0 - direction * load_ratio * np.sign(needed))
+
+
+def require_fading(static_friction: float, stribeck_speed: float) -> None:
+    """Refuse friction at rest without the speed by which it falls [N·m], [rad/s].
+
+    Raises:
+        ValueError: It is such.
+    """
+    if static_friction > 0.0 and stribeck_speed == 0.0:
+        raise ValueError(
+            f"static_friction = {static_friction:g} N·m needs a stribeck_speed above 0 [rad/s], by"
+            " which it falls to 37 %; 0.05 rad/s is usual for gears"
+        )

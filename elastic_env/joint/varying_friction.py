@@ -1,0 +1,143 @@
+"""Dry friction that changes with load and speed, in MuJoCo.
+
+MuJoCo's `frictionloss` of a joint is one number. Friction that grows with the load, or falls from
+rest to motion, has to be set anew before every physics step. `make_elastic` leaves the parameters
+in the model, as numbers named `<joint>_dry_friction`, and the environments of this project look
+after them. A program with a loop of its own does so in one line:
+
+    friction = VaryingFriction(model)
+    while running:
+        friction.update(model, data)
+        mujoco.mj_step(model, data)
+
+Load and speed are those at the beginning of the step, so that friction lags by one physics step.
+"""
+
+from collections.abc import Callable
+from typing import Self
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint, joint_torque
+from elastic_env.joint.friction import dry_friction
+from elastic_env.joint.joint_names import (
+    FRICTION_SUFFIX,
+    JointAddresses,
+    friction_name,
+    spring_name,
+)
+
+_TERMS = 4
+
+
+def varies(joint: ElasticJoint) -> bool:
+    """True if a joint's dry friction changes with its load or speed."""
+    return joint.load_friction > 0.0 or joint.static_friction > 0.0
+
+
+def add_terms(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+    """Leave the friction of a joint in the specification of an elastic model.
+
+    Args:
+        spec: Of the model.
+        hinge: Of the link; its `frictionloss` is the part that does not change.
+        joint: The rest.
+    """
+    terms = [hinge.frictionloss, joint.load_friction, joint.static_friction, joint.stribeck_speed]
+    spec.add_numeric(name=friction_name(hinge.name), size=_TERMS, data=terms)
+
+
+class VaryingFriction:
+    """Friction of the joints of an elastic model whose friction varies.
+
+    Args:
+        model: Compiled from what `make_elastic` made.
+
+    Attributes:
+        joints: Names of these joints; empty where no friction varies.
+        links: Their degrees of freedom, (n,).
+        numbers: Places of F₀, c, F_s and ω_s in `numeric_data`, (4, n).
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        names = [model.numeric(i).name for i in range(model.nnumeric)]
+        self.joints = [
+            name.removesuffix(FRICTION_SUFFIX) for name in names if name.endswith(FRICTION_SUFFIX)
+        ]
+        at = JointAddresses.of(model, self.joints)
+        self.links = at.q_dot
+        first = [model.numeric_adr[model.numeric(friction_name(j)).id] for j in self.joints]
+        self.numbers = np.array(first, dtype=np.int64) + np.arange(_TERMS)[:, None]
+        is_sprung = at.theta != at.q
+        self._sprung = np.flatnonzero(is_sprung)
+        self._rigid = np.flatnonzero(~is_sprung)
+        self._springs = np.array(
+            [model.tendon(spring_name(self.joints[i])).id for i in self._sprung], dtype=np.int64
+        )
+        self._at = at
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> Self | None:
+        """The same; None where no friction varies."""
+        if model.nnumeric == 0:
+            return None
+        found = cls(model)
+        return found if found.joints else None
+
+    def update(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Set the friction for the coming physics step of one world.
+
+        Args:
+            model: Whose `dof_frictionloss` is set.
+            data: Its state.
+        """
+        limits = self.limits(lambda name: getattr(model, name)[None], _rows_of(data))
+        model.dof_frictionloss[self.links] = limits[0]
+
+    def limits(self, field: Callable[[str], Array], state: Callable[[str], Array]) -> Array:
+        """Friction F of worlds in their states, (num_worlds, n) [N·m].
+
+        Args:
+            field: Rows of a field of the models, one for each world or one for all.
+            state: Rows of a field of the states.
+        """
+        terms = field("numeric_data")[:, self.numbers]
+        return dry_friction(
+            speed=state("qvel")[:, self.links],
+            load=self._load(field, state),
+            coulomb=terms[:, 0],
+            load_ratio=terms[:, 1],
+            static=terms[:, 2],
+            stribeck_speed=terms[:, 3],
+        )
+
+    def _load(self, field: Callable[[str], Array], state: Callable[[str], Array]) -> Array:
+        """τ_J, (num_worlds, n) [N·m].
+
+        A joint without a spring passes what its actuators leave when its rotor is accelerated, as
+        of the last physics step.
+        """
+        at = self._at
+        qpos = state("qpos")
+        qvel = state("qvel")
+        load = np.zeros((len(qpos), len(self.joints)))
+        if len(sprung := self._sprung):
+            ends = field("tendon_lengthspring")[:, self._springs]
+            load[:, sprung] = joint_torque(
+                qpos[:, at.theta[sprung]] - qpos[:, at.q[sprung]],
+                qvel[:, at.theta_dot[sprung]] - qvel[:, at.q_dot[sprung]],
+                stiffness=field("tendon_stiffness")[:, self._springs],
+                damping=field("tendon_damping")[:, self._springs],
+                backlash=ends[..., 1] - ends[..., 0],
+            )
+        if len(rigid := self._rigid):
+            links = self.links[rigid]
+            rotor = field("dof_armature")[:, links] * state("qacc")[:, links]
+            load[:, rigid] = state("qfrc_actuator")[:, links] - rotor
+        return load
+
+
+def _rows_of(data: mujoco.MjData) -> Callable[[str], Array]:
+    return lambda name: getattr(data, name)[None]

@@ -1,0 +1,126 @@
+"""Named servos against their makers' sheets, in MuJoCo: units at the output shaft."""
+
+import warnings
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+import elastic_env  # noqa: F401  registers the environments
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.hardware.emulator.joints import Joints
+from elastic_env.joint.joint_settings import read_joints
+from elastic_env.joint.make_elastic import transform_hinges
+from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
+from elastic_env.robots.robot.environment import configure_robot
+from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.world.physics import SingleWorld
+from tests.test_varying_friction import rigid_spec
+
+SHEETS = {
+    "XL330-M288": (0.52, 103.0),
+    "STS3215": (1.91, 45.0),
+    "STS3250": (4.90, 75.2),
+    "MX-64": (6.0, 63.0),
+    "MX-106": (8.4, 45.0),
+    "XM430-W350": (4.1, 46.0),
+}
+"""Stall torque [N·m] and speed without load [rev/min]: ROBOTIS' e-manual at the voltage of the
+table, Feetech's 19.5 kg·cm and 50 kg·cm."""
+
+
+def world(name: str) -> tuple[mujoco.MjModel, SingleWorld]:
+    """The servo with a small balanced link."""
+    spec = rigid_spec(timestep_s=2e-4)
+    model = transform_hinges(spec, {"q": small_servo(name)}).compile()
+    return model, SingleWorld(model)
+
+
+@pytest.mark.parametrize("name", SMALL_SERVOS)
+def test_a_named_servo_turns_as_fast_as_its_sheet_says(name: str) -> None:
+    """Catches constants of the bare motor, and revolutions in place of radians."""
+    model, simulated = world(name)
+    simulated.ctrl[0] = 1e4
+    simulated.advance(3000)
+    sheet = SHEETS[name][1] * 2.0 * np.pi / 60.0
+    assert simulated._data.joint("q").qvel[0] == pytest.approx(sheet, rel=0.35)
+    assert model.opt.timestep == 2e-4
+
+
+@pytest.mark.parametrize("name", SMALL_SERVOS)
+def test_a_named_servo_lifts_what_its_sheet_says(name: str) -> None:
+    """Catches kilograms at a centimetre, and a gear's loss that is counted twice: the load that
+    the servo still carries."""
+    joint = small_servo(name)
+    assert joint.servo is not None
+    most = float(joint.servo.largest_torque())
+    carried = (1.0 - joint.load_friction) * most - joint.coulomb_friction
+    assert carried == pytest.approx(SHEETS[name][0], rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("name", "gain"),
+    [("XL330-M288", 0.84), ("STS3215", 23.9), ("STS3250", 47.6), ("XM430-W350", 22.5)],
+)
+def test_the_position_gain_is_that_of_the_table(name: str, gain: float) -> None:
+    """Catches a register of another unit; k_p grows with register and supply."""
+    joint = small_servo(name)
+    assert joint.servo is not None
+    assert joint.servo.position_gain == pytest.approx(gain, rel=5e-3)
+    motor = SMALL_SERVOS[name].motor
+    twice = small_servo(name, gain=2.0 * SMALL_SERVOS[name].gain, voltage=0.5 * motor.voltage)
+    assert twice.servo is not None
+    assert twice.servo.position_gain == pytest.approx(joint.servo.position_gain)
+    assert twice.servo.torque_limit == pytest.approx(0.5 * joint.servo.torque_limit)
+
+
+def test_an_unknown_servo_names_those_that_are_known() -> None:
+    """Catches a name that leads nowhere."""
+    with pytest.raises(ConfigurationError, match=r"unknown servo 'XL-330'.*XL330-M288"):
+        small_servo("XL-330")
+
+
+def test_a_name_stands_for_the_joint_in_files_and_environments() -> None:
+    """Catches a parameter that is lost on the way to Robot-v0, the testbed or a live robot."""
+    joint = small_servo("STS3250")
+    (own,) = read_joints({"*": "STS3250"}, ["elbow"]).values()
+    assert own is not None
+    assert (own.stiffness, own.load_friction) == (joint.stiffness, joint.load_friction)
+    assert joint.servo is not None
+    assert own.servo.motor == joint.servo.motor
+    load = {"gravity_torque": 1.33, "mass": 1.13, "gyration_radius": 0.01}
+    env = gymnasium.make(
+        "elastic_env/Testbed-v0", joint="STS3250", pendulum=load, action_bound_rad=1.2
+    )
+    config: Any = env.unwrapped
+    assert config.task.config.joint == joint
+    space: Any = env.action_space
+    assert space.high == pytest.approx(1.2)
+    env.close()
+
+
+def test_an_emulated_servo_refuses_a_motor() -> None:
+    """Catches a torque that the emulator cannot switch off."""
+    config = TestbedConfig(joint=small_servo("STS3250"))
+    with pytest.raises(ConfigurationError, match=r"emulated servo controls its current"):
+        Joints(config, num_joints=1, start_s=0.0)
+
+
+def test_the_back_emf_is_part_of_the_damping_that_is_assumed() -> None:
+    """Catches a servo that is damped twice, by its motor and by an assumed velocity gain."""
+    motor = SMALL_SERVOS["STS3215"].motor
+    text = """<mujoco><worldbody><body name="link"><joint name="q" axis="0 -1 0"/>
+      <inertial mass="1" pos="0 0 -0.1" diaginertia="0.001 0.001 0.001"/></body></worldbody>
+    </mujoco>"""
+    braking = []
+    for servo in ({"position_gain": 20.0}, {"position_gain": 20.0, "motor": motor}):
+        own = {"stiffness": 400.0, "rotor_inertia": 0.02, "servo": {"torque_limit": 3.0, **servo}}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            config = configure_robot(text, {"q": own})
+        made = config.joints["q"].servo
+        assert made is not None
+        braking.append(made.braking)
+    assert braking[1] == pytest.approx(max(braking[0], motor.damping))
