@@ -9,8 +9,8 @@ from rich.console import Console
 
 from train.commands.cli import CONSOLE, run_program
 from train.commands.entry import start as start_program
-from train.figures.recorded_plots import draw_hand_errors
 from train.recorded.justin import HandError, hand_errors, num_trials, read_poses
+from train.recorded.pictures import draw_hand_errors
 from train.recorded.sources import JUSTIN, SOURCES
 from train.runs.console import make_table
 from train.runs.escaping import write_records

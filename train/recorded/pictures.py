@@ -29,8 +29,9 @@ def draw_hand_errors(rows: Sequence[HandError], path: Path) -> Path:
     for name, shade in zip(own, _SHADES, strict=True):
         points = [row for row in rows if row.prediction == name and row.mass_factor == 1.0]
         points = sorted(points, key=lambda row: row.poses)
-        counts = [row.poses for row in points]
-        right.plot(counts, [row.mean_mm for row in points], "o-", color=shade, label=name)
+        means = [row.mean_mm for row in points]
+        right.plot([row.poses for row in points], means, "o-", color=shade, label=name)
+    counts = sorted({row.poses for row in rows})
     right.set_xscale("log")
     right.set_xticks(counts, [f"{count}" for count in counts])
     right.minorticks_off()
