@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from docs.pages.cells import Rows, page_table
+from train.recorded.justin import DRAWN, GUESSED
 
 _SOURCE_MM = {
     "rigid, as given": "21.3",
@@ -15,7 +16,7 @@ _SOURCE_MM = {
 
 def hands(rows: Rows) -> str:
     """Held-out errors from most poses, beside what the source states in-sample."""
-    own = _of_masses(rows, 1.0)
+    own = _of_masses(rows, GUESSED)
     lines = [
         [
             row["prediction"],
@@ -36,28 +37,26 @@ def by_poses(rows: Rows) -> str:
     counts = sorted({int(row["poses"]) for row in rows})
     lines = []
     for name in [name for name in _SOURCE_MM if name.startswith("K")]:
-        found = {int(row["poses"]): row for row in _of_masses(rows, 1.0) if _is(row, name)}
+        found = {int(row["poses"]): row for row in _of_masses(rows, GUESSED) if _is(row, name)}
         lines.append([name, *(f"{float(found[count]['mean_mm']):.2f}" for count in counts)])
     return page_table(["mean error [mm] by poses that were fitted", *map(str, counts)], lines)
 
 
 def by_masses(rows: Rows) -> str:
-    """Held-out errors over factors on the guessed masses."""
-    factors = sorted({float(row["mass_factor"]) for row in rows})
+    """Held-out errors with the guessed masses, and with others."""
     lines = []
     for name in [name for name in _SOURCE_MM if name.startswith("K")]:
         found = [row for row in rows if _is(row, name) and int(row["poses"]) == _most(rows)]
-        by_factor = {float(row["mass_factor"]): float(row["mean_mm"]) for row in found}
-        lines.append([name, *(f"{by_factor[factor]:.2f}" for factor in factors)])
-    head = [f"× {factor:g}" for factor in factors]
-    return page_table(["mean error [mm] by the guessed masses", *head], lines)
+        by_masses = {row["masses"]: float(row["mean_mm"]) for row in found}
+        lines.append([name, *(f"{by_masses[masses]:.2f}" for masses in (GUESSED, DRAWN))])
+    return page_table(["mean error [mm] by masses", GUESSED, DRAWN], lines)
 
 
 def in_short(rows: Rows) -> str:
     """The humanoid in one sentence."""
     full = {
         row["prediction"]: float(row["mean_mm"])
-        for row in _of_masses(rows, 1.0)
+        for row in _of_masses(rows, GUESSED)
         if int(row["poses"]) == _most(rows)
     }
     best = min(value for name, value in full.items() if name.startswith("K"))
@@ -70,8 +69,8 @@ def in_short(rows: Rows) -> str:
     )
 
 
-def _of_masses(rows: Rows, factor: float) -> list[Mapping[str, str]]:
-    return [row for row in rows if float(row["mass_factor"]) == factor]
+def _of_masses(rows: Rows, masses: str) -> list[Mapping[str, str]]:
+    return [row for row in rows if row["masses"] == masses]
 
 
 def _most(rows: Rows) -> int:

@@ -63,7 +63,7 @@ def _print_hands(rows: list[HandError], console: Console) -> None:
         [
             row.prediction,
             f"{row.poses}",
-            f"{row.mass_factor:g}",
+            row.masses,
             f"{row.mean_mm:.2f}",
             f"{row.least_mm:.2f} to {row.most_mm:.2f}",
             f"{row.rms_mm:.2f}",
@@ -73,7 +73,7 @@ def _print_hands(rows: list[HandError], console: Console) -> None:
     title = (
         f"error of a hand at {rows[0].held_out} poses that were held out, {rows[0].halves} halves"
     )
-    head = ["prediction", "poses", "masses ×", "mean [mm]", "halves", "rms"]
+    head = ["prediction", "poses", "masses", "mean [mm]", "halves", "rms"]
     console.print(make_table(title, head, lines, box=box.SIMPLE))
 
 

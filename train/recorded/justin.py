@@ -30,8 +30,10 @@ from elastic_env.rigid.tree.links import Tree
 HALVES = 5
 """Random halves of the poses: one is fitted, the other is held out."""
 FEW_POSES = (20, 40, 80)
-MASS_FACTORS = (0.6, 1.0, 1.6)
-"""Factors on the guessed masses."""
+MASS_RANGE = (0.6, 1.6)
+"""Factors that are drawn for each guessed mass, to see how much hangs on the guesses."""
+GUESSED = "as guessed"
+DRAWN = f"each × {MASS_RANGE[0]:g} to {MASS_RANGE[1]:g}, drawn"
 
 
 class Row(NamedTuple):
@@ -65,8 +67,9 @@ _LEFT = (
 _MARKERS = {"right": (-0.1, -0.03, 0.1), "left": (-0.1, 0.03, 0.05)}
 # guesses
 _SHOULDERS = {"right": (0.0, -0.2, 0.1), "left": (0.0, 0.2, 0.1)}
-_TORSO_KG = (10.0, 6.0, 6.0, 18.0)
 _ARM_KG = (2.7, 2.7, 2.7, 2.7, 1.7, 1.6, 2.3)
+_MASSES_KG = np.array([10.0, 6.0, 6.0, 18.0, *_ARM_KG, *_ARM_KG])
+_AS_GUESSED = np.ones(len(_MASSES_KG))
 _INERTIA_KG_M2 = 0.01
 _POSES_OF_SEARCH = 40
 
@@ -120,24 +123,23 @@ def _numbers(text: str) -> list[float]:
     return [float(word) for word in text.replace("[", " ").replace("]", " ").split()]
 
 
-def justin_spec(shoulders: dict[str, Rotation], mass_factor: float = 1.0) -> mujoco.MjSpec:
+def justin_spec(shoulders: dict[str, Rotation], mass_factors: Array = _AS_GUESSED) -> mujoco.MjSpec:
     """The robot as it is published, with guesses for what is not.
 
     Args:
         shoulders: Rotation from the chest to the first joint of each arm that the model has.
-        mass_factor: Factor on all guessed masses.
+        mass_factors: Factors on the guessed masses of all links, (18,).
     """
+    torso_kg, right_kg, left_kg = np.split(mass_factors * _MASSES_KG, (4, 11))
     spec = mujoco.MjSpec()
     between_shoulders = np.mean(list(_SHOULDERS.values()), axis=0)
-    chest = _add_chain(
-        spec.worldbody, TORSO_JOINTS, _TORSO, mass_factor * np.array(_TORSO_KG), between_shoulders
-    )
+    chest = _add_chain(spec.worldbody, TORSO_JOINTS, _TORSO, torso_kg, between_shoulders)
     for side, rotation in shoulders.items():
         shoulder = chest.add_body(
             name=f"{side}_shoulder", pos=_SHOULDERS[side], quat=_wxyz(rotation)
         )
         rows = _RIGHT if side == "right" else _LEFT
-        masses = mass_factor * np.array(_ARM_KG)
+        masses = right_kg if side == "right" else left_kg
         marker = np.array(_MARKERS[side])
         hand = _add_chain(shoulder, ARM_JOINTS[side], rows, masses, marker)
         hand.add_site(name=f"{side}_hand", pos=marker)
@@ -186,10 +188,10 @@ def find_shoulder(side: str, poses: RecordedPoses) -> Rotation:
     return min(Rotation.create_group("D2"), key=missed)
 
 
-def find_rigid(poses: RecordedPoses, mass_factor: float = 1.0) -> mujoco.MjSpec:
+def find_rigid(poses: RecordedPoses, mass_factors: Array = _AS_GUESSED) -> mujoco.MjSpec:
     """The robot with the shoulders and the places of the markers that fit poses best, rigid."""
     few = poses.of(np.arange(min(_POSES_OF_SEARCH, len(poses.theta))))
-    spec = justin_spec({side: find_shoulder(side, few) for side in _MARKERS}, mass_factor)
+    spec = justin_spec({side: find_shoulder(side, few) for side in _MARKERS}, mass_factors)
     problem = _problem(spec, poses, tuple(_MARKERS)).as_rigid()
     return correct_model(spec, _tree(spec, problem.joints), fit_geometry(problem))
 
@@ -258,8 +260,8 @@ class HandError(Model):
     """Poses that were predicted, in each half."""
     halves: int
     """Random halves; the errors are means over them."""
-    mass_factor: float
-    """Factor on the guessed masses."""
+    masses: str
+    """`GUESSED` or `DRAWN`."""
     rms_mm: float
     """Root mean square over poses and hands."""
     mean_mm: float
@@ -275,10 +277,10 @@ def num_trials(count: int) -> int:
     return HALVES * len(_trials(count // 2))
 
 
-def _trials(half: int) -> list[tuple[int, float]]:
-    """Number of poses that are fitted, and factor on the masses."""
-    few = [(count, 1.0) for count in FEW_POSES if count < half]
-    return [*few, *((half, factor) for factor in MASS_FACTORS)]
+def _trials(half: int) -> list[tuple[int, str]]:
+    """Number of poses that are fitted, and masses."""
+    few = [(count, GUESSED) for count in FEW_POSES if count < half]
+    return [*few, (half, GUESSED), (half, DRAWN)]
 
 
 def hand_errors(poses: RecordedPoses, progress: Callable[[int], None]) -> list[HandError]:
@@ -289,25 +291,28 @@ def hand_errors(poses: RecordedPoses, progress: Callable[[int], None]) -> list[H
         progress: Called with the number of trials so far; `num_trials` says how many there are.
     """
     count = len(poses.theta)
-    found: dict[tuple[str, int, float], list[Array]] = {}
+    found: dict[tuple[str, int, str], list[Array]] = {}
     done = 0
     for half in range(HALVES):
-        order = np.random.default_rng(half).permutation(count)
+        generator = np.random.default_rng(half)
+        order = generator.permutation(count)
+        drawn = generator.uniform(*MASS_RANGE, len(_MASSES_KG))
         fitted = order[: count // 2]
         outer = poses.of(order[count // 2 :])
-        for number, factor in _trials(len(fitted)):
-            errors = _errors_of(poses.of(fitted[:number]), outer, factor)
+        for number, masses in _trials(len(fitted)):
+            factors = drawn if masses == DRAWN else _AS_GUESSED
+            errors = _errors_of(poses.of(fitted[:number]), outer, factors)
             for name, own in errors.items():
-                found.setdefault((name, number, factor), []).append(own)
+                found.setdefault((name, number, masses), []).append(own)
             done += 1
             progress(done)
     held_out = count - count // 2
     return [_summary(key, errors, held_out) for key, errors in found.items()]
 
 
-def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factor: float) -> dict[str, Array]:
+def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factors: Array) -> dict[str, Array]:
     """Distances of the hands from each prediction at the outer poses, (N, 2) [m]."""
-    spec = find_rigid(inner, mass_factor)
+    spec = find_rigid(inner, mass_factors)
     errors = dict[str, Array]()
     for variant in VARIANTS:
         problem = _problem(spec, inner, tuple(_MARKERS), variant.geometry, variant.lateral)
@@ -319,8 +324,8 @@ def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factor: float) -
     return errors
 
 
-def _summary(key: tuple[str, int, float], errors: list[Array], held_out: int) -> HandError:
-    name, number, factor = key
+def _summary(key: tuple[str, int, str], errors: list[Array], held_out: int) -> HandError:
+    name, number, masses = key
     means = [1e3 * float(own.mean()) for own in errors]
     rms = [1e3 * float(np.sqrt(np.mean(own**2))) for own in errors]
     return HandError(
@@ -328,7 +333,7 @@ def _summary(key: tuple[str, int, float], errors: list[Array], held_out: int) ->
         poses=number,
         held_out=held_out,
         halves=len(errors),
-        mass_factor=factor,
+        masses=masses,
         rms_mm=float(np.mean(rms)),
         mean_mm=float(np.mean(means)),
         least_mm=min(means),

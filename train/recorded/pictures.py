@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from train.figures.plots import require_matplotlib, save
-from train.recorded.justin import VARIANTS, HandError
+from train.recorded.justin import GUESSED, VARIANTS, HandError
 
 _OWN = "#2a6f97"
 _OTHER = "#9aa5b1"
@@ -17,7 +17,7 @@ def draw_hand_errors(rows: Sequence[HandError], path: Path) -> Path:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 3.6), width_ratios=(1.3, 1.0))
     own = [variant.name for variant in VARIANTS]
     most = max(row.poses for row in rows)
-    full = [row for row in rows if row.poses == most and row.mass_factor == 1.0]
+    full = [row for row in rows if row.poses == most and row.masses == GUESSED]
     for place, row in enumerate(full):
         left.barh(place, row.mean_mm, color=_OWN if row.prediction in own else _OTHER)
         left.text(row.mean_mm + 0.2, place, f"{row.mean_mm:.1f}", va="center", fontsize=9)
@@ -27,7 +27,7 @@ def draw_hand_errors(rows: Sequence[HandError], path: Path) -> Path:
     left.set_title(f"{most} poses fitted, {full[0].held_out} held out")
     left.invert_yaxis()
     for name, shade in zip(own, _SHADES, strict=True):
-        points = [row for row in rows if row.prediction == name and row.mass_factor == 1.0]
+        points = [row for row in rows if row.prediction == name and row.masses == GUESSED]
         points = sorted(points, key=lambda row: row.poses)
         means = [row.mean_mm for row in points]
         right.plot([row.poses for row in points], means, "o-", color=shade, label=name)
