@@ -141,6 +141,13 @@ class GeometryProblem:
         other.__dict__["unknowns"] = self.unknowns
         return other
 
+    def align(self) -> "GeometryProblem":
+        """The same problem, with the tracker rotated as fits these poses best."""
+        model = align_tracker(self.model, self.theta, self.measured)
+        other = replace(self, model=model)
+        other.__dict__["unknowns"] = self.unknowns
+        return other
+
     def as_rigid(self) -> "GeometryProblem":
         """The same poses of the rigid arm as it is given: only tracker and markers are sought."""
         priors = self.priors.replace(offset_rad=_NOTHING)
@@ -264,8 +271,8 @@ class GeometryFit:
         )
 
     def missed(self, problem: GeometryProblem) -> Array:
-        """Places of the markers less those that these parameters predict, (N, k, 3) [m]."""
-        return problem.measured - problem.model.measured(self.parameters, problem.theta)
+        """Places of the markers less those that this fit predicts, (N, k, 3) [m]."""
+        return problem.measured - self.problem.model.measured(self.parameters, problem.theta)
 
     def errors(self, problem: GeometryProblem) -> Array:
         """Distances of the markers from where they were measured, (N, k) [m]."""

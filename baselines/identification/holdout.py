@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
+from baselines.identification.geometry_fit import GeometryFit, GeometryProblem, fit_geometry
 from baselines.identification.rivals import RIVALS
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -102,16 +102,12 @@ def judge(
     done = 0
     for part in parts:
         rest = np.setdiff1d(np.arange(len(problem.theta)), part)
-        inner = problem.of_poses(rest)
+        inner = problem.of_poses(rest).align()
         outer = problem.of_poses(part)
         rigid = fit_geometry(inner.as_rigid())
         errors[RIGID].append(rigid.errors(outer))
-        missed = rigid.missed(inner)
-        for name, predict in RIVALS.items():
-            flat = missed.reshape(len(missed), -1)
-            predicted = predict(inner.theta, flat, outer.theta).reshape(-1, *missed.shape[1:])
-            left = rigid.missed(outer) - predicted
-            errors[name].append(np.linalg.norm(left, axis=-1))
+        for name, left in rival_errors(rigid, inner, outer).items():
+            errors[name].append(left)
         errors[FITTED].append(fit_geometry(inner).errors(outer))
         done += 1
         progress(done)
@@ -119,7 +115,7 @@ def judge(
     outer = problem.of_poses(parts[0])
     curve = []
     for chosen in curve_poses(rest, seed):
-        own = 1e3 * fit_geometry(problem.of_poses(chosen)).errors(outer)
+        own = 1e3 * fit_geometry(problem.of_poses(chosen).align()).errors(outer)
         curve.append(CurvePoint(poses=len(chosen), rms_mm=_rms(own), mean_mm=float(own.mean())))
         done += 1
         progress(done)
@@ -129,6 +125,25 @@ def judge(
         errors=tuple(_summary(name, np.concatenate(found)) for name, found in errors.items()),
         curve=tuple(curve),
     )
+
+
+def rival_errors(
+    rigid: GeometryFit, inner: GeometryProblem, outer: GeometryProblem
+) -> dict[str, Array]:
+    """Distances of the markers from what each rival predicts on top of a rigid fit, (N, k) [m].
+
+    Args:
+        rigid: Fit of the rigid model to the inner poses.
+        inner: Poses that a rival learns from.
+        outer: Poses that it predicts.
+    """
+    missed = rigid.missed(inner)
+    flat = missed.reshape(len(missed), -1)
+    left = {}
+    for name, predict in RIVALS.items():
+        predicted = predict(inner.theta, flat, outer.theta).reshape(-1, *missed.shape[1:])
+        left[name] = np.linalg.norm(rigid.missed(outer) - predicted, axis=-1)
+    return left
 
 
 def num_fits(problem: GeometryProblem, parts: list[IntArray]) -> int:

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import baselines
-from docs.pages import arms, joints, speeds, walks
+from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
@@ -81,6 +81,7 @@ TABLES = {
     },
     "cluster": "python -m tests.cluster_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
+    "recorded_justin": "python -m train.recorded writes it",
     "step": "python -m docs.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
@@ -211,6 +212,10 @@ PARTS: Mapping[str, Part] = {
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
     "one arm": _of(arms.one_arm, "gallery"),
+    "recorded hands": _of(recorded.hands, "recorded_justin"),
+    "recorded hands by poses": _of(recorded.by_poses, "recorded_justin"),
+    "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
+    "recorded in short": _of(recorded.in_short, "recorded_justin"),
     "link encoders": _of(arms.link_encoders, "link_encoder"),
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),

@@ -1,0 +1,81 @@
+"""Tables of the page of recorded robots, from what `python -m train.recorded` writes."""
+
+from collections.abc import Mapping
+
+from docs.pages.cells import Rows, page_table
+from train.recorded.justin import DRAWN, GUESSED
+
+_SOURCE_MM = {
+    "rigid, as given": "21.3",
+    "K and encoder offsets": "–",
+    "K and geometry": "5.64",
+    "K, geometry and lateral compliance": "3.12",
+}
+"""Mean errors that the source states, fitted and judged on the same 500 poses [mm]."""
+
+
+def hands(rows: Rows) -> str:
+    """Held-out errors from most poses, beside what the source states in-sample."""
+    own = _of_masses(rows, GUESSED)
+    lines = [
+        [
+            row["prediction"],
+            f"{float(row['mean_mm']):.2f}",
+            f"{float(row['least_mm']):.2f} to {float(row['most_mm']):.2f}",
+            f"{float(row['rms_mm']):.2f}",
+            _SOURCE_MM.get(row["prediction"], "–"),
+        ]
+        for row in own
+        if int(row["poses"]) == _most(rows)
+    ]
+    head = ["prediction", "mean [mm]", "over the halves", "rms", "source, in-sample mean"]
+    return page_table(head, lines)
+
+
+def by_poses(rows: Rows) -> str:
+    """Held-out errors of what was identified, by the number of poses that were fitted."""
+    counts = sorted({int(row["poses"]) for row in rows})
+    lines = []
+    for name in [name for name in _SOURCE_MM if name.startswith("K")]:
+        found = {int(row["poses"]): row for row in _of_masses(rows, GUESSED) if _is(row, name)}
+        lines.append([name, *(f"{float(found[count]['mean_mm']):.2f}" for count in counts)])
+    return page_table(["mean error [mm] by poses that were fitted", *map(str, counts)], lines)
+
+
+def by_masses(rows: Rows) -> str:
+    """Held-out errors with the guessed masses, and with others."""
+    lines = []
+    for name in [name for name in _SOURCE_MM if name.startswith("K")]:
+        found = [row for row in rows if _is(row, name) and int(row["poses"]) == _most(rows)]
+        by_masses = {row["masses"]: float(row["mean_mm"]) for row in found}
+        lines.append([name, *(f"{by_masses[masses]:.2f}" for masses in (GUESSED, DRAWN))])
+    return page_table(["mean error [mm] by masses", GUESSED, DRAWN], lines)
+
+
+def in_short(rows: Rows) -> str:
+    """The humanoid in one sentence."""
+    full = {
+        row["prediction"]: float(row["mean_mm"])
+        for row in _of_masses(rows, GUESSED)
+        if int(row["poses"]) == _most(rows)
+    }
+    best = min(value for name, value in full.items() if name.startswith("K"))
+    rivals = [value for name, value in full.items() if not name.startswith(("K", "rigid"))]
+    held_out = rows[0]["held_out"]
+    return (
+        f"At {held_out} held-out poses of a recorded humanoid, identification lowers the error of"
+        f" a hand from {full['rigid, as given']:.1f} to {best:.1f} mm; the best rival without"
+        f" physics reaches {min(rivals):.1f} mm.\n"
+    )
+
+
+def _of_masses(rows: Rows, masses: str) -> list[Mapping[str, str]]:
+    return [row for row in rows if row["masses"] == masses]
+
+
+def _most(rows: Rows) -> int:
+    return max(int(row["poses"]) for row in rows)
+
+
+def _is(row: Mapping[str, str], name: str) -> bool:
+    return row["prediction"] == name

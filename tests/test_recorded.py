@@ -1,0 +1,138 @@
+"""Recordings of others: made-up files of the same form, and the published geometry."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from baselines.identification.geometry_fit import fit_geometry
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from train.recorded import justin
+from train.recorded.justin import RecordedPoses, find_rigid, justin_spec, read_poses
+from train.recorded.sources import Source
+
+GENERATOR = np.random.default_rng(5)
+
+
+def craig(row: justin.Row, q: float) -> Array:
+    """Rx(α) Tx(r) Rz(q + θ) Tz(d), written out."""
+    alpha = np.deg2rad(row.alpha_deg)
+    angle = q + np.deg2rad(row.theta_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    ca, sa = np.cos(alpha), np.sin(alpha)
+    return np.array(
+        [
+            [c, -s, 0.0, row.r_m],
+            [s * ca, c * ca, -sa, -sa * row.d_m],
+            [s * sa, c * sa, ca, ca * row.d_m],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def test_the_model_has_the_published_geometry() -> None:
+    """Catches a row in another convention, and a length on the wrong side of its joint."""
+    q = GENERATOR.uniform(-1.0, 1.0, 11)
+    spec = justin_spec({"left": Rotation.identity()})
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    T = np.eye(4)
+    for row, angle in zip(justin._TORSO, q[:4], strict=True):
+        T = T @ craig(row, angle)
+    shoulder = np.eye(4)
+    shoulder[:3, 3] = justin._SHOULDERS["left"]
+    T = T @ shoulder
+    for row, angle in zip(justin._LEFT, q[4:], strict=True):
+        T = T @ craig(row, angle)
+    hand = T @ [*justin._MARKERS["left"], 1.0]
+    np.testing.assert_allclose(data.site("left_hand").xpos, hand[:3], atol=1e-12)
+
+
+def table(poses: int) -> str:
+    """A table of the published form."""
+    text = ",joints,markers\n"
+    for number in range(poses):
+        joints = " ".join(f"{0.01 * (number + j):.8f}" for j in range(19))
+        text += f'{number},[ {joints}],"[[1. 2. {number}.]\n [4. 5. 6.]]"\n'
+    return text
+
+
+@pytest.mark.parametrize("is_packed", [True, False])
+def test_the_published_table_is_read(is_packed: bool, tmp_path: Path) -> None:
+    """Catches columns that are shifted, the hands swapped, and a chest that is not upright."""
+    file = tmp_path / "m.csv"
+    file.write_text(table(3))
+    if is_packed:
+        with zipfile.ZipFile(tmp_path / "m.zip", "w") as archive:
+            archive.write(file, "m.csv")
+        file = tmp_path / "m.zip"
+    poses = read_poses(file)
+    assert poses.measured[2].tolist() == [[1.0, 2.0, 2.0], [4.0, 5.0, 6.0]]
+    np.testing.assert_allclose(poses.theta[1, [0, 3, 4, 17]], [0.01, -0.05, 0.04, 0.17])
+
+
+def test_another_table_is_refused(tmp_path: Path) -> None:
+    """Catches a traceback where a file of the name has another content."""
+    (tmp_path / "m.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ConfigurationError, match="must have the columns joints, 19 numbers"):
+        read_poses(tmp_path / "m.csv")
+
+
+@dataclass(frozen=True)
+class Local(Source):
+    """A source whose files lie in a folder."""
+
+    def address(self, path: str) -> str:
+        return f"file://{self.repository}/{path}"
+
+
+def test_a_recording_is_fetched_once_and_checked(tmp_path: Path) -> None:
+    """Catches another file under the name, and a copy that is fetched again."""
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there/a.json").write_text("{}")
+    digest = "44136fa355b3678a1146ad16f7e8649e94fb4fc21fe77e8310c060f61caaff8a"
+    source = Local("made", "", str(tmp_path), "c", "none", {"there/a.json": digest})
+    folder = tmp_path / "here"
+    with pytest.raises(ConfigurationError, match=r"a.json is not there; get it by --fetch"):
+        source.file(folder, "there/a.json")
+    shown = list[str]()
+    source.fetch(folder, shown.append)
+    source.fetch(folder, shown.append)
+    assert len(shown) == 1
+    copy = source.file(folder, "there/a.json")
+    assert copy.read_text() == "{}"
+    copy.write_text("[]")
+    with pytest.raises(ConfigurationError, match="is not the file that was measured: SHA-256"):
+        source.file(folder, "there/a.json")
+    (tmp_path / "there/a.json").unlink()
+    copy.unlink()
+    with pytest.raises(ConfigurationError, match="cannot fetch file:"):
+        source.fetch(folder, shown.append)
+
+
+@pytest.mark.slow
+def test_shoulders_are_found_from_poses_alone() -> None:
+    """Catches a search that ends in another frame: made-up rigid poses are met exactly."""
+    turns = {
+        "right": Rotation.from_rotvec([0.2, 3.0, 0.1]),
+        "left": Rotation.from_rotvec([0.4, 0, 0]),
+    }
+    model = justin_spec(turns).compile()
+    data = mujoco.MjData(model)
+    theta = GENERATOR.uniform(-1.5, 1.5, (40, 18))
+    measured = np.empty((40, 2, 3))
+    for pose, q in enumerate(theta):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        measured[pose] = data.site_xpos
+    measured += GENERATOR.normal(0.0, 1e-4, measured.shape)
+    poses = RecordedPoses(theta, measured)
+    again = justin._problem(find_rigid(poses), poses, ("right", "left")).as_rigid()
+    assert fit_geometry(again).noise_m == pytest.approx(1e-4, rel=0.3)

@@ -1,0 +1,81 @@
+"""`python -m train.recorded FOLDER`: every figure of the page "Recorded robots"."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich import box
+from rich.console import Console
+
+from train.commands.cli import CONSOLE, run_program
+from train.commands.entry import start as start_program
+from train.recorded.justin import HandError, hand_errors, num_trials, read_poses
+from train.recorded.pictures import draw_hand_errors
+from train.recorded.sources import JUSTIN, SOURCES
+from train.runs.console import make_table
+from train.runs.escaping import write_records
+from train.runs.folders import run_folder
+from train.runs.progress import show_progress
+
+
+def main(
+    folder: Annotated[Path, tyro.conf.Positional], fetch: bool = False, output: Path | None = None
+) -> None:
+    """Identify recorded robots and predict what was held out; takes half an hour.
+
+    The recordings are of others, and are not part of the project. Each is one commit of a public
+    repository, and is checked by its digest.
+
+    Args:
+        folder: Folder of the recordings.
+        fetch: Fetch what the folder does not have from github.com.
+        output: Folder for tables and figures; default runs/recorded, numbered if taken.
+    """
+    for source in SOURCES:
+        CONSOLE.print(
+            f"{source.name}: {source.what}\n  {source.repository}, commit {source.commit};"
+            f" licence: {source.licence}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        if fetch:
+            source.fetch(folder, lambda address: CONSOLE.print(f"fetching {address}"))
+    (path,) = (JUSTIN.file(folder, path) for path in JUSTIN.files)
+    poses = read_poses(path)
+    total = num_trials(len(poses.theta))
+    with (
+        run_folder("recorded", {"folder": str(folder)}, None, output) as results,
+        show_progress(CONSOLE, {"humanoid": total}, unit="fits") as show,
+    ):
+        rows = hand_errors(poses, lambda done: show(0, done))
+        files = [
+            write_records([row.model_dump() for row in rows], results / "recorded_justin.csv"),
+            draw_hand_errors(rows, results / "recorded_justin.png"),
+        ]
+    _print_hands(rows, CONSOLE)
+    for file in files:
+        CONSOLE.print(f"wrote {file}", soft_wrap=True)
+
+
+def _print_hands(rows: list[HandError], console: Console) -> None:
+    """Errors of the hands, most poses last."""
+    lines = [
+        [
+            row.prediction,
+            f"{row.poses}",
+            row.masses,
+            f"{row.mean_mm:.2f}",
+            f"{row.least_mm:.2f} to {row.most_mm:.2f}",
+            f"{row.rms_mm:.2f}",
+        ]
+        for row in rows
+    ]
+    title = (
+        f"error of a hand at {rows[0].held_out} poses that were held out, {rows[0].halves} halves"
+    )
+    head = ["prediction", "poses", "masses", "mean [mm]", "halves", "rms"]
+    console.print(make_table(title, head, lines, box=box.SIMPLE))
+
+
+if __name__ == "__main__":
+    start_program(lambda: run_program(lambda: tyro.cli(main)))
