@@ -136,6 +136,7 @@ class DisturbanceObserver(PolicyAround):
         ramp_s: float = STAND_S,
     ) -> None:
         super().__init__(policy, model)
+        self.inputs = ()
         table = model.observation_table
         require_sensor(table, LINK_IMU, _LINK_ANGLE)
         self._gains = gains
@@ -148,11 +149,6 @@ class DisturbanceObserver(PolicyAround):
         self._zero_steps = round(self._gains.zero_s / self._dt)
         self._coulomb = self._gains.friction * model.coulomb_friction
         self._ramp = Ramp(model, ramp_s).table
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return ()
 
     @override
     def begin(self, rows: Array) -> ObserverMemory:

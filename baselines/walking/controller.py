@@ -172,6 +172,7 @@ class WalkingController(BatchPolicy):
         ramp_s: float = STAND_S,
     ) -> None:
         super().__init__(model)
+        self.inputs = ("zmp", "com", "leg_length", "hip", "balance_gain")
         table = model.observation_table
         self._biped = model.biped
         self._walk_view = WalkView(table)
@@ -189,11 +190,6 @@ class WalkingController(BatchPolicy):
         self._stances = Stances.of(model)
         self._sole = _sole(self._biped)
         self._foot_spacing = self._biped.foot_spacing
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return ("zmp", "com", "leg_length", "hip", "balance_gain")
 
     @override
     def begin(self, rows: Array) -> Records:

@@ -101,6 +101,7 @@ class PostureFeedback(PolicyAround):
         ramp_s: float = STAND_S,
     ) -> None:
         super().__init__(policy, model)
+        self.inputs = (*self.policy.inputs, "posture_gain")
         self._walk_view = WalkView(model.observation_table)
         self._ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
@@ -113,11 +114,6 @@ class PostureFeedback(PolicyAround):
         )
         self._gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
         self._gains["swing_share"] = period_s / max(gains.swing_s, period_s)
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return (*self.policy.inputs, "posture_gain")
 
     @override
     def begin(self, rows: Array) -> PostureMemory:
