@@ -170,14 +170,16 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
 
 
 def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str, ...]) -> None:
+    listed = ", ".join(usable)
+    takes = f"its options are: {listed}" if usable else "it has no options"
     for option in given:
         if option not in usable:
-            takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
             # of those with options the oracle alone assumes no stiffness
-            why = " but knows the true one" if option in ASSUMED_OPTIONS and usable else ""
+            is_true = bool(usable) and option in ASSUMED_OPTIONS
+            why = f"{option} but knows the true one" if is_true else option
             task = env.unwrapped.task.name
             raise ConfigurationError(
-                f"the policy {name!r} of the {task} does not use {option}{why}; {takes}"
+                f"the policy {name!r} of the {task} does not use {why}; {takes}"
             )
 
 
