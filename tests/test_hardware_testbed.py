@@ -300,7 +300,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
     monkeypatch.setattr(plant, "SupervisedBus", lambda *_: bus)
     monkeypatch.setattr(plant, "time", bus)
     monkeypatch.setattr(realtime, "time", bus)
-    monkeypatch.setattr(plant, "prefer_realtime", lambda _: None)
+    monkeypatch.setattr(plant.realtime, "prefer_realtime", lambda _: None)
     return bus
 
 

@@ -116,7 +116,7 @@ class BendingObserver:
         """Tilt of the pelvis over each flat foot by the bending, s, (num_worlds, 2, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]
 
-    def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
+    def disagreement(self, rows: Array, bending: Array) -> Array:
         """Tilt of a flat foot's sole by motors and IMU, e, and the bending that is expected, s.
 
         Args:
@@ -124,7 +124,7 @@ class BendingObserver:
             bending: Of the joints, (num_worlds, 12) [rad].
 
         Returns:
-            (num_worlds, 2 legs, 2) each, roll and pitch [rad].
+            Both, (2, num_worlds, 2 legs, 2), roll and pitch [rad].
         """
         chains = self._model.biped.chains
         return chains.sole_tilts(rows[:, self._theta], rows[:, self._attitude], bending)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -27,24 +27,8 @@ _CHARACTERS_PER_ROW = 37
 """Width of a picture over the size of its letters."""
 
 
-class Picture(Protocol):
-    """Draws the present state of a task from its signals."""
-
-    def rgb(self, signals: Signals, world: int = 0) -> Image:
-        """An image of a world, (height, width, 3)."""
-        ...
-
-    def show(self, signals: Signals) -> None:
-        """Update the window, which shows the first world."""
-        ...
-
-    def close(self) -> None:
-        """Free renderer and window."""
-        ...
-
-
-class ModelPicture(ABC):
-    """A `Picture` made from a display model, which is posed and never stepped.
+class Picture(ABC):
+    """Draws the present state of a task by a display model, which is posed and never stepped.
 
     Args:
         spec: What is drawn, with a camera named `CAMERA`.

@@ -39,7 +39,8 @@ TIMING_METRICS = (
     Metric("limited", "limited", "max", over="all"),
 )
 _KINDS = {float: REAL, int: WHOLE}
-_CYCLE = record_type(*((name, _KINDS[of]) for name, of in get_type_hints(CycleRecord).items()))
+_FIELDS = get_type_hints(CycleRecord).items()
+_CYCLE = record_type(*((name, _KINDS[kind]) for name, kind in _FIELDS))
 _LINK = JointTask.world_type
 
 
@@ -51,9 +52,7 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
-    world_type = record_type(
-        *((name, _LINK[name]) for name in _LINK.names or ()), ("cycle", _CYCLE)
-    )
+    world_type = record_type(*((n, _LINK[n]) for n in _LINK.names or ()), ("cycle", _CYCLE))
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle

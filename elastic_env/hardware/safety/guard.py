@@ -5,6 +5,7 @@ comparison would let a motion go on whose measurement is none.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +40,7 @@ def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
     return ~(np.isfinite(values) & np.isfinite(most) & (values <= most))
 
 
-def is_outside(value: npt.ArrayLike, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
+def is_outside(value: Any, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
     """True where a value is not known to lie between two bounds, or on one of them.
 
     Shapes as in `exceeds`.
@@ -107,11 +108,10 @@ class Guard:
             FaultError: A goal is not a finite number, or the time is none.
         """
         asked = np.asarray(goals, dtype=np.float64)
-        if asked.shape != self.goals.shape or not np.isfinite(asked).all():
-            raise FaultError(
-                f"goals must be {len(self.goals)} finite angles [rad], got"
-                f" {np.asarray(goals).tolist()}"
-            )
+        n = len(self.goals)
+        if asked.shape != (n,) or not np.isfinite(asked).all():
+            found = np.asarray(goals).tolist()
+            raise FaultError(f"goals must be {n} finite angles [rad], got {found}")
         if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
             raise FaultError(
                 "the time since the last command must be at least 0 s and finite, got"
@@ -187,13 +187,11 @@ class Guard:
         hot = ~is_missing & exceeds(temperature, self._hottest)
         if hot.any():
             return explain_heat(self._list(hot, temperature), self._hottest[hot])
-        unknown = self._without_temperature > _LONGEST_WITHOUT_TEMPERATURE
+        longest = _LONGEST_WITHOUT_TEMPERATURE
+        unknown = self._without_temperature > longest
         if unknown.any():
             servos = self._list(unknown)
-            return (
-                f"no temperature from {servos} in {_LONGEST_WITHOUT_TEMPERATURE} cycles: elastic"
-                " hardware check"
-            )
+            return f"no temperature from {servos} in {longest} cycles: elastic hardware check"
         return ""
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:
