@@ -135,8 +135,9 @@ class SharedSample:
         for _ in range(_TRIES):
             before = self._counter()
             values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
-            if before == self._counter() and before % 2 == 0:
-                self._last = Attitude(*values) if before else None
+            # packing a counter clears it first: a zero is none, once there was a sample
+            if before and before % 2 == 0 and before == self._counter():
+                self._last = Attitude(*values)
                 break
         return self._last
 
