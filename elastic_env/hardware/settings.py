@@ -92,7 +92,7 @@ class HardwareSettings(Model):
         named = (self.port, self.imu_port)
         ports = [os.path.realpath(port) for port in named if port is not None]
         if len(set(ports)) < len(ports):
-            raise ValueError(f"servo and IMU each have their own port, got {self.port} for both")
+            raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
         return self
 
     @model_validator(mode="after")
