@@ -20,7 +20,6 @@ from baselines.compensation.compensators import (
     Compensated,
     DynamicCompensator,
     GravityCompensator,
-    OutputMethod,
 )
 from baselines.compensation.measured import (
     LINK_ENCODER,
@@ -85,7 +84,7 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
     return Zero(model)
 
 
-def _around(core: Builder, compensator: Any, output: OutputMethod = "taylor") -> Builder:
+def _around(core: Builder, compensator: Any, output: Any = "taylor") -> Builder:
     """A compensator around a policy."""
 
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:

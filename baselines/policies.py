@@ -1,6 +1,5 @@
 """The baselines by name; `baselines.catalogue` says how each is built."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +168,7 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     return played
 
 
-def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str, ...]) -> None:
+def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
     listed = ", ".join(usable)
     takes = f"its options are: {listed}" if usable else "it has no options"
     for option in given:

@@ -35,7 +35,7 @@ _ERROR = _SEEN.group("model_error")
 _LOAD = _SEEN.names.index("excess_load")
 _AXIS = np.array([0, 0, 1, 1, 1, 0])  # roll or pitch, of the joints of a leg
 _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
-_PRIOR_LOADS = 5.0
+_LOADS = 5.0
 """Number of measurements that the assumed load counts for."""
 
 
@@ -71,7 +71,7 @@ class LegEstimator(Estimator):
         self,
         model: WalkerModel,
         sensors: DeflectionSensors | None = None,
-        prior_loads: float = _PRIOR_LOADS,
+        prior_loads: float = _LOADS,
     ) -> None:
         self._observer = BendingObserver(model)
         self._sensors = sensors
@@ -202,7 +202,7 @@ def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
     return LegEncoderEstimator(model, sensors)
 
 
-def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
+def mean_load(memory: Array, excess: Array, prior: float = _LOADS) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum.
 
     Args:

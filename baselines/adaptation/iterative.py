@@ -7,7 +7,7 @@ the environment that it is given, which may be hardware. What it has learned is 
 over the time of an episode.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -127,13 +127,13 @@ class IterativeLearner(LearnedOffsets):
     trials = 10
     """Number of trials that it learns from."""
 
-    def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] = lambda _: None) -> None:
+    def rehearse(self, env: Any, seed: int, told: Any = None) -> None:
         """Learn on the robots that `env.reset(seed=seed)` draws; earlier learning is dropped.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.
             seed: World i has the robot of seed + i, in every trial with other noise.
-            told: Called after each trial.
+            told: Called with each `Trial`.
         """
         stage = Stage(env, seed)
         shape = (stage.num_worlds, stage.num_steps + 1, len(self._signals.names))
@@ -143,7 +143,8 @@ class IterativeLearner(LearnedOffsets):
             self.play(tables)
             trial = stage.trial(self, self._signals, number)
             tables, before = self._learn(tables, before, trial)
-            told(trial)
+            if told is not None:
+                told(trial)
         self.play(tables)
 
     def _learn(self, tables: Array, before: Array, trial: Trial) -> tuple[Array, Array]:
@@ -201,7 +202,8 @@ class Stage:
             error[running, step] = signals.error(asked, seen, info)[running]
             for world in np.flatnonzero(start & ~over).tolist():
                 found = info.get("final_info", info)["episode_metrics"].items()
-                metrics[world] = {k: float(v if is_scalar else v[world]) for k, v in found}
+                own = {k: v if is_scalar else v[world] for k, v in found}
+                metrics[world] = {name: float(value) for name, value in own.items()}
             failed = failed | (terminated & ~over)
             over = over | start
             if over.all():
@@ -214,7 +216,7 @@ class Stage:
         seen, _ = self._env.reset(seed=seed, options={"robot_seed": robots})
         return np.atleast_2d(seen)
 
-    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Mapping[str, Any]]:
+    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Any]:
         command = action[0] if self._is_scalar else action
         seen, _, terminated, truncated, info = self._env.step(command)
         ends = (np.atleast_1d(terminated), np.atleast_1d(truncated))

@@ -48,7 +48,7 @@ class TableDescription(Model):
     @classmethod
     def _base_is_a_name(cls, value: str) -> str:
         if ":" in value or value == "iterative":
-            raise ValueError(f"the base must be a baseline without learning, got {value!r}")
+            raise ValueError(f"it must be a baseline without learning, got {value!r}")
         return value
 
 
@@ -117,10 +117,10 @@ def _require_table(description: TableDescription, table: Array) -> None:
             f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}"
         )
     if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST:
-        raise ConfigurationError(f"offsets must be finite, within ±{_LARGEST:g} rad or m")
+        raise ConfigurationError(f"offsets must be finite within ±{_LARGEST:g} rad or m")
 
 
-def _require_same(folder: Path, learned: TableDescription, table: Array, env: Any) -> None:
+def _require_same(folder: Path, learned: Any, table: Array, env: Any) -> None:
     """Refuse a table of another robot or motion."""
     task = env.unwrapped.task
     period_s = task.assumed_model.control_period_s
@@ -131,7 +131,8 @@ def _require_same(folder: Path, learned: TableDescription, table: Array, env: An
         ("the number of rows", len(table), task.num_steps + 1),
     ]
     for key in {**motion, **learned.motion}:
-        pairs.append((f"a motion whose {key} is", learned.motion.get(key), motion.get(key)))
+        what = f"a motion whose {key} is"
+        pairs.append((what, learned.motion.get(key), motion.get(key)))
     for what, known, given in pairs:
         if known != given:
             raise ConfigurationError(

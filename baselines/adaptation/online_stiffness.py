@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.adaptation.estimators import Estimator
 from baselines.compensation import policy as policies
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -62,7 +61,7 @@ class OnlineStiffness(policies.PolicyAround):
     """
 
     def __init__(
-        self, policy: Any, model: RobotModel, estimator: Estimator, gains: AdaptationGains
+        self, policy: Any, model: RobotModel, estimator: Any, gains: AdaptationGains
     ) -> None:
         super().__init__(policy, model)
         dt = model.control_period_s

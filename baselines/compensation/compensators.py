@@ -296,7 +296,8 @@ class DynamicCompensator(Compensator):
         k_i = self._drives["integral_gain"]
         zero = np.zeros_like(torque)
         windup = np.divide(torque, k_i, out=zero.copy(), where=k_i > 0.0)
-        deflection = elasticity.static_deflection(torque, self._stiffness, self._backlash)
+        springs = (self._stiffness, self._backlash)
+        deflection = elasticity.static_deflection(torque, *springs)
         return DriveMemory(deflection, rate=zero, windup=windup, friction=zero)
 
     @override
@@ -375,7 +376,7 @@ def settle(
 
 @compiled
 def servo_error(
-    rate: Array, rate_dot: Array, torque: Array, windup: Array, drives: Any, period_s: float
+    rate: Array, rate_dot: Array, torque: Array, windup: Array, drives: Any, dt: float
 ) -> tuple[Array, Array]:
     """Errors that servos need to move rotors under loads [rad], and their integrals [rad·s].
 
@@ -387,7 +388,7 @@ def servo_error(
         torque: Joint torques [N·m].
         windup: Integrals of the errors before [rad·s].
         drives: Rows of `DRIVE`, one per joint, (n,).
-        period_s: Control period [s].
+        dt: Control period [s].
     """
     errors = np.empty(torque.shape)
     integrals = np.zeros(torque.shape)
@@ -400,7 +401,7 @@ def servo_error(
             if k_i > 0.0:  # k_p e + k_i ∫e = effort
                 lag_s = drive.position_gain / k_i
                 before = windup[world, i]
-                integrals[world, i] = follow_lag(before, effort / k_i, lag_s, period_s)
+                integrals[world, i] = follow_lag(before, effort / k_i, lag_s, dt)
             effort -= k_i * integrals[world, i]
             errors[world, i] = effort / drive.position_gain
     return errors, integrals

@@ -11,7 +11,7 @@ The command leads by the model's deflection instead, which `baselines.adaptation
 what is measured.
 """  # noqa: E501
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from typing_extensions import override
@@ -66,7 +66,7 @@ class DeflectionSensors:
         ConfigurationError: The observation does not have the sensor.
     """
 
-    def __init__(self, model: RobotModel, sensor: str, joints: tuple[str, ...] = ("",)) -> None:
+    def __init__(self, model: RobotModel, sensor: str, joints: Any = ("",)) -> None:
         table = model.observation_table
         require_sensor(table, sensor)
         self._stiffness = model.stiffness

@@ -43,13 +43,13 @@ class TrueCompensator(DynamicCompensator):
         env: The environment itself.
         ramp_s: Time after which the integrator begins [s].
         friction: Whether the compensator knows the friction.
-        integral_gain: Gain on the true link error [1/s].
+        gain: Gain on the true link error [1/s].
     """
 
-    def __init__(self, env: Any, ramp_s: float, friction: bool, integral_gain: float) -> None:
+    def __init__(self, env: Any, ramp_s: float, friction: bool, gain: float) -> None:
         self._env = env.unwrapped
         super().__init__(self._env.truth().model, friction=friction)
-        self._gain = integral_gain * self._dt
+        self._gain = gain * self._dt
         self._ramp = Ramp(self.model, ramp_s)
         self._truth: Any = None
 

@@ -179,7 +179,7 @@ class Zero(BatchPolicy):
     reads_rates = False
 
     @override
-    def predict(self, observation: Array, *_: Any, **_others: Any) -> tuple[Action, None]:
+    def predict(self, observation: Array, *_: Any, **_named: Any) -> tuple[Any, None]:
         """Zero offset, (..., n) [rad], whatever the observation holds."""
         shape = (*observation.shape[:-1], self.view.num_joints)
         return np.zeros(shape, dtype=np.float32), None
@@ -374,8 +374,8 @@ class ObservationView:
             ElasticError: An episode goes on.
         """
         if not np.all(self.is_start(rows) if episode_start is None else episode_start):
-            by_clock = self._clock is not None
-            sign = "clock.time" if by_clock else "a reference at rest, and no command yet"
+            at_rest = "a reference at rest, and no command yet"
+            sign = at_rest if self._clock is None else "clock.time"
             raise ElasticError(
                 "predict() was called without `state` in what looks like the middle of an episode"
                 f" (a beginning is known by {sign}): this policy has memory; pass the state that"

@@ -393,7 +393,7 @@ class PositionCompensator:
         calm_s = max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5)
         cure = f"ramp_s={calm_s:.3g} takes it over in that time"
         if self._ramp > 0.0:
-            cure = "set the payload to 0 where it was, and let ramp_s pass before it moves"
+            cure = "set the payload to 0 where it was, and let ramp_s pass before"
         self._warn_once(
             "jump",
             f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"

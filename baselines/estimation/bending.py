@@ -171,11 +171,11 @@ def regress(
 
 
 @compiled
-def update(x: Array, P: Array, expected: float, seen: float, deviation_rad: float) -> None:
+def update(x: Array, P: Array, expected: float, seen: float, sigma: float) -> None:
     """Take in a measurement of (expected, 1) · x = seen − expected with a standard deviation."""
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
-    variance = (expected * first + second) + deviation_rad**2
+    variance = (expected * first + second) + sigma**2
     error = (seen - expected) - (expected * x[0] + x[1])
     gain = first / variance
     second_gain = second / variance

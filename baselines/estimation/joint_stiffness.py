@@ -55,4 +55,5 @@ def regress(sums: Array, prior: StiffnessPrior) -> Array:
     rank_one = common / (own * (own + n * common))
     alone = right / diagonal
     shared = rank_one / diagonal
-    return alone + shared * (alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1)))[..., None]
+    common = alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1))
+    return alone + shared * common[..., None]

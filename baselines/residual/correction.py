@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.compensation import inputs as named_inputs
-from baselines.compensation.inputs import COMMAND, INPUTS
+from baselines.compensation.inputs import COMMAND, INPUTS, InputKind
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
     Action,
-    PolicyInputs,
     Step,
     as_action,
     as_batch_policy,
@@ -93,7 +92,7 @@ class Corrected:
         action, memory = self.correct(rows, residual, memory, inputs)
         return as_action(action, inputs.is_single), memory
 
-    def correct(self, rows: Array, residual: Array, memory: Any, inputs: PolicyInputs) -> Step:
+    def correct(self, rows: Array, residual: Array, memory: Any, inputs: Any) -> Step:
         """`act` for rows: offsets of the joints, (num_worlds, n) [rad], and the new memory.
 
         Args:
@@ -197,7 +196,7 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
     return np.where(chosen, bounds, 0.0)
 
 
-def fit_columns(wanted: str, names: list[str], kind: named_inputs.InputKind) -> BoolArray:
+def fit_columns(wanted: str, names: list[str], kind: InputKind) -> BoolArray:
     """Columns that are called so, or whose names end so.
 
     Raises:

@@ -65,7 +65,8 @@ class Features:
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
         self._history = settings.history
         commands = model.observation_table.signals_of("last_command")
-        self.signals = (*seen, *rename_group(commands if self._acts else (), BASE_ACTION))
+        acts = rename_group(commands, BASE_ACTION) if self._acts else ()
+        self.signals = (*seen, *acts)
         self.width = len(self.signals) + self._history * len(self._measured)
         self._mirror: LeftFirst | None = None
         if settings.mirror:
@@ -185,7 +186,7 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
 class _Instant:
     """A source that remembers nothing."""
 
-    def __init__(self, signals: tuple[Signal, ...], function: Callable[..., Array]) -> None:
+    def __init__(self, signals: Any, function: Callable[..., Array]) -> None:
         self.signals = signals
         self._function = function
 

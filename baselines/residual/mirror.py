@@ -23,6 +23,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signal
 from elastic_env.world.robot_model import WalkerModel
 
+Signals = Sequence[Signal]
 _SIGN = {"same": 1.0, "opposite": -1.0, "complement": -1.0}
 _SIDE = re.compile(r"(?<=\.)[lr]_")
 
@@ -38,7 +39,7 @@ class Mirror:
             side alone.
     """
 
-    def __init__(self, signals: Sequence[Signal]) -> None:
+    def __init__(self, signals: Signals) -> None:
         columns = {signal.name: column for column, signal in enumerate(signals)}
         others = [_other_side(name) for name in columns]
         if lacking := [name for name in others if name not in columns]:
@@ -69,9 +70,7 @@ class LeftFirst:
             the other leg's.
     """
 
-    def __init__(
-        self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected
-    ) -> None:
+    def __init__(self, signals: Signals, measured: Signals, corrected: Corrected) -> None:
         model = corrected.model
         settings = corrected.settings
         if not isinstance(model, WalkerModel):

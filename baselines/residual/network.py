@@ -47,10 +47,11 @@ def require_network(tensors: Tensors) -> int:
         shape = (widths[i + 1], widths[i])
         found = tensors[f"weight{i}"].shape
         if found != shape:
-            raise ConfigurationError(f"weight{i} must have the shape {shape}, got {found}")
+            shapes = f"the shape {shape}, got {found}"
+            raise ConfigurationError(f"weight{i} must have {shapes}")
     std = tensors["std"]
     if std.shape != (widths[0],) or not (std > 0.0).all():
-        raise ConfigurationError(f"std must be {widths[0]} positive values, one per feature")
+        raise ConfigurationError(f"std must be {widths[0]} positive values, as mean")
     return depth
 
 

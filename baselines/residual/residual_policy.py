@@ -81,9 +81,10 @@ class ResidualPolicy(policies.BatchPolicy):
     def begin(self, rows: Array) -> ResidualMemory:
         n = len(rows)
         caution = None if self._caution is None else self._caution.begin(n)
-        undecided = (np.full(n, _UNDECIDED), np.zeros((n, self.corrected.num_residuals)))
-        inner = self.corrected.begin(rows)
-        return ResidualMemory(*undecided, self._features.begin(n), caution, inner)
+        wait = np.full(n, _UNDECIDED)
+        residual = np.zeros((n, self.corrected.num_residuals))
+        own = (wait, residual, self._features.begin(n), caution)
+        return ResidualMemory(*own, self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:
@@ -117,7 +118,7 @@ class ResidualPolicy(policies.BatchPolicy):
 _UNDECIDED = -1
 
 
-def save_residual(folder: Path, residual: ResidualDescription, tensors: Tensors) -> None:
+def save_residual(folder: Path, residual: Any, tensors: Tensors) -> None:
     """Write a residual that `load_residual` reads; the network must be valid.
 
     Raises:
@@ -167,7 +168,8 @@ def _none_at(folder: Path, why: str) -> str:
     if inside:  # the last policy first: the best one flatters itself
         folders = sorted((path.parent.name != "last", path.parent) for path in inside)
         listed = ", ".join(str(path) for _, path in folders)
-        return f"{folder} is no residual but has some inside; give one of them: {listed}"
+        cure = f"give one of them: {listed}"
+        return f"{folder} is no residual but has some inside; {cure}"
     families: dict[str, list[str]] = {}
     for name in shipped_names():
         family, _, seed = name.partition("/")

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
+from baselines.compensation import policy as policies
+from baselines.compensation.policy import Records, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.world.robot_model import WalkerModel
 
 # of six joints of a leg
 _HIP_ROLL = 1
@@ -83,7 +83,7 @@ class PostureMemory(NamedTuple):
     inner: Any
 
 
-class PostureFeedback(PolicyAround):
+class PostureFeedback(policies.PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Args:
@@ -94,11 +94,11 @@ class PostureFeedback(PolicyAround):
     """
 
     def __init__(
-        self, policy: Any, model: WalkerModel, gains: PostureGains, ramp_s: float = STAND_S
+        self, policy: Any, model: Any, gains: PostureGains, ramp_s: float = STAND_S
     ) -> None:
         super().__init__(policy, model)
         self.inputs = (*self.policy.inputs, "posture_gain")
-        self._walk_view = WalkView(model.observation_table)
+        self._walk_view = policies.WalkView(model.observation_table)
         self._ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
         self._gains: Any = np.zeros(1, POSTURE)
@@ -116,7 +116,7 @@ class PostureFeedback(PolicyAround):
         return PostureMemory(np.zeros(len(rows), FEEDBACK), self.policy.begin(rows))
 
     @override
-    def act(self, rows: Array, memory: PostureMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: PostureMemory, inputs: Any) -> Step:
         """It takes the input `posture_gain`."""
         change = _NO_CHANGE
         if inputs.posture_gain is not None:
@@ -191,7 +191,7 @@ def hold_posture(
 
 
 @compiled
-def pitch_of_leg(own: Any, right: float, leg: int, turn: float, last: Any, kept: Any) -> float:
+def pitch_of_leg(own: Any, right: Any, leg: int, turn: float, last: Any, kept: Any) -> Any:
     """Hip pitch of a leg [rad].
 
     A leg that carries half of the weight stands and turns, one in the air follows slowly.

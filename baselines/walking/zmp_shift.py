@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg
 
 from elastic_env.core.compiled import compiled, record_type
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry
 from elastic_env.world.robot_model import WalkerModel
 
@@ -140,7 +140,7 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
 
 
 @compiled
-def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, out: Array) -> None:
+def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> None:
     """Add the offsets that move the planned pelvis over feet that stay; no shift changes no bit.
 
     Where a foot would be out of reach, the leg is as long as it can be.

@@ -158,7 +158,7 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         AttitudeError: Nothing comes that is an attitude.
     """
 
-    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05) -> None:
+    def __init__(self, port: str, baudrate: int = 115200, oldest_s: float = 0.05) -> None:
         self.port = port
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)

@@ -33,5 +33,5 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
             _add(body, _SPHERE, radius, pos=model.body_ipos[body.id])
 
 
-def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, radius: float, **place: Any) -> None:
+def _add(body: Any, kind: mujoco.mjtGeom, radius: float, **place: Any) -> None:
     body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_LOOK, **place)

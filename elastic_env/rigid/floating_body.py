@@ -95,7 +95,8 @@ class FloatingBody:
         """Center of mass of the robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
         com = np.empty((len(q), 3))
         for i in range(len(q)):
-            com[i] = pinocchio.centerOfMass(self._model, self._data, self._position(q[i]))
+            position = self._position(q[i])
+            com[i] = pinocchio.centerOfMass(self._model, self._data, position)
         return com
 
 
@@ -113,7 +114,8 @@ def pinocchio_model(model: mujoco.MjModel) -> pinocchio.Model:
             name = model.joint(int(j)).name
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
                 T = pinocchio.SE3.Identity()
-                carrier = tree.addJoint(carrier, pinocchio.JointModelFreeFlyer(), T, name)
+                free = pinocchio.JointModelFreeFlyer()
+                carrier = tree.addJoint(carrier, free, T, name)
                 continue
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())

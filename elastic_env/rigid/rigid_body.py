@@ -47,26 +47,24 @@ class RigidBody:
         self._spring = model.jnt_stiffness[at].copy()
         self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
         self._has_springs = bool(self._spring.any())
-        compile_now(
-            self._compile, np.zeros((1, len(joints)))
-        )  # the first command of a live robot cannot wait
+        # the first command of a live robot cannot wait
+        compile_now(self._compile, np.zeros((1, len(joints))))
 
     def gravity_torque(self, q: Array) -> Array:
         """Torque that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
         rows = self._rows(q)
-        torque = np.empty(q.shape)
-        kernels.gravity_torques(self._links, self._loads, rows, torque.reshape(rows.shape))
+        torque = np.empty(rows.shape)
+        kernels.gravity_torques(self._links, self._loads, rows, torque)
         return self._with_springs(torque, q)
 
     def gravity_gradient(self, q: Array) -> Array:
         """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         rows = self._rows(q)
-        n = self._n
-        gradient = np.empty((*q.shape, n))
-        kernels.gravity_gradients(self._links, self._loads, rows, gradient.reshape(len(rows), n, n))
+        gradient = np.empty((*rows.shape, self._n))
+        kernels.gravity_gradients(self._links, self._loads, rows, gradient)
         if self._has_springs:
             np.einsum("...ii->...i", gradient)[...] += self._spring
-        return gradient
+        return gradient.reshape(*q.shape, self._n)
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
@@ -76,8 +74,8 @@ class RigidBody:
                 f" and {q_ddot.shape}"
             )
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
-        torque = np.empty(q.shape)
-        kernels.inverse_dynamics(self._links, self._loads, motion, torque.reshape(motion[0].shape))
+        torque = np.empty(motion[0].shape)
+        kernels.inverse_dynamics(self._links, self._loads, motion, torque)
         return self._with_springs(torque, q)
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
@@ -91,7 +89,10 @@ class RigidBody:
         self._links = self._tree.add_load(body, mass, place)
 
     def _with_springs(self, torque: Array, q: Array) -> Array:
-        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
+        torque = torque.reshape(q.shape)
+        if self._has_springs:
+            torque = torque + self._spring * (q - self._spring_rest)
+        return torque
 
     def _rows(self, values: Array) -> Array:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
@@ -122,8 +123,9 @@ def require_hinge_tree(
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
-    others = [j for j in range(model.njnt) if j not in but and model.joint(j).name not in but]
-    kinds = {model.joint(j).name: model.jnt_type[j] for j in others}
+    joints_of = [(j, model.joint(j).name) for j in range(model.njnt)]
+    others = [(j, name) for j, name in joints_of if j not in but and name not in but]
+    kinds = {name: model.jnt_type[j] for j, name in others}
     names = list(kinds)
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:

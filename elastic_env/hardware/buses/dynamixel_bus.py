@@ -17,9 +17,10 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses import port as ports
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States
 from elastic_env.hardware.buses.packets import word
-from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
+from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE, bus_gone
 from elastic_env.hardware.buses.servo_models import (
     NUM_BLOCKS,
     ServoModel,
@@ -60,11 +61,11 @@ class DynamixelBus:
 
     def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
         self.name = port
-        self.port = Port(port, baudrate)
+        self.port = ports.Port(port, baudrate)
         self.models: dict[int, ServoModel] = {}
         self.reply_timeout_s = _REPLY_TIMEOUT_S
         self.num_retries = 0
-        self._handler = PacketHandler()
+        self._handler = ports.PacketHandler()
         self._cycles_without_temperature = TEMPERATURE_CYCLES
         self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)
         """Blocks that the last requests asked for; None where all servos answered."""
@@ -178,11 +179,12 @@ class DynamixelBus:
 
     def read_condition(self, servo_id: int) -> Condition:
         """Velocity, temperature and hardware error of one servo."""
-        speed = self.read(servo_id, "present_velocity") * self.models[servo_id].velocity_unit
+        counts = self.read(servo_id, "present_velocity")
         temperature = float(self.read(servo_id, "present_temperature"))
         highest = float(self.read(servo_id, "temperature_limit"))
         error = explain_errors(self.read(servo_id, "hardware_error_status"))
-        return Condition(speed, temperature, highest, error)
+        unit = self.models[servo_id].velocity_unit
+        return Condition(counts * unit, temperature, highest, error)
 
     def write_goal(self, servo_id: int, angle: float) -> None:
         """Command one servo [rad], which confirms it.
@@ -282,25 +284,25 @@ class DynamixelBus:
             return free[0]
         return next(filter(model.has_temperature, free), free[0])
 
-    def _decode(self, block: range, replies: dict[int, bytes], alerts: set[int]) -> States:
+    def _decode(self, block: range, replies: dict[int, bytes], alerts: Any) -> States:
         values = np.full((len(self.ids), 4), np.nan)
         for row, (servo_id, model) in enumerate(self.models.items()):
             if servo_id in replies:
                 values[row] = model.decode_block(block, replies[servo_id])
-        position, velocity, current, temperature = values.T.copy()
+        angle, velocity, current, temperature = values.T.copy()
         now = time.monotonic()
         is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
-        return States(position, velocity, current, is_fresh, has_alert, now, temperature)
+        return States(angle, velocity, current, is_fresh, has_alert, now, temperature)
 
-    def _request(self, servo_id: int, instruction: int, data: bytes, length: int) -> bytes:
+    def _request(self, servo_id: int, kind: int, data: bytes, length: int) -> bytes:
         """The data of a reply.
 
         A few tries, with silence in between so that no late reply answers the next one.
         """
         problem = "does not answer"
         for _ in range(_TRIES):
-            self._send(servo_id, instruction, data)
+            self._send(servo_id, kind, data)
             wire_ms = self.port.tx_time_per_byte * (_STATUS_BYTES + length)
             self.port.setPacketTimeoutMillis(wire_ms + 1e3 * self.reply_timeout_s)
             while (reply := self._receive()) is not None:
@@ -385,7 +387,7 @@ class BusGroup:
         calls = [partial(bus.read_states, timeout_s) for bus in self.buses]
         return States.join(self._call_all(calls))
 
-    def torque_off(self, when_sent: Callable[[], Any] = tuple) -> HardwareError | None:
+    def torque_off(self, when_sent: Any = None) -> HardwareError | None:
         """Switch all torque off, at every bus before any servo is asked whether it is.
 
         A lost bus keeps no other on.
@@ -398,11 +400,13 @@ class BusGroup:
             all is off.
         """
         self._call_all([partial(_call, bus.torque_off) for bus in self.buses])
-        when_sent()
+        if when_sent is not None:
+            when_sent()
         calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
         answers = self._call_all(calls)
         errors = [answer for answer in answers if isinstance(answer, HardwareError)]
-        silent = [name for names in answers if isinstance(names, list) for name in names]
+        lists = [answer for answer in answers if isinstance(answer, list)]
+        silent = [name for names in lists for name in names]
         problems = [str(error) for error in errors]
         if silent:
             problems.append(

@@ -17,6 +17,7 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 from elastic_env.robots.testbed.config import TestbedConfig
 
 _END_S = 10.0
+_PROCESS = "elastic_env.hardware.emulator.process"
 
 
 class EmulatorConfig(Model):
@@ -63,7 +64,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def __init__(self, config: EmulatorConfig | None = None) -> None:
         text = (config or EmulatorConfig()).model_dump_json()
         pipes: Any = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
-        self._process = start_child("elastic_env.hardware.emulator.process", text, **pipes)
+        self._process = start_child(_PROCESS, text, **pipes)
         self._take_ports(self._receive())
 
     def faults(self, **changes: Any) -> None:
@@ -80,7 +81,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         asked for is to tell.
         """
         events = self._request({"events": True})
-        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in events]
+        return [(float(t), int(i), str(name), int(count)) for t, i, name, count in events]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""

@@ -199,8 +199,8 @@ class ServoPlant:
             ports = {settings.port: [settings.servo_id]}
             self._bus = SupervisedBus(ports, settings.baudrate)
             if settings.imu_port is not None:
-                oldest_s = settings.imu_oldest_s
-                self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, oldest_s)
+                stream = (settings.imu_baudrate, settings.imu_oldest_s)
+                self._imu = AttitudeStream(settings.imu_port, *stream)
             realtime.prefer_realtime(realtime.Priority.LOOP)
         return self._bus
 

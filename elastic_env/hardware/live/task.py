@@ -42,6 +42,7 @@ _KINDS = {float: REAL, int: WHOLE}
 _FIELDS = get_type_hints(CycleRecord).items()
 _CYCLE = record_type(*((name, _KINDS[kind]) for name, kind in _FIELDS))
 _LINK = JointTask.world_type
+_OF_LINK = [(name, _LINK[name]) for name in _LINK.names or ()]
 
 
 class HardwareTestbedTask(TestbedTask):
@@ -52,7 +53,7 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
-    world_type = record_type(*((n, _LINK[n]) for n in _LINK.names or ()), ("cycle", _CYCLE))
+    world_type = record_type(*_OF_LINK, ("cycle", _CYCLE))
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle

@@ -297,7 +297,8 @@ def emergency_stop(
                 bus.open()
                 known = dict(zip(ids, models[number], strict=True)) if models else {}
                 for servo_id in ids if not models else ():
-                    with noting(ReplyError):  # one that does not answer keeps no other on
+                    # one that does not answer keeps no other on
+                    with noting(ReplyError):
                         known[servo_id] = bus.ping(servo_id).model_number
                 bus.attach_known(known)
         reached = [bus for bus in buses if bus.models]

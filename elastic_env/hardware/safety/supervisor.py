@@ -16,7 +16,6 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,7 @@ class Supervisor:
         program: Process id of the program.
     """
 
-    def __init__(self, channel: Channel, buses: Sequence[DynamixelBus], program: int) -> None:
+    def __init__(self, channel: Channel, buses: list[Any], program: int) -> None:
         self._channel = channel
         self._program = program
         self._buses = buses
@@ -86,7 +85,8 @@ class Supervisor:
     def _next_request(self) -> dict[str, Any] | None:
         """The next request; a program that hangs loses its torque meanwhile."""
         while True:
-            glance_s = None if self._guard is None else min(self._patience_s(), _GLANCE_S)
+            is_moving = self._guard is not None
+            glance_s = min(self._patience_s(), _GLANCE_S) if is_moving else None
             if self._channel.is_waiting(glance_s):
                 break
             if is_ending(self._program):
@@ -123,8 +123,9 @@ class Supervisor:
             checks = check_bus(bus, servo_ids)
             bad = [check for check in checks if check.is_vital and not check.is_good]
             if bad:
-                words = "; ".join(f"{one.what} is {one.value}: {one.cure}" for one in bad)
-                raise HardwareError(f"nothing can move at {bus.name} yet: {words}")
+                words = [f"{one.what} is {one.value}: {one.cure}" for one in bad]
+                listed = "; ".join(words)
+                raise HardwareError(f"nothing can move at {bus.name} yet: {listed}")
         models = [bus.models.values() for bus in self._buses]
         return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
@@ -174,7 +175,8 @@ class Supervisor:
         now = time.monotonic()
         wait_s = at - now
         if exceeds(wait_s, LONGEST_WAIT_S):
-            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {wait_s:.3f} s")
+            asked = f"asked for {wait_s:.3f} s"
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
@@ -262,8 +264,9 @@ def require_ready(name: str, condition: Condition, limit_c: float) -> None:
         raise FaultError(f"{name} reports {condition.error}; {cure}")
     speed = abs(condition.velocity)
     if exceeds(speed, _REST_RAD_S):
+        moves = f"{name} moves at {speed:.2f} rad/s"
         cure = f"below {_REST_RAD_S:g} rad/s: wait until it hangs still, then try again"
-        raise FaultError(f"{name} moves at {speed:.2f} rad/s; torque goes on at rest, {cure}")
+        raise FaultError(f"{moves}; torque goes on at rest, {cure}")
     hottest = min(limit_c, condition.temperature_limit)
     if exceeds(condition.temperature, hottest):
         which = f"{name}: {condition.temperature:g}"

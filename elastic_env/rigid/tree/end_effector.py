@@ -41,8 +41,9 @@ class EndEffector:
             raise ConfigurationError(
                 f"end_effector {name!r} is on {model.body(self.body).name!r}, which no joint moves"
             )
-        self._chain[-1]["R"] = tree.R[self.body] @ R
-        self._chain[-1]["anchor"] = tree.place[self.body] + tree.R[self.body] @ self.place
+        R_lb = tree.R[self.body]
+        self._chain[-1]["R"] = R_lb @ R
+        self._chain[-1]["anchor"] = tree.place[self.body] + R_lb @ self.place
         self._n = len(joints)
         compile_now(self.pose, np.zeros((1, self._n)))
 
@@ -56,7 +57,8 @@ class EndEffector:
         position, _, axes, anchors = self._walked(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
-        moved[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
+        levers = position[:, None] - anchors
+        moved[:, :, columns] = np.cross(axes, levers).swapaxes(1, 2)
         turned[:, :, columns] = axes.swapaxes(1, 2)
         shape = (*q.shape[:-1], 3, self._n)
         return moved.reshape(shape), turned.reshape(shape)
@@ -67,7 +69,8 @@ class EndEffector:
         found, R_found = self.pose(q)
         # of small angles the sine of the half angle is exact, the cosine is not
         half = np.linalg.norm(R_found - R_wanted, axis=(-2, -1)) / math.sqrt(8.0)
-        return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
+        angle = 2.0 * np.arcsin(np.minimum(half, 1.0))
+        return np.linalg.norm(found - wanted, axis=-1), angle
 
     def parts(self, q_ref: Array, q: Array) -> Array:
         r"""Error of the position that the deviation of each joint makes alone, to first order.
@@ -88,7 +91,8 @@ class EndEffector:
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
         count = len(rows)
         hinges = len(self._chain) - 1
-        made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
+        shapes = ((3,), (3, 3), (hinges, 3), (hinges, 3))
+        made = [np.empty((count, *shape)) for shape in shapes]
         kernels.poses(self._chain, rows, *made)
         return tuple(made)
 
@@ -120,9 +124,8 @@ def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
         mujoco.mju_quat2Mat(R, model.site_quat[at])
         return int(model.site_bodyid[at]), model.site_pos[at].copy(), R.reshape(3, 3)
     if name not in bodies:
-        raise unknown_name(
-            "site or body for end_effector", name, [one for one in (*sites, *bodies) if one]
-        )
+        known = [one for one in (*sites, *bodies) if one]
+        raise unknown_name("site or body for end_effector", name, known)
     return bodies[name], np.zeros(3), np.eye(3)
 
 
