@@ -44,7 +44,7 @@ from typing_extensions import override
 from baselines.compensation.compensators import GravityCompensator, presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -129,11 +129,7 @@ class DisturbanceObserver(PolicyAround):
     """
 
     def __init__(
-        self,
-        policy: Policy,
-        model: RobotModel,
-        gains: ObserverGains,
-        ramp_s: float = STAND_S,
+        self, policy: Any, model: RobotModel, gains: ObserverGains, ramp_s: float = STAND_S
     ) -> None:
         super().__init__(policy, model)
         self.inputs = ()

@@ -77,16 +77,12 @@ def read_table_description(folder: Path) -> TableDescription:
     Raises:
         ConfigurationError: There is none, or it is not valid.
     """
-    return load_json(
-        folder / DESCRIPTION,
-        TableDescription,
-        what="table",
-        missing=lambda why: (
-            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed"
-            f" ({why}), as `elastic iterate` writes it"
-        ),
-        within=folder,
-    )
+
+    def missing(why: str) -> str:
+        needed = f"a folder with {DESCRIPTION} and {OFFSETS} is needed ({why})"
+        return f"nothing learned lies at {folder}: {needed}, as `elastic iterate` writes it"
+
+    return load_json(folder / DESCRIPTION, TableDescription, "table", missing, folder)
 
 
 def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:

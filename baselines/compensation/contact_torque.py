@@ -244,11 +244,8 @@ def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
 def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> Vector:
     """Gravity in the frame of a tilted pelvis [m/s²]."""
     cosine = math.cos(pitch)
-    return (
-        gravity * math.sin(pitch),
-        -gravity * (cosine * math.sin(roll)),
-        -gravity * (cosine * math.cos(roll)),
-    )
+    y = -gravity * (cosine * math.sin(roll))
+    return gravity * math.sin(pitch), y, -gravity * (cosine * math.cos(roll))
 
 
 @compiled

@@ -58,6 +58,8 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 "wrist_*": 300}.
 """
 
+Rates = npt.ArrayLike | None
+"""Rates or accelerations of a motion; None at rest."""
 _Settings = Mapping[str, JointSettings]
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's
@@ -236,21 +238,11 @@ class PositionCompensator:
         if asked is not None and before is not None:
             self._warn_of_jump(self._of_command * (self._torque(*asked) - before))
 
-    def torque(
-        self,
-        q: npt.ArrayLike,
-        q_dot: npt.ArrayLike | None = None,
-        q_ddot: npt.ArrayLike | None = None,
-    ) -> Array:
+    def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
         return self._torque(*self._motion(q, q_dot, q_ddot))
 
-    def command(
-        self,
-        q_desired: npt.ArrayLike,
-        q_dot: npt.ArrayLike | None = None,
-        q_ddot: npt.ArrayLike | None = None,
-    ) -> Array:
+    def command(self, q_desired: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Servo command that brings the links to where they should be.
 
         Args:
@@ -309,7 +301,8 @@ class PositionCompensator:
             return self._soft_link_angle(shown_angle, None)
         q = shown_angle
         for _ in range(_MOST_ITERATIONS):
-            residual = q - shown_angle + self._compliance * self._torque(q, None, None)
+            torque = self._links.gravity_torque(q)
+            residual = q - shown_angle + self._compliance * torque
             step, _ = _solved(factors, pivots, residual)
             q = q - step
             missing = residual.dot(residual)
@@ -324,14 +317,9 @@ class PositionCompensator:
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
         """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
-        found = follow_load(
-            theta,
-            self._compliance,
-            lambda q: self._torque(q, None, None),
-            self._links.gravity_gradient,
-            tolerance=_LAST_RESIDUAL_RAD,
-            within=(self._lowest, self._highest),
-        )
+        ends = (self._lowest, self._highest)
+        springs = (self._compliance, self._links.gravity_torque, self._links.gravity_gradient)
+        found = follow_load(theta, *springs, tolerance=_LAST_RESIDUAL_RAD, within=ends)
         if found.lost.any():
             raise ElasticError(
                 f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
@@ -464,11 +452,8 @@ def _warn(message: str) -> None:
 def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
-    return {
-        j: float(home[model.jnt_qposadr[j]])
-        for j in range(model.njnt)
-        if model.joint(j).name not in joints
-    }
+    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
+    return {j: float(home[model.jnt_qposadr[j]]) for j in others}
 
 
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Any) -> dict[str, Any]:

@@ -80,12 +80,7 @@ class Features:
         return FeaturesMemory(past, tuple(sources))
 
     def at(
-        self,
-        rows: Array,
-        memory: FeaturesMemory | None,
-        fresh: BoolArray,
-        state: Any,
-        episode_start: Any,
+        self, rows: Array, memory: Any, fresh: BoolArray, state: Any, episode_start: Any
     ) -> tuple[Array, FeaturesMemory]:
         """Features of a decision, and the memory for the next one.
 
@@ -214,7 +209,7 @@ class _ContactError:
     signals = (
         Signal("contact_error.x", "m", "ZMP less the planned one", mirrored="same"),
         Signal("contact_error.y", "m", "likewise, to the left", mirrored="opposite"),
-        Signal("contact_error.share", "1", "likewise, of the load", mirrored="opposite"),
+        Signal("contact_error.share", "1", "likewise, of load", mirrored="opposite"),
     )
     _LEAST_N = 50.0
 

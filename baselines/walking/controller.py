@@ -101,6 +101,7 @@ def _sole(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
+_GAINS = [name for name in WalkingGains.model_fields if not name.endswith("filter_s")]
 CONTROLLER = record_type(
     period_s=(),
     is_com_fed_back=bool,
@@ -114,15 +115,10 @@ CONTROLLER = record_type(
     per_pelvis=(2,),  # motion of the center of mass per motion of the pelvis [1]
     ankle_stiffness=(2, 2),  # pitch and roll of the legs [N·m/rad]
     friction_deflection=(2, 6),  # [rad]
-    friction_rate_rad_s=(),
-    force_difference=(),
-    force_difference_decay_s=(),
-    force_difference_limit_m=(),
-    dcm=(),
-    zmp_limit_m=(),
     velocity_share=(),  # of a step in a period [1]
     zmp_share=(),  # likewise
     weight_share=(),  # likewise
+    **dict.fromkeys(_GAINS, ()),
 )
 """Assumptions of the controller, and its gains."""
 
@@ -250,7 +246,7 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
     stiffness = model.stiffness.reshape(2, 6)
     period_s = model.control_period_s
     constants: Any = np.zeros(1, CONTROLLER)
-    for name in set(WalkingGains.model_fields) & set(CONTROLLER.names or ()):
+    for name in _GAINS:
         constants[name] = getattr(gains, name)
     constants["period_s"] = period_s
     constants["is_com_fed_back"] = com_feedback

@@ -54,13 +54,10 @@ class PostureGains(Model):
     """Largest part of the integral, and of the whole [rad]."""
 
 
+_GAINS = ("proportional", "integral", "derivative", "leak_s", "limit_rad")
 POSTURE = record_type(
     period_s=(),
-    proportional=(),  # [1]
-    integral=(),  # [1/s]
-    derivative=(),  # [s]
-    leak_s=(),
-    limit_rad=(),
+    **dict.fromkeys(_GAINS, ()),
     integral_limit=(),  # [rad·s]
     filter_share=(),  # of a step in a period [1]
     swing_share=(),  # likewise
@@ -102,7 +99,7 @@ class PostureFeedback(policies.PolicyAround):
         self._ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
         self._gains: Any = np.zeros(1, POSTURE)
-        for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):
+        for name in _GAINS:
             self._gains[name] = getattr(gains, name)
         self._gains["period_s"] = period_s
         self._gains["integral_limit"] = np.inf

@@ -100,15 +100,10 @@ def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
     spec.visual.headlight.diffuse = [0.15] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.rgba.haze = [*_BACKGROUND, 1.0]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=_BACKGROUND,
-        rgb2=_BACKGROUND,
-        width=64,
-        height=64,
-    )
+    kind = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    flat = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    sky = spec.add_texture(name="sky", type=kind, builtin=flat, width=64, height=64)
+    sky.rgb1 = sky.rgb2 = _BACKGROUND
 
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:

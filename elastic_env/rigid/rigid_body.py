@@ -1,6 +1,6 @@
 """Rigid-body dynamics of robots on a fixed base, batches in one pass."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -10,7 +10,7 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
-from elastic_env.rigid.tree.links import Tree
+from elastic_env.rigid.tree.links import Held, Tree
 
 
 class RigidBody:
@@ -31,10 +31,7 @@ class RigidBody:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        held: Mapping[str, float] | Mapping[int, float] | None = None,
+        self, model: mujoco.MjModel, joints: Sequence[str], held: Held | None = None
     ) -> None:
         held = held or {}
         require_hinge_tree(model, joints, but=list(held))
@@ -69,10 +66,8 @@ class RigidBody:
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
         if not q.shape == q_dot.shape == q_ddot.shape:
-            raise ElasticError(
-                f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape}"
-                f" and {q_ddot.shape}"
-            )
+            shapes = f"{q.shape}, {q_dot.shape} and {q_ddot.shape}"
+            raise ElasticError(f"angles, rates, accelerations must have one shape, got {shapes}")
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
         torque = np.empty(motion[0].shape)
         kernels.inverse_dynamics(self._links, self._loads, motion, torque)
@@ -98,10 +93,8 @@ class RigidBody:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
         if values.shape[-1:] != (self._n,):
             # compiled code reads where nothing is, without a word
-            raise ElasticError(
-                f"one value per joint is needed, (..., {self._n}), got an array of shape"
-                f" {values.shape}"
-            )
+            needed = f"(..., {self._n}), got an array of shape {values.shape}"
+            raise ElasticError(f"one value per joint is needed, {needed}")
         return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, self._n)
 
     def _compile(self, zero: Array) -> None:

@@ -113,10 +113,8 @@ class Guard:
             found = np.asarray(goals).tolist()
             raise FaultError(f"goals must be {n} finite angles [rad], got {found}")
         if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
-            raise FaultError(
-                "the time since the last command must be at least 0 s and finite, got"
-                f" {elapsed_s} s"
-            )
+            needed = f"at least 0 s and finite, got {elapsed_s} s"
+            raise FaultError(f"the time since the last command must be {needed}")
         if not self.is_holding:
             reach = self.limits.slew_rad_s * elapsed_s
             within = np.clip(asked, self.limits.lowest_rad, self.limits.highest_rad)

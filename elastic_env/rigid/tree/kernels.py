@@ -313,17 +313,10 @@ def poses(links: Any, q: Array, place: Array, R: Array, axes: Array, anchors: Ar
                 c = math.cos(angle)
                 s = math.sin(angle)
                 xx, xy, xz, yx, yy, yz, zx, zy, zz = turned
-                turned = (
-                    c * xx + s * xy,
-                    c * xy - s * xx,
-                    xz,
-                    c * yx + s * yy,
-                    c * yy - s * yx,
-                    yz,
-                    c * zx + s * zy,
-                    c * zy - s * zx,
-                    zz,
-                )
+                x = (c * xx + s * xy, c * xy - s * xx, xz)
+                y = (c * yx + s * yy, c * yy - s * yx, yz)
+                z = (c * zx + s * zy, c * zy - s * zx, zz)
+                turned = x + y + z
                 fill(axes[row, i], (xz, yz, zz))
                 fill(anchors[row, i], moved)
         fill(place[row], moved)

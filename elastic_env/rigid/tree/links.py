@@ -10,6 +10,9 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.kernels import LINK
 
+Held = Mapping[str, float] | Mapping[int, float]
+"""Positions of joints that do not move, by name or number, a hinge [rad] or a slide [m]."""
+
 
 @dataclass(frozen=True)
 class Tree:
@@ -27,13 +30,7 @@ class Tree:
     R: Array
 
     @classmethod
-    def of(
-        cls,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        held: Mapping[str, float] | Mapping[int, float],
-        root: int = 0,
-    ) -> Self:
+    def of(cls, model: mujoco.MjModel, joints: Sequence[str], held: Held, root: int = 0) -> Self:
         """Of a model whose other joints are held.
 
         Args:
