@@ -75,11 +75,13 @@ class TrueCompensator(DynamicCompensator):
 
     @override
     def offset(self, motion: Motion, memory: Any) -> Step:
+        offset, drives = super().offset(motion, memory.drives)
+        if self._gain == 0.0:
+            return offset, memory._replace(drives=drives)
         is_on = self._ramp.is_over(memory.steps)
         error = np.where(is_on, memory.target - self._truth.q, 0.0)
         correction = memory.correction + self._gain * error
-        correction = np.clip(correction, -_LIMIT_RAD, _LIMIT_RAD)
-        offset, drives = super().offset(motion, memory.drives)
+        correction = np.minimum(np.maximum(correction, -_LIMIT_RAD), _LIMIT_RAD)
         memory = TrueMemory(memory.steps + 1, correction, motion.q, drives)
         return offset + correction, memory
 

@@ -179,7 +179,14 @@ class Zero(BatchPolicy):
     reads_rates = False
 
     @override
-    def predict(self, observation: Array, *_: Any, **_named: Any) -> tuple[Any, None]:
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+        inputs: PolicyInputs = NO_INPUTS,
+    ) -> tuple[Any, None]:
         """Zero offset, (..., n) [rad], whatever the observation holds."""
         shape = (*observation.shape[:-1], self.view.num_joints)
         return np.zeros(shape, dtype=np.float32), None

@@ -29,7 +29,7 @@ share, not halves. A foot out of reach comes as near as the leg allows. The join
 further feedback.
 """  # noqa: E501
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from typing_extensions import override
@@ -132,7 +132,7 @@ class FootBalance(BatchPolicy):
     def _imu(self, rows: Array) -> Array:
         return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
-    def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> list[Array]:
+    def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> Any:
         """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y [rad]."""
         gains = self._gains
         periods = np.round(rows[:, self._clock][:, 0] / self._dt)
@@ -147,8 +147,8 @@ class FootBalance(BatchPolicy):
         lifts = rotation_of_tilt(together)[:, 2, :2]
         shift[..., 2] += np.einsum("wi,wfi->wf", lifts, from_middle)
         turn = together[:, None] + gains.moment * moment[..., :2]
-        limits = ((shift, gains.shift_limit_m), (turn, gains.turn_limit_rad))
-        return [np.clip(value, -limit, limit) for value, limit in limits]
+        shift = np.clip(shift, -gains.shift_limit_m, gains.shift_limit_m)
+        return shift, np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad)
 
     def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
         """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)."""
