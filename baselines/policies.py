@@ -142,17 +142,14 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     description, network = load_residual(folder)
     task = env.unwrapped.task.name
     if description.robot != task:
-        raise ConfigurationError(
-            f"{shorten(folder)} is a residual for the {description.robot}, the environment is the"
-            f" {task}"
-        )
+        robot = f"the {description.robot}, the environment is the {task}"
+        raise ConfigurationError(f"{shorten(folder)} is a residual for {robot}")
     model: RobotModel = env.unwrapped.assumed_model
     joints = model.joint_names
     if description.joints not in ([], joints):
-        raise ConfigurationError(
-            f"{shorten(folder)} was trained on a robot with the joints"
-            f" {', '.join(description.joints)}; the environment's has {', '.join(joints)}"
-        )
+        trained = f"a robot with the joints {', '.join(description.joints)}"
+        has = f"the environment's has {', '.join(joints)}"
+        raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
     return ResidualPolicy(Corrected(base, model, description.settings), network)
 

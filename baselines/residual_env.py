@@ -82,10 +82,8 @@ class _Deciding:
         shape = space.shape
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
-            raise ActionError(
-                f"a residual must be finite numbers of shape {shape} within ±1, got"
-                f" {quote(residual)}"
-            )
+            needed = f"finite numbers of shape {shape} within ±1"
+            raise ActionError(f"a residual must be {needed}, got {quote(residual)}")
         clipped = np.clip(given, -1.0, 1.0).reshape(len(rows), -1)
         return self.features.turn_back(rows, clipped).reshape(shape)
 

@@ -83,10 +83,8 @@ class LearnedOffsets(PolicyAround):
         steps = memory.steps + 1
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
-            raise ElasticError(
-                f"the offsets were learned in {tables} worlds, one each, and are played in"
-                f" {len(rows)}"
-            )
+            learned = f"learned in {tables} worlds, one each"
+            raise ElasticError(f"the offsets were {learned}, and are played in {len(rows)}")
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
         return (action + offsets).astype(np.float32), LearnedMemory(steps, inner)

@@ -43,10 +43,9 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
         ConfigurationError: It does not have it.
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
-        raise ConfigurationError(
-            f"this policy reads {sensor}, which the environment does not have; make it with"
-            f" sensors=[{sensor!r}]"
-        )
+        cure = f"make it with sensors=[{sensor!r}]"
+        lacks = "which the environment does not have"
+        raise ConfigurationError(f"this policy reads {sensor}, {lacks}; {cure}")
 
 
 class DeflectionSensors:

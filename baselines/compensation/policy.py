@@ -364,10 +364,9 @@ class ObservationView:
         rows = np.asarray(observation, dtype=np.float64)
         rows = rows[None] if rows.ndim < 2 else rows
         if rows.ndim != 2 or rows.shape[1] != self._width:
-            raise ElasticError(
-                f"an observation must have the {self._width} columns of its table, one row per"
-                f" world, got shape {np.shape(observation)}"
-            )
+            needed = f"the {self._width} columns of its table, one row per world"
+            found = np.shape(observation)
+            raise ElasticError(f"an observation must have {needed}, got shape {found}")
         return rows
 
     def require_start(self, rows: Array, episode_start: Any) -> None:

@@ -409,16 +409,12 @@ class PositionCompensator:
         if values.shape != (n,):
             is_array = isinstance(given, np.ndarray)
             size = f", an array of shape {values.shape}" if is_array else ""
-            raise ActionError(
-                f"{name} must be {n} numbers [{unit}], of {', '.join(self.joints)}; got"
-                f" {quote(given)}{size}"
-            )
+            needed = f"{n} numbers [{unit}], of {', '.join(self.joints)}"
+            raise ActionError(f"{name} must be {needed}; got {quote(given)}{size}")
         if not np.isfinite(values).all():
             bad = np.array(self.joints)[~np.isfinite(values)]
-            raise ActionError(
-                f"{name} must be finite [{unit}], got {quote(values.tolist())}; see"
-                f" {', '.join(bad)}"
-            )
+            found = f"{quote(values.tolist())}; see {', '.join(bad)}"
+            raise ActionError(f"{name} must be finite [{unit}], got {found}")
         return values
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
@@ -625,10 +621,8 @@ def _by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]
     if not isinstance(given, list | tuple | np.ndarray):
         return dict.fromkeys(joints, given)
     if len(given) != len(joints):
-        raise ConfigurationError(
-            f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got"
-            f" {len(given)}"
-        )
+        needed = f"{len(joints)} numbers [N·m/rad], of {', '.join(joints)}"
+        raise ConfigurationError(f"{name} must be {needed}, got {len(given)}")
     return dict(zip(joints, given, strict=True))
 
 

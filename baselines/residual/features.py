@@ -166,14 +166,12 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
         signals = rename_group(table.signals_of("encoder_angle"), name)
         return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
     if isinstance(model, WalkerModel):
-        match name:
-            case "contact_error":
-                return _ContactError(model, period_s)
-            case "level":
-                return GroundLevel(model, period_s)
-            case "bending":
-                return BendingObserver(model)
-        further += ["contact_error", "level", "bending"]
+        if name == "bending":
+            return BendingObserver(model)
+        timed = {"contact_error": _ContactError, "level": GroundLevel}
+        if name in timed:
+            return timed[name](model, period_s)
+        further += [*timed, "bending"]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 

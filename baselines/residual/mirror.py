@@ -74,10 +74,8 @@ class LeftFirst:
         model = corrected.model
         settings = corrected.settings
         if not isinstance(model, WalkerModel):
-            raise ConfigurationError(
-                "mirror is for a walker, whose legs are mirror images, got a"
-                f" {type(model).__name__}; set mirror: false"
-            )
+            found = f"got a {type(model).__name__}; set mirror: false"
+            raise ConfigurationError(f"mirror is for a walker, with legs that are alike, {found}")
         unlike: list[str] = []
         bounds = corrected.channels.parts(corrected.channels.bounds)
         for name, of_input in bounds.items():

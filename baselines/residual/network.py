@@ -30,10 +30,8 @@ def require_network(tensors: Tensors) -> int:
     depth = sum(name.startswith("weight") for name in tensors)
     names = {f"{kind}{i}" for kind in ("weight", "bias") for i in range(depth)}
     if not 1 <= depth <= _MOST_LAYERS or set(tensors) != {"mean", "std", *names}:
-        raise ConfigurationError(
-            f"weights must be mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers; "
-            f"got {quote(sorted(tensors))}"
-        )
+        needed = f"mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers"
+        raise ConfigurationError(f"weights must be {needed}; got {quote(sorted(tensors))}")
     for name, tensor in tensors.items():
         _require_numbers(name, tensor)
     vectors = ["mean", *(f"bias{i}" for i in range(depth))]

@@ -64,10 +64,8 @@ class ResidualSettings(Model):
             raise ValueError("acts_on takes the place of space and scale; leave them out")
         space = values.get("space", "model")
         if not isinstance(space, str) or space not in _OLD_SPACES:
-            raise ValueError(
-                f"space must be one of {', '.join(_OLD_SPACES)}, got {quote(space)}; better give"
-                " acts_on"
-            )
+            known = ", ".join(_OLD_SPACES)
+            raise ValueError(f"space must be one of {known}, got {quote(space)}")
         acts_on = {_OLD_SPACES[space]: values.get("scale")}
         others = {key: values[key] for key in values if key not in ("space", "scale")}
         return {**others, "acts_on": acts_on}
@@ -89,10 +87,8 @@ class ResidualSettings(Model):
     @property
     def bounds(self) -> dict[str, Bound]:
         """`acts_on` with the defaults put in."""
-        return {
-            name: INPUTS[name].default if bound is None else bound
-            for name, bound in self.acts_on.items()
-        }
+        given = self.acts_on.items()
+        return {k: INPUTS[k].default if bound is None else bound for k, bound in given}
 
 
 class TrainedOn(Model):
