@@ -44,10 +44,9 @@ class SafetyLimits(Model):
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
-            raise ValueError(
-                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got "
-                f"{self.lowest_rad} and {self.highest_rad}"
-            )
+            needed = f"below highest_rad, by at least {_LEAST_RANGE_RAD} rad"
+            given = f"{self.lowest_rad} and {self.highest_rad}"
+            raise ValueError(f"lowest_rad must be {needed}, got {given}")
         return self
 
 

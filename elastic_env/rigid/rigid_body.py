@@ -127,7 +127,5 @@ def require_hinge_tree(
             )
     require_known("joint of the rigid model", joints, names)
     if sorted(joints) != sorted(names):
-        raise ConfigurationError(
-            f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}:"
-            f" {', '.join(joints)}"
-        )
+        needed = f"all {len(names)} joints must be named ({', '.join(names)})"
+        raise ConfigurationError(f"{needed}, got {len(joints)}: {', '.join(joints)}")

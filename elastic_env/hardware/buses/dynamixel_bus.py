@@ -16,17 +16,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses import packets, servo_models
 from elastic_env.hardware.buses import port as ports
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States
 from elastic_env.hardware.buses.packets import word
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE, bus_gone
-from elastic_env.hardware.buses.servo_models import (
-    NUM_BLOCKS,
-    ServoModel,
-    explain_errors,
-    servo_model,
-)
+from elastic_env.hardware.buses.servo_models import ServoModel
 from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
 
 _TRIES = 3
@@ -67,7 +62,7 @@ class DynamixelBus:
         self.num_retries = 0
         self._handler = ports.PacketHandler()
         self._cycles_without_temperature = TEMPERATURE_CYCLES
-        self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)
+        self._awaited: deque[range | None] = deque(maxlen=servo_models.NUM_BLOCKS - 1)
         """Blocks that the last requests asked for; None where all servos answered."""
 
     def open(self) -> None:
@@ -129,7 +124,8 @@ class DynamixelBus:
         Raises:
             HardwareError: A model is not known, or they do not go together.
         """
-        self.models = {i: servo_model(number) for i, number in numbers.items()}
+        kinds = {i: servo_models.servo_model(number) for i, number in numbers.items()}
+        self.models = kinds
         if len({model.blocks for model in self.models.values()}) > 1:
             names = ", ".join(f"{i}: {model.name}" for i, model in self.models.items())
             raise HardwareError(
@@ -182,7 +178,8 @@ class DynamixelBus:
         counts = self.read(servo_id, "present_velocity")
         temperature = float(self.read(servo_id, "present_temperature"))
         highest = float(self.read(servo_id, "temperature_limit"))
-        error = explain_errors(self.read(servo_id, "hardware_error_status"))
+        status = self.read(servo_id, "hardware_error_status")
+        error = servo_models.explain_errors(status)
         unit = self.models[servo_id].velocity_unit
         return Condition(counts * unit, temperature, highest, error)
 
@@ -409,10 +406,8 @@ class BusGroup:
         silent = [name for names in lists for name in names]
         problems = [str(error) for error in errors]
         if silent:
-            problems.append(
-                f"torque off was sent, but not confirmed by {', '.join(silent)}: switch the"
-                " power off"
-            )
+            who = f"{', '.join(silent)}: switch the power off"
+            problems.append(f"torque off was sent, but not confirmed by {who}")
         if not problems:
             return None
         pairs = zip(self.buses, answers, strict=True)

@@ -103,10 +103,8 @@ class HardwareTestbedTask(TestbedTask):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """Signals of a step, as in the table of the module."""
         cycle = worlds["cycle"]
-        return {
-            **super()._signals(joints, worlds),
-            **{name: cycle[name].copy() for name in _CYCLE.names or ()},
-        }
+        own = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        return {**super()._signals(joints, worlds), **own}
 
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]

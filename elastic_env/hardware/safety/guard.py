@@ -148,10 +148,9 @@ class Guard:
         highest = limits.highest_rad + limits.margin_rad
         outside = is_fresh & is_outside(states.position, lowest, highest)
         if outside.any():
-            return (
-                f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
-                f"{self._list(outside, states.position)} rad"
-            )
+            ends = f"{limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad"
+            servos = self._list(outside, states.position)
+            return f"a position is outside {ends}: {servos} rad"
         fast = is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
         if fast.any():
             speeds = self._list(fast, states.velocity)

@@ -23,15 +23,11 @@ import numpy as np
 from elastic_env.hardware.buses.bus import Condition, States
 from elastic_env.hardware.buses.dynamixel_bus import BusGroup, DynamixelBus, servo_name
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
+from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.guard import Guard, exceeds, explain_heat
 from elastic_env.hardware.safety.processes import Channel, is_ending
-from elastic_env.hardware.safety.realtime import (
-    LONGEST_WAIT_S,
-    Priority,
-    prefer_realtime,
-    sleep_until,
-)
+from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.settings import SafetyLimits
 
 _REPLY_TIMEOUT_S = 0.003
@@ -182,7 +178,7 @@ class Supervisor:
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
         self._servos.write_goals(allowed)
         self._commanded_s = now
-        sleep_until(at)
+        realtime.sleep_until(at)
         begin = time.monotonic()
         states = self._servos.read_states(_REPLY_TIMEOUT_S)
         reason = guard.check(states)
@@ -290,7 +286,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     for number in _SIGNALS:
         signal.signal(number, _end)
     # a thread for each of several buses
-    prefer_realtime(Priority.SUPERVISOR, with_threads=True)
+    realtime.prefer_realtime(realtime.Priority.SUPERVISOR, with_threads=True)
     buses = [DynamixelBus(port, baudrate) for port in ports]
     try:
         for bus in buses:

@@ -1,17 +1,18 @@
 """Pose of the end effector of a tree of hinges, for a batch of postures at once."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
-from elastic_env.rigid.tree.links import Tree
+from elastic_env.rigid.tree.links import Held, Tree
 
 
 class EndEffector:
@@ -28,11 +29,7 @@ class EndEffector:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        name: str,
-        held: Mapping[str, float] | None = None,
+        self, model: MjModel, joints: Sequence[str], name: str, held: Held | None = None
     ) -> None:
         self.body, self.place, R = _found(model, name)
         tree = Tree.of(model, joints, held or {})
@@ -97,7 +94,7 @@ class EndEffector:
         return tuple(made)
 
 
-def outermost_body(model: mujoco.MjModel) -> str:
+def outermost_body(model: MjModel) -> str:
     """The named body that has the most bodies between it and the base; the last of several.
 
     Raises:
@@ -108,13 +105,12 @@ def outermost_body(model: mujoco.MjModel) -> str:
         depth[body] = depth[model.body_parentid[body]] + 1
     named = [body for body in range(1, model.nbody) if model.body(body).name]
     if not named:
-        raise ConfigurationError(
-            "no body of the model has a name; give one to the body that is the end effector"
-        )
+        cure = "give one to the body that is the end effector"
+        raise ConfigurationError(f"no body of the model has a name; {cure}")
     return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
 
 
-def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
+def _found(model: MjModel, name: str) -> tuple[int, Array, Array]:
     """Body of a site or body, place and orientation in it."""
     sites = {model.site(i).name: i for i in range(model.nsite)}
     bodies = {model.body(i).name: i for i in range(1, model.nbody)}

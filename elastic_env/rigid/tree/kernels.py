@@ -586,11 +586,9 @@ def into_parent(R: Matrix, c: float, s: float, v: Vector) -> Vector:
 @compiled
 def times(A: Matrix, v: Vector) -> Vector:
     """A v."""
-    return (
-        A[0] * v[0] + A[1] * v[1] + A[2] * v[2],
-        A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
-        A[6] * v[0] + A[7] * v[1] + A[8] * v[2],
-    )
+    x = A[0] * v[0] + A[1] * v[1] + A[2] * v[2]
+    y = A[3] * v[0] + A[4] * v[1] + A[5] * v[2]
+    return x, y, A[6] * v[0] + A[7] * v[1] + A[8] * v[2]
 
 
 @compiled
