@@ -6,7 +6,7 @@ compositions.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from typing import Any
@@ -18,10 +18,8 @@ from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensators import (
     Compensated,
-    Compensator,
     DynamicCompensator,
     GravityCompensator,
-    OutputMethod,
 )
 from baselines.compensation.measured import (
     LINK_ENCODER,
@@ -56,6 +54,14 @@ class Track(StrEnum):
     TRUTH = "ground truth"
 
 
+TRACK_OF_SENSOR = {
+    TORQUE_SENSOR: Track.TORQUE_SENSORS,
+    LINK_ENCODER: Track.LINK_ENCODERS,
+    LINK_IMU: Track.LINK_ENCODERS,
+}
+"""Track of a policy that reads a sensor beyond the standard set."""
+
+
 @dataclass(frozen=True)
 class NamedPolicy:
     """A policy that `baselines.make` knows by name.
@@ -71,16 +77,16 @@ class NamedPolicy:
     build: Builder
     options: tuple[str, ...] = ()
     track: Track = Track.STANDARD
-    sensors: tuple[str, ...] = field(default=())
+    sensors: tuple[str, ...] = ()
 
 
 def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     return Zero(model)
 
 
-def _around(
-    core: Builder, compensator: Callable[..., Compensator], output: OutputMethod = "taylor"
-) -> Builder:
+def _around(core: Builder, compensator: Any, output: Any = "taylor") -> Builder:
+    """A compensator around a policy."""
+
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
         made = compensator(model, options.output or output, options.gravity)
         return Compensated(core(env, model, options), made, ramp_s=options.ramp_s)
@@ -91,19 +97,23 @@ def _around(
 _friction = _around(_zero, partial(DynamicCompensator, friction=True))
 
 
-def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+def _observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     gains = options.observer
     build = _friction if gains.friction else _around(_zero, DynamicCompensator)
-    inner = build(env, model, options)
-    return DisturbanceObserver(inner, model, gains, options.ramp_s)
+    return DisturbanceObserver(build(env, model, options), model, gains, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
 
 
-def _without_feedback(build: Builder) -> Builder:
-    return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
+def _open(build: Builder) -> Builder:
+    """Without feedback of the center of mass."""
+
+    def built(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+        return build(env, model, options.replace(com_feedback=False))
+
+    return built
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
@@ -112,10 +122,11 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
             "the oracle reads the truth, by a method truth() of the environment, which "
             f"{type(env.unwrapped).__name__} does not have"
         )
-    if isinstance(model, WalkerModel):
-        controller = _controller(env, env.unwrapped.truth().model, options)
-        return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)
-    return Oracle(env, _zero(env, model, options), options.ramp_s)
+    ramp_s = options.ramp_s
+    if not isinstance(model, WalkerModel):
+        return Oracle(env, Zero(model), ramp_s)
+    inner = _controller(env, env.unwrapped.truth().model, options)
+    return Oracle(env, inner, ramp_s, friction=False, integral_gain=0.0)
 
 
 def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -169,12 +180,17 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     # away over the walks
     if "swing_s" not in options.posture.model_fields_set:
         options = options.replace(posture=options.posture.replace(swing_s=0.0))
-    base = policies_of(is_walker)[learned_base(options, is_walker)].build(env, model, options)
+    known = policies_of(is_walker)[learned_base(options, is_walker)]
+    base = known.build(env, model, options)
     signals = learned_signals(model, options.learning)
-    return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
+    learner = IterativeLearner(base, model, signals, options.ramp_s)
+    learner.trials = options.learning.trials
+    return learner
 
 
-def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
+def _measured(
+    sensor: str, options: tuple[str, ...], joints: tuple[str, ...] = ("",)
+) -> NamedPolicy:
     """`dynamic` with the deflections of some joints by sensors, which also adapt the stiffness."""
 
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
@@ -188,7 +204,7 @@ def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
         estimator = make_estimator(model, sensors)
         return OnlineStiffness(policy, model, estimator, options.adaptation)
 
-    return build
+    return NamedPolicy(_weighing(build), options, TRACK_OF_SENSOR[sensor], (sensor,))
 
 
 def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -213,11 +229,13 @@ COMPENSATED: Mapping[str, Builder] = {
 ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
 """Options that say what a policy assumes of the joints."""
 _COMPENSATOR = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
-_CONTROLLER = ("gains", "com_feedback")
-_COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
-_MEASURED = (*_COMPENSATED, "adaptation")
+_CONTROLLER = ("gains", "com_feedback", "ramp_s")
+_COMPENSATED = (*_COMPENSATOR, "gains", "com_feedback")
+_ADAPTIVE = (*_COMPENSATED, "base", "adaptation")
 _POSTURE = ("posture", "zmp_offset")
 _LEARNED = ("learned_base", "learning")
+_PUBLISHED = ("stance_roll", "foot_balance", "ramp_s")
+_TALOS = (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque")
 
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
@@ -226,14 +244,9 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "dynamic": NamedPolicy(_around(_zero, DynamicCompensator), _COMPENSATOR),
     "friction": NamedPolicy(_friction, _COMPENSATOR),
     "disturbance_observer": NamedPolicy(
-        _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
+        _observer, (*_COMPENSATOR, "observer"), TRACK_OF_SENSOR[LINK_IMU], (LINK_IMU,)
     ),
-    "link_encoder": NamedPolicy(
-        _with_sensors(LINK_ENCODER),
-        (*_COMPENSATOR, "adaptation"),
-        Track.LINK_ENCODERS,
-        (LINK_ENCODER,),
-    ),
+    "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATOR, "adaptation")),
     "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
@@ -244,40 +257,20 @@ There `uncompensated` has no controller to add and equals `zero`.
 
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
-    "uncompensated_open": NamedPolicy(
-        _without_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")
-    ),
-    "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER, "ramp_s")),
-    "input_open": NamedPolicy(_without_feedback(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
+    "uncompensated_open": NamedPolicy(_open(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
+    "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER)),
+    "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
-    "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
+    "adaptive": NamedPolicy(_weighing(_adaptive), _ADAPTIVE),
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
-    "adaptive_posture": NamedPolicy(
-        _weighing(_with_posture(_adaptive)), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
-    ),
-    "torque_sensor": NamedPolicy(
-        _weighing(_with_sensors(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
-    ),
-    "hip_sensor": NamedPolicy(
-        _weighing(_with_sensors(LINK_ENCODER, ("hip",))),
-        _MEASURED,
-        Track.LINK_ENCODERS,
-        (LINK_ENCODER,),
-    ),
-    "link_encoder": NamedPolicy(
-        _weighing(_with_sensors(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
-    ),
-    "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
-    "talos": NamedPolicy(
-        _talos,
-        (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque", "ramp_s"),
-        Track.TORQUE_SENSORS,
-        (TORQUE_SENSOR,),
-    ),
-    "iterative": NamedPolicy(
-        _iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS
-    ),
-    "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
+    "adaptive_posture": NamedPolicy(_weighing(_with_posture(_adaptive)), (*_ADAPTIVE, *_POSTURE)),
+    "torque_sensor": _measured(TORQUE_SENSOR, (*_COMPENSATED, "adaptation")),
+    "hip_sensor": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation"), ("hip",)),
+    "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation")),
+    "thormang": NamedPolicy(_thormang, _PUBLISHED),
+    "talos": NamedPolicy(_talos, _TALOS, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
+    "iterative": NamedPolicy(_iterative, (*_ADAPTIVE, "posture", *_LEARNED), Track.WALKS),
+    "oracle": NamedPolicy(_oracle, _CONTROLLER, Track.TRUTH),
 }
 """Policies of the walker.
 

@@ -1,6 +1,5 @@
 """The baselines by name; `baselines.catalogue` says how each is built."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -143,17 +142,14 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     description, network = load_residual(folder)
     task = env.unwrapped.task.name
     if description.robot != task:
-        raise ConfigurationError(
-            f"{shorten(folder)} is a residual for the {description.robot}, the environment is the"
-            f" {task}"
-        )
+        robot = f"the {description.robot}, the environment is the {task}"
+        raise ConfigurationError(f"{shorten(folder)} is a residual for {robot}")
     model: RobotModel = env.unwrapped.assumed_model
     joints = model.joint_names
     if description.joints not in ([], joints):
-        raise ConfigurationError(
-            f"{shorten(folder)} was trained on a robot with the joints"
-            f" {', '.join(description.joints)}; the environment's has {', '.join(joints)}"
-        )
+        trained = f"a robot with the joints {', '.join(description.joints)}"
+        has = f"the environment's has {', '.join(joints)}"
+        raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
     return ResidualPolicy(Corrected(base, model, description.settings), network)
 
@@ -169,15 +165,17 @@ def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     return played
 
 
-def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str, ...]) -> None:
+def _require_effect(name: str, env: Any, given: Any, usable: tuple[str, ...]) -> None:
+    listed = ", ".join(usable)
+    takes = f"its options are: {listed}" if usable else "it has no options"
     for option in given:
         if option not in usable:
-            takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
             # of those with options the oracle alone assumes no stiffness
-            why = " but knows the true one" if option in ASSUMED_OPTIONS and usable else ""
+            is_true = bool(usable) and option in ASSUMED_OPTIONS
+            why = f"{option} but knows the true one" if is_true else option
             task = env.unwrapped.task.name
             raise ConfigurationError(
-                f"the policy {name!r} of the {task} does not use {option}{why}; {takes}"
+                f"the policy {name!r} of the {task} does not use {why}; {takes}"
             )
 
 

@@ -12,6 +12,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -40,12 +42,10 @@ class _Deciding:
         policy = make(base, env) if isinstance(base, str) else base
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, self.settings)
         self.features = Features(self.corrected)
-        self.observation_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (self.features.width,), np.float64
-        )
-        self.action_space = gymnasium.spaces.Box(
-            -1.0, 1.0, (self.corrected.num_residuals,), np.float32
-        )
+        seen = (self.features.width,)
+        decided = (self.corrected.num_residuals,)
+        self.observation_space = Box(-np.inf, np.inf, seen, np.float64)
+        self.action_space = Box(-1.0, 1.0, decided, np.float32)
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
         self._past: FeaturesMemory | None = None
@@ -62,32 +62,33 @@ class _Deciding:
 
         The measurements count for some worlds only, or for all.
         """
-        features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
+        policy = (self._state, self._start)
+        features, past = self.features.at(rows, self._past, self._fresh, *policy)
         if worlds is not None and self._past is not None:
             past = put_rows(self._past, worlds, select_rows(past, worlds))
         self._past = past
-        self._fresh = np.zeros_like(self._fresh) if worlds is None else self._fresh & ~worlds
+        self._fresh = self._fresh & (False if worlds is None else ~worlds)
         return features
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
         """Commands of the corrected base for a control step."""
-        action, self._state = self.corrected.act(observation, residual, self._state, self._start)
+        policy = (self._state, self._start)
+        action, self._state = self.corrected.act(observation, residual, *policy)
         self._start = np.zeros_like(self._start)
         return action
 
-    def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
+    def read_residual(self, rows: Array, residual: Any, space: Any) -> Array:
         """A residual for the observations of its decision, clipped and out of the mirror."""
+        shape = space.shape
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
-            raise ActionError(
-                f"a residual must be finite numbers of shape {shape} within ±1, got"
-                f" {quote(residual)}"
-            )
-        clipped = np.clip(given, -1.0, 1.0)
-        return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
+            needed = f"finite numbers of shape {shape} within ±1"
+            raise ActionError(f"a residual must be {needed}, got {quote(residual)}")
+        clipped = np.clip(given, -1.0, 1.0).reshape(len(rows), -1)
+        return self.features.turn_back(rows, clipped).reshape(shape)
 
 
-class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """One world whose action is the residual of a base policy, [−1, 1]^k.
 
     Args:
@@ -104,18 +105,14 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
     def __init__(
         self, env: gymnasium.Env[Any, Any], base_policy: Policy | str, **settings: Any
     ) -> None:
-        arguments = {"base_policy": base_policy, **settings}
-        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
+        RecordConstructorArgs.__init__(self, base_policy=base_policy, **settings)
         gymnasium.Wrapper.__init__(self, env)
         self._deciding = _Deciding(env, base_policy, settings, num_worlds=1)
+        self.settings = self._deciding.settings
+        """How the residual acts."""
         self.observation_space = self._deciding.observation_space
         self.action_space = self._deciding.action_space
         self._last = np.zeros(0)
-
-    @property
-    def settings(self) -> ResidualSettings:
-        """How the residual acts."""
-        return self._deciding.settings
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -129,8 +126,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        shape = self.action_space.shape or ()
-        residual = self._deciding.read_residual(self._last[None], action, shape)[None]
+        rows = self._last[None]
+        residual = self._deciding.read_residual(rows, action, self.action_space)[None]
         total = 0.0
         terminated = False
         truncated = False
@@ -171,25 +168,24 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._deciding = _Deciding(env, base_policy, settings, env.num_envs)
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
+        self.settings = self._deciding.settings
+        """How the residual acts."""
+        n = env.num_envs
         self.single_observation_space = self._deciding.observation_space
         self.single_action_space = self._deciding.action_space
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self.action_space = batch_space(self.single_action_space, env.num_envs)
-        self._rows = np.zeros((env.num_envs, 0))
+        self.observation_space = batch_space(self.single_observation_space, n)
+
+        self.action_space = batch_space(self.single_action_space, n)
+        self._rows = np.zeros((n, 0))
         self._last: Array | None = None
-        self._done = np.zeros(env.num_envs, dtype=np.bool_)
+        self._done = np.zeros(n, dtype=np.bool_)
         self._decisions = 0
-        self._cut_at = np.zeros(env.num_envs, dtype=np.int64)
+        self._cut_at = np.zeros(n, dtype=np.int64)
 
     @property
     def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Metadata that Gymnasium's wrappers ask for."""
         return {**self.env.metadata, "autoreset_mode": self.autoreset_mode}
-
-    @property
-    def settings(self) -> ResidualSettings:
-        """How the residual acts."""
-        return self._deciding.settings
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -212,18 +208,17 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         it; learning that saw all worlds in the same phase would see one phase at a time. What is
         cut counts as truncated, and has no metrics.
         """
-        length = -(-self.env.unwrapped.task.num_steps // self.settings.decision_period)  # type: ignore[attr-defined]
+        env: Any = self.env.unwrapped
+        length = -(-env.task.num_steps // self.settings.decision_period)
+        order = generator.permutation(np.arange(1, self.num_envs + 1))
         self._decisions = 0
-        self._cut_at = -(
-            -generator.permutation(np.arange(1, self.num_envs + 1)) * length // self.num_envs
-        )
+        self._cut_at = -(-order * length // self.num_envs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        shape = self.action_space.shape or ()
-        residual = self._deciding.read_residual(self._rows, actions, shape)
+        residual = self._deciding.read_residual(self._rows, actions, self.action_space)
         waiting = self._done & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
@@ -243,7 +238,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._rows, _ = self.env.reset(options={"reset_mask": worlds})
         self._done = self._done & ~worlds
         self._deciding.begin(worlds)
-        return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
+        begun = self._deciding.observe(self._rows, worlds)
+        return np.where(worlds[:, None], begun, features)
 
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
         """Hold a residual for a decision period in the worlds that are alive.
@@ -271,18 +267,18 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
                 truncated = truncated | (ended & finished)
                 reason = np.where(ended, info["termination"], reason)
                 for name, values in info["episode_metrics"].items():
-                    metrics[name] = np.where(
-                        ended, values, metrics.get(name, np.zeros_like(values))
-                    )
+                    before = metrics.get(name, np.zeros_like(values))
+                    metrics[name] = np.where(ended, values, before)
                 alive = alive & ~ended
                 if not alive.any():
                     break
+        done = terminated | truncated
         info = {"termination": reason}
         if metrics:
-            info |= {"episode_metrics": metrics, "_episode_metrics": terminated | truncated}
-        features = self._deciding.observe(self._rows, ~(terminated | truncated))
+            info |= {"episode_metrics": metrics, "_episode_metrics": done}
+        features = self._deciding.observe(self._rows, ~done)
         if final is not None:
-            features = np.where((terminated | truncated)[:, None], final, features)
+            features = np.where(done[:, None], final, features)
         return Transition(features, reward, terminated, truncated, info)
 
     def _step(self, command: Array) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

@@ -99,17 +99,17 @@ BROKEN = (
         "return theta + _solve(gravity, theta",
         COMPENSATION,
     ),
-    BrokenFormula(_COMPENSATORS, "- 0.5 * self._dt * theta_dot", "", COMPENSATION),
+    BrokenFormula(_COMPENSATORS, "- 0.5 * dt * theta_dot", "", COMPENSATION),
     BrokenFormula(
         _COMPENSATORS,
-        "drive.rotor_inertia * theta_ddot[world, i] + torque[world, i]",
+        "drive.rotor_inertia * rate_dot[world, i] + torque[world, i]",
         "torque[world, i]",
         COMPENSATION,
     ),
     BrokenFormula(
         _COMPENSATORS,
-        "target + math.exp(-period_s / time_constant_s)",
-        "target + (1.0 - period_s / time_constant_s)",
+        "target + math.exp(-period_s / lag_s)",
+        "target + (1.0 - period_s / lag_s)",
         COMPENSATION,
     ),
     BrokenFormula(

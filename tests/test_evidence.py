@@ -154,7 +154,7 @@ def test_evidence_is_of_the_episode_and_counted_once_per_decision() -> None:
         memory = put_rows(memory, due, select_rows(source.observe(observation, memory)[1], due))
         action, state = policy.predict(observation, state, starting)
         np.testing.assert_array_equal(state.caution.loads, memory.loads)
-        np.testing.assert_array_equal(state.caution.bending, memory.bending)
+        np.testing.assert_array_equal(state.caution.observer, memory.observer)
         observation, *_ = envs.step(action)
     assert memory.loads[0, 0] == memory.loads[1, 0] - 5.0 == 7.0
 

@@ -45,7 +45,7 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -131,13 +131,10 @@ class DisturbanceObserver(PolicyAround):
     """
 
     def __init__(
-        self,
-        policy: Policy,
-        model: RobotModel,
-        gains: ObserverGains,
-        ramp_s: float = STAND_S,
+        self, policy: Any, model: RobotModel, gains: ObserverGains, ramp_s: float = STAND_S
     ) -> None:
         super().__init__(policy, model)
+        self.inputs = ()
         table = model.observation_table
         require_sensor(table, LINK_IMU, _LINK_ANGLE)
         self._gains = gains
@@ -145,57 +142,42 @@ class DisturbanceObserver(PolicyAround):
         self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
         self._body = make_dynamics(model, self._static.gravity)
-        self._follow_share = 1.0 - float(np.exp(-self._dt / self._gains.time_constant_s))
-        self._smooth_share = 1.0 - float(np.exp(-self._dt / self._gains.rate_filter_s))
-        self._zero_steps = round(self._gains.zero_s / self._dt)
+        self._follow_share = 1.0 - float(np.exp(-self._dt / gains.time_constant_s))
+        self._smooth_share = 1.0 - float(np.exp(-self._dt / gains.rate_filter_s))
+        self._zero_steps = round(gains.zero_s / self._dt)
         model.require_constant_friction("the disturbance observer")
-        self._coulomb = self._gains.friction * model.coulomb_friction
+        self._coulomb = gains.friction * model.coulomb_friction
         self._ramp = Ramp(model, ramp_s).table
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return ()
 
     @override
     def begin(self, rows: Array) -> ObserverMemory:
         imu = rows[:, self._imu].copy()
-        deflection = self.view.theta(rows) - imu
+        delta = self.view.theta(rows) - imu
         zero = np.zeros_like(imu)
-        joints = JointObservation(
-            offset=zero,
-            imu=imu,
-            deflection=deflection,
-            friction=zero,
-            smooth_deflection=deflection,
-            smooth_q=imu,
-            smooth_friction=zero,
-            rate=zero,
-            disturbance=zero,
-        )
+        joints = JointObservation(zero, imu, delta, zero, delta, imu, zero, zero, zero)
         steps = np.zeros((len(rows), 1), dtype=np.int64)
         return ObserverMemory(steps, joints, self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: ObserverMemory, inputs: PolicyInputs
-    ) -> tuple[Array, ObserverMemory]:
+    def act(self, rows: Array, memory: ObserverMemory, inputs: PolicyInputs) -> Step:
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         joints = self._observe(rows, steps, memory.joints)
         share = self._ramp.take(steps, mode="clip")
         lead = share * joints.disturbance / self.model.stiffness
-        return (action + lead).astype(np.float32), ObserverMemory(steps, joints, inner)
+        memory = ObserverMemory(steps, joints, inner)
+        return (action + lead).astype(np.float32), memory
 
     @override
     def link_angles(self, rows: Array, memory: ObserverMemory) -> Array:
         """The IMU's angle without its offset, (num_worlds, n) [rad]."""
         return rows[:, self._imu] + memory.joints.offset
 
-    def _observe(self, rows: Array, steps: IntArray, was: JointObservation) -> JointObservation:
-        """Memory of the joints after a control step."""
+    def _observe(self, rows: Array, steps: IntArray, was: Any) -> JointObservation:
+        """`JointObservation` after a control step."""
         gains = self._gains
         model = self.model
+        dt = self._dt
         theta = self.view.theta(rows)
         imu = rows[:, self._imu].copy()
         q_ref_dot = self.view.motion(rows).q_dot
@@ -206,19 +188,21 @@ class DisturbanceObserver(PolicyAround):
         # new
         is_new = (imu != was.imu) | is_zeroing
         deflection = np.where(is_new, theta - imu - offset, was.deflection)
-        friction = presliding_friction(was.friction, q_ref_dot * self._dt, self._coulomb)
+        friction = presliding_friction(was.friction, q_ref_dot * dt, self._coulomb)
 
         def smooth(value: Array, before: Array) -> Array:
             """A value behind the filter that all have in common."""
-            return np.where(is_zeroing, value, before + self._smooth_share * (value - before))
+            filtered = before + self._smooth_share * (value - before)
+            return np.where(is_zeroing, value, filtered)
 
         delta = smooth(deflection, was.smooth_deflection)
         delta_dot = (deflection - delta) / gains.rate_filter_s
         q = smooth(theta - deflection, was.smooth_q)
         q_dot = (theta - deflection - q) / gains.rate_filter_s
         known = smooth(friction, was.smooth_friction)
-        passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
-        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was.rate) / self._dt)
+        joints = (model.stiffness, model.damping, model.backlash)
+        passed = joint_torque(delta, delta_dot, *joints)
+        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was.rate) / dt)
         # at rest dry friction takes any value up to F: only what is beyond is a disturbance
         left = passed - needed - was.disturbance
         stuck = np.clip(left, -self._coulomb, self._coulomb)

@@ -4,8 +4,8 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 |---|---|---|
 | `LegEstimator` | encoders, foot sensors, IMU | (1 + ρ_roll) (1 + μ) for all joints of a leg but yaw |
 | the same | also joint torques | (1 + ρ_roll) (1 + μ) for rolls, (1 + ρ_pitch) (1 + μ) for pitches |
-| `EncoderEstimator` | also link encoders | (1 + r_j) (1 + μ) joint by joint |
-| `LinkEncoderEstimator` | encoders on motors and links of a robot on a fixed base | 1 + r_j joint by joint |
+| `LegEncoderEstimator` | also link encoders | (1 + r_j) (1 + μ) joint by joint |
+| `EncoderEstimator` | encoders on motors and links of a robot on a fixed base | 1 + r_j joint by joint |
 
 ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the
 feet. Without torque sensors ρ of pitch is left out: friction hides the bending there. Joints
@@ -22,31 +22,22 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.joint_stiffness import (
-    RegressionMemory,
-    StiffnessPrior,
-    StiffnessRegression,
-)
+from baselines.estimation.joint_stiffness import StiffnessPrior, regress
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 _SEEN = SignalTable(BendingObserver.signals)
 _ERROR = _SEEN.group("model_error")
 _LOAD = _SEEN.names.index("excess_load")
-_ROLL = 0
-_PITCH = 1
-_AXIS = np.array([_ROLL, _ROLL, _PITCH, _PITCH, _PITCH, _ROLL])  # of the joints of a leg
+_AXIS = np.array([0, 0, 1, 1, 1, 0])  # roll or pitch, of the joints of a leg
 _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
-_PRIOR_LOADS = 5.0
+_LOADS = 5.0
 """Number of measurements that the assumed load counts for."""
-ARM_PRIOR = StiffnessPrior(own=0.3, noise_rad=0.005)
-"""Joints of an arm are less alike than those of two legs, and no foot sensors add errors of
-their own.
-"""
 
 
 class Estimator(Protocol):
@@ -74,69 +65,55 @@ class LegEstimator(Estimator):
     Args:
         model: Assumed walker.
         sensors: Joint torque sensors, if it has them.
+        prior_loads: Number of measurements that the assumed load counts for.
     """
 
-    def __init__(self, model: WalkerModel, sensors: DeflectionSensors | None = None) -> None:
+    def __init__(
+        self,
+        model: WalkerModel,
+        sensors: DeflectionSensors | None = None,
+        prior_loads: float = _LOADS,
+    ) -> None:
         self._observer = BendingObserver(model)
         self._sensors = sensors
+        self._prior_loads = prior_loads
         self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
-        return EstimatorMemory(np.zeros((num_worlds, 2)), self._observer.begin(num_worlds))
+        loads = np.zeros((num_worlds, 2))
+        return EstimatorMemory(loads, self._observer.begin(num_worlds))
 
-    @override
-    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, EstimatorMemory]:
+    def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
+        """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
         bending = None if self._sensors is None else self._sensors.deflection(rows)
         seen, observer = self._observer.observe(rows, memory.observer, bending)
-        load, loads = mean_load(memory.loads, seen[:, [_LOAD]])
+        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], self._prior_loads)
+        return seen, load, EstimatorMemory(loads, observer)
+
+    @override
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Any]:
+        seen, load, memory = self.observe(rows, memory)
         error = seen[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
         joints = ((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS
-        return joints.reshape(len(rows), -1), EstimatorMemory(loads, observer)
+        return joints.reshape(len(rows), -1), memory
+
+
+class RegressionMemory(NamedTuple):
+    """Memory of a regression.
+
+    Attributes:
+        friction: That holds the links back, (num_worlds, n) [N·m].
+        q: Link angles of the last measurement, (num_worlds, n) [rad].
+        sums: As of `regress`, (num_worlds, 5, n).
+    """
+
+    friction: Array
+    q: Array
+    sums: Array
 
 
 class EncoderEstimator(Estimator):
-    """r of each joint by link encoders; joints that have none take part in the load alone.
-
-    See the module.
-
-    Args:
-        model: Assumed walker.
-        sensors: Its link encoders.
-    """
-
-    def __init__(self, model: WalkerModel, sensors: DeflectionSensors) -> None:
-        self._sensors = sensors
-        self._regression = StiffnessRegression(model, StiffnessPrior())
-        self._compensator = GravityCompensator(model, output="wrench")
-        self._theta = model.observation_table.group("encoder_angle")
-        self._stiffness = model.stiffness
-        self._wrench = model.observation_table.group("wrench")
-        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
-
-    @override
-    def begin(self, num_worlds: int) -> EstimatorMemory:
-        return EstimatorMemory(np.zeros((num_worlds, 2)), self._regression.begin(num_worlds))
-
-    @override
-    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, EstimatorMemory]:
-        has = self._sensors.has
-        deflection = self._sensors.deflection(rows)
-        theta = rows[:, self._theta]
-        q = theta - deflection
-        friction = self._regression.friction(q, memory.observer)
-        modelled = theta - self._compensator.at(rows).link_angle(theta)
-        h = modelled + friction / self._stiffness
-        error, observer = self._regression.add(
-            h, deflection, friction, q, memory.observer, measured=has
-        )
-        force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
-        excess = force.sum(axis=1, keepdims=True) / self._carried - 1.0
-        load, loads = mean_load(memory.loads, excess)
-        return (1.0 + has * error) * (1.0 + load) - 1.0, EstimatorMemory(loads, observer)
-
-
-class LinkEncoderEstimator(Estimator):
     """r of each joint by encoders on all links, see the module.
 
     Args:
@@ -144,40 +121,90 @@ class LinkEncoderEstimator(Estimator):
         sensors: Its link encoders.
     """
 
+    prior = StiffnessPrior(own=0.3, noise_rad=0.005)
+    """Joints of an arm are less alike than those of two legs, and no foot sensors add errors of
+    their own.
+    """
+
     def __init__(self, model: RobotModel, sensors: DeflectionSensors) -> None:
+        self._model = model
+        model.require_constant_friction("the estimate of the stiffness")
         self._sensors = sensors
-        self._regression = StiffnessRegression(model, ARM_PRIOR)
         self._view = ObservationView(model)
-        self._body = make_dynamics(model, GravityCompensator(model).gravity)
-        self._stiffness = model.stiffness
-        self._viscous = model.viscous_friction
+        self._compensator = self._compensator_of(model)
+
+    def _compensator_of(self, model: RobotModel) -> Any:
+        """Says which deflection to expect."""
+        return make_dynamics(model, GravityCompensator(model).gravity)
 
     @override
-    def begin(self, num_worlds: int) -> RegressionMemory:
-        return self._regression.begin(num_worlds)
+    def begin(self, num_worlds: int) -> Any:
+        zero = np.zeros((num_worlds, self._view.num_joints))
+        return RegressionMemory(zero, zero, np.stack([zero] * 5, axis=1))
 
     @override
-    def estimate(self, rows: Array, memory: RegressionMemory) -> tuple[Array, RegressionMemory]:
+    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         deflection = self._sensors.deflection(rows)
-        motion = self._view.motion(rows)
         q = self._view.theta(rows) - deflection
-        friction = self._regression.friction(q, memory)
-        torque = self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
-        torque = torque + self._viscous * motion.q_dot
-        h = (torque + friction) / self._stiffness
-        return self._regression.add(h, deflection, friction, q, memory, measured=self._sensors.has)
+        moved = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
+        coulomb = self._model.coulomb_friction
+        friction = presliding_friction(memory.friction, moved, coulomb)
+        h = self._expected(rows, q, friction)
+        y = deflection - h
+        own = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
+        sums = memory.sums + self._sensors.has * own
+        error = regress(sums.swapaxes(0, 1), self.prior)
+        return error, RegressionMemory(friction, q, sums)
+
+    def _expected(self, rows: Array, q: Array, friction: Array) -> Array:
+        """Deflection h under the torque of the motion and under friction, (num_worlds, n) [rad]."""
+        motion = self._view.motion(rows)
+        torque = self._compensator.inverse_dynamics(q, motion.q_dot, motion.q_ddot)
+        torque = torque + self._model.viscous_friction * motion.q_dot
+        return (torque + friction) / self._model.stiffness
+
+
+class LegEncoderEstimator(EncoderEstimator):
+    """r of a walker's joints; those without a link encoder take part in the load alone."""
+
+    prior = StiffnessPrior()
+
+    @override
+    def _compensator_of(self, model: Any) -> Any:
+        self._wrench = model.observation_table.group("wrench")
+        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
+        return GravityCompensator(model, output="wrench")
+
+    @override
+    def begin(self, num_worlds: int) -> EstimatorMemory:
+        return EstimatorMemory(np.zeros((num_worlds, 2)), super().begin(num_worlds))
+
+    @override
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Any]:
+        error, observer = super().estimate(rows, memory.observer)
+        force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
+        excess = force.sum(axis=1, keepdims=True) / self._carried - 1.0
+        load, loads = mean_load(memory.loads, excess)
+        r = (1.0 + self._sensors.has * error) * (1.0 + load) - 1.0
+        return r, EstimatorMemory(loads, observer)
+
+    @override
+    def _expected(self, rows: Array, q: Array, friction: Array) -> Array:
+        theta = self._view.theta(rows)
+        modelled = theta - self._compensator.at(rows).link_angle(theta)
+        return modelled + friction / self._model.stiffness
 
 
 def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
     """The estimator that makes the most of a robot's sensors."""
     if not isinstance(model, WalkerModel):
-        return LinkEncoderEstimator(model, sensors)
+        return EncoderEstimator(model, sensors)
     if sensors.are_torques:
         return LegEstimator(model, sensors)
-    return EncoderEstimator(model, sensors)
+    return LegEncoderEstimator(model, sensors)
 
 
-def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
+def mean_load(memory: Array, excess: Array, prior: float = _LOADS) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum.
 
     Args:

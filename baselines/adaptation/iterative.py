@@ -7,7 +7,7 @@ the environment that it is given, which may be hardware. What it has learned is 
 over the time of an episode.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from baselines.adaptation.iterative_learning import limit_surprise, update
 from baselines.adaptation.learned_signals import LearnedSignals
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
+from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
@@ -67,26 +67,24 @@ class LearnedOffsets(PolicyAround):
         Row t acts in the period that ends t periods after the start.
         """
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
-        self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
+        offsets = [self._signals.offsets(share * table) for table in tables]
+        self._offsets = np.stack(offsets)
         self.tables = tables
 
     @override
     def begin(self, rows: Array) -> LearnedMemory:
-        return LearnedMemory(np.zeros(len(rows), dtype=np.int64), self.policy.begin(rows))
+        steps = np.zeros(len(rows), dtype=np.int64)
+        return LearnedMemory(steps, self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs
-    ) -> tuple[Array, LearnedMemory]:
+    def act(self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs) -> Step:
         """After the last row of the table its offsets stay."""
         action, inner = self.policy.act(rows, memory.inner, inputs)
         steps = memory.steps + 1
         tables = len(self._offsets)
         if tables not in (1, len(rows)):
-            raise ElasticError(
-                f"the offsets were learned in {tables} worlds, one each, and are played in"
-                f" {len(rows)}"
-            )
+            learned = f"learned in {tables} worlds, one each"
+            raise ElasticError(f"the offsets were {learned}, and are played in {len(rows)}")
         row = np.minimum(steps, self._offsets.shape[1] - 1)
         offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
         return (action + offsets).astype(np.float32), LearnedMemory(steps, inner)
@@ -121,23 +119,19 @@ class IterativeLearner(LearnedOffsets):
         policy: What commands the robot.
         model: Assumed robot.
         signals: Errors, offsets, gains.
-        trials: How many it learns from.
         ramp_s: Time in which the offsets grow from zero [s].
     """
 
-    def __init__(
-        self, policy: Policy, model: RobotModel, signals: LearnedSignals, trials: int, ramp_s: float
-    ) -> None:
-        super().__init__(policy, model, signals, ramp_s)
-        self.trials = trials
+    trials = 10
+    """Number of trials that it learns from."""
 
-    def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] | None = None) -> None:
+    def rehearse(self, env: Any, seed: int, told: Any = None) -> None:
         """Learn on the robots that `env.reset(seed=seed)` draws; earlier learning is dropped.
 
         Args:
             env: The environment that the policy was made for, scalar or vector.
             seed: World i has the robot of seed + i, in every trial with other noise.
-            told: Called after each trial.
+            told: Called with each `Trial`.
         """
         stage = Stage(env, seed)
         shape = (stage.num_worlds, stage.num_steps + 1, len(self._signals.names))
@@ -158,12 +152,13 @@ class IterativeLearner(LearnedOffsets):
         # where nothing came before, all is credible
         known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
         errors = limit_surprise(trial.error, known, surprise)
-        pairs = zip(tables, errors, strict=True)
-        following = np.stack(
-            [update(table, error, gains, self._period_s, trial.number) for table, error in pairs]
-        )
+        following = np.empty_like(tables)
+        for world, table in enumerate(tables):
+            own = (table, errors[world], gains, self._period_s)
+            following[world] = update(*own, trial.number)
         failed = trial.failed[:, None, None]
-        return np.where(failed, _RETREAT * tables, following), np.where(failed, before, errors)
+        tables = np.where(failed, _RETREAT * tables, following)
+        return tables, np.where(failed, before, errors)
 
 
 class Stage:
@@ -188,6 +183,7 @@ class Stage:
         Its noise depends on the robot's seed and the number of the trial alone.
         """
         n = self.num_worlds
+        is_scalar = self._is_scalar
         seen = self._reset([_seed_of_noise(robot, number) for robot in self._robots])
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
         over = np.zeros(n, dtype=np.bool_)
@@ -196,18 +192,16 @@ class Stage:
         state = None
         start = np.ones(n, dtype=np.bool_)
         for step in range(1, self.num_steps + 1):
-            action, state = policy.predict(
-                seen, state=state, episode_start=start, deterministic=True
-            )
+            action, state = policy.predict(seen, state, start, deterministic=True)
             asked = seen
             seen, terminated, truncated, info = self._step(action)
             start = terminated | truncated
             running = ~over & ~terminated
             error[running, step] = signals.error(asked, seen, info)[running]
             for world in np.flatnonzero(start & ~over).tolist():
-                metrics[world] = {
-                    name: float(value) for name, value in self._metrics_of(info, world)
-                }
+                found = info.get("final_info", info)["episode_metrics"].items()
+                own = {k: v if is_scalar else v[world] for k, v in found}
+                metrics[world] = {name: float(value) for name, value in own.items()}
             failed = failed | (terminated & ~over)
             over = over | start
             if over.all():
@@ -215,22 +209,16 @@ class Stage:
         return Trial(number, error, failed, metrics)
 
     def _reset(self, seeds: list[int]) -> Array:
-        if self._is_scalar:
-            return self._env.reset(seed=seeds[0], options={"robot_seed": self._robots[0]})[0][None]
-        return self._env.reset(seed=seeds, options={"robot_seed": self._robots})[0]
+        seed: Any = seeds[0] if self._is_scalar else seeds
+        robots: Any = self._robots[0] if self._is_scalar else self._robots
+        seen, _ = self._env.reset(seed=seed, options={"robot_seed": robots})
+        return np.atleast_2d(seen)
 
-    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Mapping[str, Any]]:
-        seen, _, terminated, truncated, info = self._env.step(
-            action[0] if self._is_scalar else action
-        )
-        if self._is_scalar:
-            return seen[None], np.array([terminated]), np.array([truncated]), info
-        return seen, terminated, truncated, info
-
-    def _metrics_of(self, info: Mapping[str, Any], world: int) -> Iterator[tuple[str, float]]:
-        """Metrics of a world whose episode has just ended."""
-        for name, values in info.get("final_info", info)["episode_metrics"].items():
-            yield name, values if self._is_scalar else values[world]
+    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Any]:
+        command = action[0] if self._is_scalar else action
+        seen, _, terminated, truncated, info = self._env.step(command)
+        ends = (np.atleast_1d(terminated), np.atleast_1d(truncated))
+        return np.atleast_2d(seen), *ends, info
 
 
 def _seed_of_noise(robot: int, number: int) -> int:

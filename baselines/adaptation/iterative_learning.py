@@ -74,7 +74,8 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
 
     sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
     longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends
-    return signal.sosfiltfilt(sections, table, axis=0, padlen=min(longest, len(table) - 1))
+    length = min(longest, len(table) - 1)
+    return signal.sosfiltfilt(sections, table, axis=0, padlen=length)
 
 
 def lead_error(error: Array, steps: int) -> Array:
@@ -96,7 +97,7 @@ def limit_surprise(error: Array, before: Array, surprise: float | Array) -> Arra
 
 
 def update(
-    table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0
+    table: Array, error: Array, gains: Sequence[ChannelGains], dt: float, trial: int = 0
 ) -> Array:
     """Offsets of the next trial, see the module.
 
@@ -104,13 +105,14 @@ def update(
         table: Offsets of this trial, (T, k), a column for each of the gains.
         error: What is to be corrected, at the same times, (T, k).
         gains: Of the columns.
-        period_s: Time between rows [s].
+        dt: Time between rows [s].
         trial: Number of this trial, 0 for the first.
     """
     following = np.empty_like(table)
     for column, own in enumerate(gains):
-        leading = lead_error(error[:, column], round(own.lead_s / period_s))
-        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * leading
-        smooth = zero_phase(wanted, own.cutoff_hz, period_s)
+        leading = lead_error(error[:, column], round(own.lead_s / dt))
+        kept = (1.0 - own.forgetting) * table[:, column]
+        wanted = kept + own.gain_of(trial) * leading
+        smooth = zero_phase(wanted, own.cutoff_hz, dt)
         following[:, column] = np.clip(smooth, -own.limit, own.limit)
     return following

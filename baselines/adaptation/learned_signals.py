@@ -31,15 +31,8 @@ from elastic_env.world.robot_model import RobotModel, WalkerModel
 LINK_IMU = "link_angle_imu"
 _LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP
 
-_ZMP = ChannelGains(
-    gain=0.6,
-    lead_s=0.26,
-    cutoff_hz=2.0,
-    surprise=0.006,
-    limit=0.06,
-    forgetting=0.1,
-    halved_after=3.0,
-)
+_ZMP = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06)
+_ZMP = _ZMP.replace(forgetting=0.1, halved_after=3.0)
 
 
 class LearningGains(Model):
@@ -107,13 +100,15 @@ class WalkSignals(LearnedSignals):
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
         """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
-        return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
+        missing = asked[:, self._zmp] - self.measured_zmp(seen)
+        return np.hstack([seen[:, self._attitude], missing])
 
     def measured_zmp(self, seen: Array) -> Array:
         """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
         biped = self._model.biped
         least_n = _LEAST_LOAD * biped.weight
-        return self._sensors.zmp_of_flat_feet(seen[:, self._wrench], biped.ankles, least_n)
+        wrench = seen[:, self._wrench]
+        return self._sensors.zmp_of_flat_feet(wrench, biped.ankles, least_n)
 
     @override
     def offsets(self, table: Array) -> Array:
@@ -147,10 +142,8 @@ class JointSignals(LearnedSignals):
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        if self._encoder is None:
-            link = np.reshape(info[LINK_IMU], (-1, 1))
-        else:
-            link = seen[:, self._encoder]
+        by_imu = self._encoder is None
+        link = np.reshape(info[LINK_IMU], (-1, 1)) if by_imu else seen[:, self._encoder]
         return asked[:, self._reference] - link
 
     @override

@@ -48,14 +48,15 @@ class TableDescription(Model):
     @classmethod
     def _base_is_a_name(cls, value: str) -> str:
         if ":" in value or value == "iterative":
-            raise ValueError(f"the base must be a baseline that has learned nothing, got {value!r}")
+            raise ValueError(f"it must be a baseline without learning, got {value!r}")
         return value
 
 
 def motion_of(env: Any) -> dict[str, Any]:
     """Gait or reference of an environment."""
     config = env.unwrapped.task.config
-    return (config.gait if hasattr(config, "gait") else config.reference).model_dump(mode="json")
+    motion = config.gait if hasattr(config, "gait") else config.reference
+    return motion.model_dump(mode="json")
 
 
 def save_table(folder: Path, description: TableDescription, table: Array) -> None:
@@ -76,16 +77,12 @@ def read_table_description(folder: Path) -> TableDescription:
     Raises:
         ConfigurationError: There is none, or it is not valid.
     """
-    return load_json(
-        folder / DESCRIPTION,
-        TableDescription,
-        what="table",
-        missing=lambda why: (
-            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed"
-            f" ({why}), as `elastic iterate` writes it"
-        ),
-        within=folder,
-    )
+
+    def missing(why: str) -> str:
+        needed = f"a folder with {DESCRIPTION} and {OFFSETS} is needed ({why})"
+        return f"nothing learned lies at {folder}: {needed}, as `elastic iterate` writes it"
+
+    return load_json(folder / DESCRIPTION, TableDescription, "table", missing, folder)
 
 
 def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
@@ -116,28 +113,25 @@ def _require_table(description: TableDescription, table: Array) -> None:
             f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}"
         )
     if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST:
-        raise ConfigurationError(f"offsets must be finite and within ±{_LARGEST:g} rad or m")
+        raise ConfigurationError(f"offsets must be finite within ±{_LARGEST:g} rad or m")
 
 
-def _require_same(folder: Path, description: TableDescription, table: Array, env: Any) -> None:
+def _require_same(folder: Path, learned: Any, table: Array, env: Any) -> None:
     """Refuse a table of another robot or motion."""
     task = env.unwrapped.task
-    pairs = (
-        ("robot", description.robot, task.name),
-        ("control period", description.control_period_s, task.assumed_model.control_period_s),
-        ("number of rows", len(table), task.num_steps + 1),
-    )
-    for what, learned, given in pairs:
-        if learned != given:
-            raise ConfigurationError(
-                f"{folder} was learned with the {what} {learned!r}, the environment has {given!r}"
-            )
+    period_s = task.assumed_model.control_period_s
     motion = motion_of(env)
-    for key in {**motion, **description.motion}:
-        learned = description.motion.get(key)
-        given = motion.get(key)
-        if learned != given:
+    pairs = [
+        ("the robot", learned.robot, task.name),
+        ("the control period", learned.control_period_s, period_s),
+        ("the number of rows", len(table), task.num_steps + 1),
+    ]
+    for key in {**motion, **learned.motion}:
+        what = f"a motion whose {key} is"
+        pairs.append((what, learned.motion.get(key), motion.get(key)))
+    for what, known, given in pairs:
+        if known != given:
             raise ConfigurationError(
-                f"{folder} was learned for a motion with {key} {quote(learned)}, the environment"
-                f" has {quote(given)}; learn it anew: offsets of one motion are wrong in another"
+                f"{folder} was learned with {what} {quote(known)}, the environment has"
+                f" {quote(given)}; learn it anew: offsets of one motion are wrong in another"
             )

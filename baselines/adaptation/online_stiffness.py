@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.adaptation.estimators import Estimator
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs, put_rows, select_rows
+from baselines.compensation import policy as policies
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import RobotModel
@@ -51,7 +50,7 @@ class StiffnessMemory(NamedTuple):
     inner: Any
 
 
-class OnlineStiffness(PolicyAround):
+class OnlineStiffness(policies.PolicyAround):
     """A compensated policy whose model of the joints is corrected by what is measured.
 
     Args:
@@ -62,16 +61,13 @@ class OnlineStiffness(PolicyAround):
     """
 
     def __init__(
-        self,
-        policy: Policy,
-        model: RobotModel,
-        estimator: Estimator,
-        gains: AdaptationGains,
+        self, policy: Any, model: RobotModel, estimator: Any, gains: AdaptationGains
     ) -> None:
         super().__init__(policy, model)
+        dt = model.control_period_s
         self._estimator = estimator
-        self._every = max(round(gains.period_s / model.control_period_s), 1)
-        self._gain = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s))
+        self._every = max(round(gains.period_s / dt), 1)
+        self._gain = 1.0 - float(np.exp(-dt / gains.filter_s))
         self._limit = gains.limit
 
     @override
@@ -82,24 +78,23 @@ class OnlineStiffness(PolicyAround):
         return StiffnessMemory(wait, zero, zero, estimator, self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: StiffnessMemory, inputs: PolicyInputs
-    ) -> tuple[Array, StiffnessMemory]:
+    def act(self, rows: Array, memory: StiffnessMemory, inputs: Any) -> policies.Step:
         """The input `deflection` r' comes on top, (1 + r) (1 + r') δ."""
         wait = memory.wait - 1
         target = memory.target
-        estimator = memory.estimator
+        own = memory.estimator
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
             wait[due] = self._every - 1
-            before = select_rows(estimator, due)
-            estimate, estimated = self._estimator.estimate(rows[due], before)
-            target = put_rows(target, due, np.clip(estimate, -self._limit, self._limit))
-            estimator = put_rows(estimator, due, estimated)
+            before = policies.select_rows(own, due)
+            estimate, after = self._estimator.estimate(rows[due], before)
+            estimate = np.clip(estimate, -self._limit, self._limit)
+            target = policies.put_rows(target, due, estimate)
+            own = policies.put_rows(own, due, after)
         correction = memory.correction + self._gain * (target - memory.correction)
         together = correction
         if inputs.deflection is not None:
             together = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0
         inputs = inputs._replace(deflection=together)
         action, inner = self.policy.act(rows, memory.inner, inputs)
-        return action, StiffnessMemory(wait, target, correction, estimator, inner)
+        return action, StiffnessMemory(wait, target, correction, own, inner)

@@ -27,6 +27,7 @@ from baselines.compensation.policy import (
     Policy,
     PolicyAround,
     PolicyInputs,
+    Step,
     WalkView,
     put_rows,
     select_rows,
@@ -35,7 +36,7 @@ from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
-from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
+from elastic_env.joint import elasticity
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
@@ -43,7 +44,7 @@ OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 
 
 def input_offset(
-    q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0
+    q: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0
 ) -> Array:
     r"""Eq. 9: the offset that brings the link to θ_d.
 
@@ -52,7 +53,7 @@ def input_offset(
     .. math:: u - q = \left(K^{-1} + k_p^{-1}\right) \tau_g(q)
 
     Args:
-        q_desired: Link angle to reach, θ_d, (..., n) [rad].
+        q: Link angle to reach, θ_d, (..., n) [rad].
         stiffness: K, (n,) [N·m/rad].
         gravity: τ_g of the assumed model.
         servo_compliance: 1/k_p of servos without an integrator, 0 of servos that hold their angle
@@ -61,8 +62,8 @@ def input_offset(
     Returns:
         (..., n) [rad].
     """
-    torque = gravity.gravity_torque(q_desired)
-    return static_deflection(torque, stiffness) + servo_compliance * torque
+    torque = gravity.gravity_torque(q)
+    return elasticity.static_deflection(torque, stiffness) + servo_compliance * torque
 
 
 def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
@@ -91,7 +92,9 @@ def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
 
     Arguments and errors are those of `taylor_link_angle`.
     """
-    return static_link_angle(theta, stiffness, gravity.gravity_torque, gravity.gravity_gradient)
+    torque = gravity.gravity_torque
+    gradient = gravity.gravity_gradient
+    return elasticity.static_link_angle(theta, stiffness, torque, gradient)
 
 
 class Compensator(Protocol):
@@ -188,7 +191,8 @@ class GravityCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        return input_offset(motion.q, self.stiffness, self.gravity, self._servo_compliance), memory
+        compliance = self._servo_compliance
+        return input_offset(motion.q, self.stiffness, self.gravity, compliance), memory
 
     @override
     def deflection(self, offset: Array, memory: Array) -> Array:
@@ -288,16 +292,18 @@ class DynamicCompensator(Compensator):
     def with_stiffness(self, stiffness: Array) -> Self:
         """The compensator with another K, also one for every world, (..., n) [N·m/rad]."""
         stiffer = shallow_copy(self)
-        stiffer._stiffness = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
+        rows = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
+        stiffer._stiffness = rows
         return stiffer
 
     @override
     def begin(self, motion: Motion) -> DriveMemory:
         torque = self._static.gravity.gravity_torque(motion.q)
-        integral_gain = self._drives["integral_gain"]
+        k_i = self._drives["integral_gain"]
         zero = np.zeros_like(torque)
-        windup = np.divide(torque, integral_gain, out=zero.copy(), where=integral_gain > 0.0)
-        deflection = static_deflection(torque, self._stiffness, self._backlash)
+        windup = np.divide(torque, k_i, out=zero.copy(), where=k_i > 0.0)
+        springs = (self._stiffness, self._backlash)
+        deflection = elasticity.static_deflection(torque, *springs)
         friction = self._friction.begin(torque.shape)
         return DriveMemory(deflection, rate=zero, windup=windup, friction=friction)
 
@@ -307,21 +313,22 @@ class DynamicCompensator(Compensator):
 
         The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
         """
+        dt = self._dt
+        before = memory.deflection
         torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
         torque = torque + self._viscous * motion.q_dot
         friction = memory.friction
         if self._rubs:
-            friction = self._friction.follow(motion.q_dot * self._dt, friction)
+            friction = self._friction.follow(motion.q_dot * dt, friction)
             torque = self._friction.passed(torque, motion.q_dot, friction)
-        target = static_deflection(torque, self._stiffness, self._backlash)
-        deflection = settle(memory.deflection, target, self._stiffness, self._drives, self._dt)
-        rate = (deflection - memory.deflection) / self._dt
+        target = elasticity.static_deflection(torque, self._stiffness, self._backlash)
+        deflection = settle(before, target, self._stiffness, self._drives, dt)
+        rate = (deflection - before) / dt
         theta_dot = motion.q_dot + rate
-        theta_ddot = motion.q_ddot + (rate - memory.rate) / self._dt
-        error, windup = servo_error(
-            theta_dot, theta_ddot, torque, memory.windup, self._drives, self._dt
-        )
-        offset = deflection + error - 0.5 * self._dt * theta_dot  # it is held too early
+        theta_ddot = motion.q_ddot + (rate - memory.rate) / dt
+        motor = (theta_dot, theta_ddot)
+        error, windup = servo_error(*motor, torque, memory.windup, self._drives, dt)
+        offset = deflection + error - 0.5 * dt * theta_dot  # it is held too early
         return offset, DriveMemory(deflection, rate, windup, friction)
 
     @override
@@ -368,59 +375,60 @@ def settle(
     for world in range(len(target)):
         K = stiffness[min(world, len(stiffness) - 1)]
         for i in range(len(drives)):
-            settled[world, i] = follow_lag(
-                deflection[world, i], target[world, i], drives[i].damping / K[i], period_s
-            )
+            lag_s = drives[i].damping / K[i]
+            before = deflection[world, i]
+            settled[world, i] = follow_lag(before, target[world, i], lag_s, period_s)
     return settled
 
 
 @compiled
 def servo_error(
-    theta_dot: Array, theta_ddot: Array, torque: Array, windup: Array, drives: Any, period_s: float
+    rate: Array, rate_dot: Array, torque: Array, windup: Array, drives: Any, dt: float
 ) -> tuple[Array, Array]:
     """Errors that servos need to move rotors under loads [rad], and their integrals [rad·s].
 
     The integrals are those after a control period.
 
     Args:
-        theta_dot: Rates of the motor sides, (worlds, n) [rad/s].
-        theta_ddot: Their accelerations [rad/s²].
+        rate: Of the motor sides, θ̇, (worlds, n) [rad/s].
+        rate_dot: Their acceleration, θ̈ [rad/s²].
         torque: Joint torques [N·m].
         windup: Integrals of the errors before [rad·s].
         drives: Rows of `DRIVE`, one per joint, (n,).
-        period_s: Control period [s].
+        dt: Control period [s].
     """
     errors = np.empty(torque.shape)
     integrals = np.zeros(torque.shape)
     for world in range(len(torque)):
         for i in range(len(drives)):
             drive = drives[i]
-            effort = drive.rotor_inertia * theta_ddot[world, i] + torque[world, i]
-            effort += drive.braking * theta_dot[world, i]
-            if drive.integral_gain > 0.0:  # k_p e + k_i ∫e = effort
-                time_s = drive.position_gain / drive.integral_gain
-                integrals[world, i] = follow_lag(
-                    windup[world, i], effort / drive.integral_gain, time_s, period_s
-                )
-            effort -= drive.integral_gain * integrals[world, i]
+            effort = drive.rotor_inertia * rate_dot[world, i] + torque[world, i]
+            effort += drive.braking * rate[world, i]
+            k_i = drive.integral_gain
+            if k_i > 0.0:  # k_p e + k_i ∫e = effort
+                lag_s = drive.position_gain / k_i
+                before = windup[world, i]
+                integrals[world, i] = follow_lag(before, effort / k_i, lag_s, dt)
+            effort -= k_i * integrals[world, i]
             errors[world, i] = effort / drive.position_gain
     return errors, integrals
 
 
 @compiled
-def follow_lag(state: float, target: float, time_constant_s: float, period_s: float) -> float:
+def follow_lag(state: float, target: float, lag_s: float, period_s: float) -> float:
     """State of a first-order lag after one period towards a constant target.
 
     There is no lag for a time constant of zero.
     """
-    return target + math.exp(-period_s / time_constant_s) * (state - target)
+    return target + math.exp(-period_s / lag_s) * (state - target)
 
 
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
     """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
     if isinstance(gravity, LegTorque):
         return gravity.solve(q, stiffness, torque)
-    return solve_stiffness(np.broadcast_to(stiffness, q.shape), gravity.gravity_gradient(q), torque)
+    K = np.broadcast_to(stiffness, q.shape)
+    return elasticity.solve_stiffness(K, gravity.gravity_gradient(q), torque)
 
 
 _T = TypeVar("_T")
@@ -476,6 +484,7 @@ class Compensated(PolicyAround):
     ) -> None:
         model = compensator.model
         super().__init__(policy, model)
+        self.inputs = (DEFLECTION, *self.policy.inputs)
         self.compensator = compensator
         self._theta = model.observation_table.group("encoder_angle")
         self._corrects_policy = corrects_policy
@@ -484,22 +493,15 @@ class Compensated(PolicyAround):
         if isinstance(model, WalkerModel):
             self._plan = WalkView(model.observation_table), model.biped.foot_spacing
 
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return (DEFLECTION, *self.policy.inputs)
-
     @override
     def begin(self, rows: Array) -> CompensatedMemory:
         motion = self.view.motion(rows)
-        memory = self.compensator.at(rows).begin(motion)
+        own = self.compensator.at(rows).begin(motion)
         steps = np.zeros((len(rows), 1), dtype=np.int64)
-        return CompensatedMemory(steps, motion.q.copy(), memory, self.policy.begin(rows))
+        return CompensatedMemory(steps, motion.q.copy(), own, self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs
-    ) -> tuple[Array, CompensatedMemory]:
+    def act(self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs) -> Step:
         """It takes the input `deflection`, r: what is compensated, and seen, is (1 + r) δ.
 
         The contact forces that load the joints act where the inputs shift the ZMP.
@@ -530,8 +532,9 @@ class Compensated(PolicyAround):
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, own)
         steps = memory.steps + 1
-        total = (wanted + self._ramp.take(steps, mode="clip") * offset).astype(np.float32)
-        return total, CompensatedMemory(steps, links.copy(), own, inner)
+        total = wanted + self._ramp.take(steps, mode="clip") * offset
+        memory = CompensatedMemory(steps, links.copy(), own, inner)
+        return total.astype(np.float32), memory
 
     @override
     def link_angles(self, rows: Array, memory: CompensatedMemory) -> Array:

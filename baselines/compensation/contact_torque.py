@@ -22,7 +22,7 @@ from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.rigid.leg_chains import LegChains
-from elastic_env.rigid.tree.kernels import loads_type
+from elastic_env.rigid.tree.kernels import Vector, loads_type
 from elastic_env.world.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
@@ -73,7 +73,8 @@ class LegTorque(NamedTuple):
         if not is_small:
             torque = self.gravity_torque(q) if torque is None else torque
             # says so if it is singular
-            solve_stiffness(np.broadcast_to(stiffness, q.shape), self.gravity_gradient(q), torque)
+            K = np.broadcast_to(stiffness, q.shape)
+            solve_stiffness(K, self.gravity_gradient(q), torque)
         return x
 
 
@@ -93,12 +94,8 @@ class ContactGravity:
         biped = model.biped
         self._view = WalkView(model.observation_table)
         self._chains = biped.weightless_chains if method == "lumped" else biped.chains
-        self._contact: Any = np.zeros(1, CONTACT)
-        self._contact["gravity"] = biped.gravity
-        self._contact["mass"] = biped.chains.mass
-        self._contact["footholds"] = biped.footholds
-        self._contact["ankle_height"] = biped.ankle_height
-        self._contact["is_at_zmp"] = method == "com"
+        robot = (biped.gravity, biped.chains.mass, biped.footholds, biped.ankle_height)
+        self._contact: Any = np.array([(*robot, method == "com")], CONTACT)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
@@ -158,9 +155,9 @@ class PlannedTorque:
 
         `gravity` is the static one, if known.
         """
-        plan = self._model.plan
-        row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
-        torque = plan.torque.take(row, axis=0, mode="clip")
+        periods = rows[:, self._time][:, 0] / self._model.control_period_s
+        row = np.rint(periods).astype(np.int64)
+        torque = self._model.plan.torque.take(row, axis=0, mode="clip")
         gravity = gravity or self._gravity.at(rows)
         return BoundPlannedTorque(torque, rows[:, self._reference], gravity)
 
@@ -198,12 +195,14 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
             weight = share if foot == 1 else 1.0 - share
             # what the ground carries is a negative mass where it does
             load.mass[foot] = -ground.mass * weight
-            for i in range(2):
-                middle = (1.0 - share) * ground.footholds[0, i] + share * ground.footholds[1, i]
-                load.point[foot, i] = plan.zmp_reference[i] - middle if ground.is_at_zmp else 0.0
-            load.point[foot, 2] = -ground.ankle_height if ground.is_at_zmp else 0.0
-            for i in range(3):
-                load.wrench[foot, 0, i] = load.wrench[foot, 1, i] = 0.0
+            load.point[foot] = 0.0
+            load.wrench[foot] = 0.0
+            if ground.is_at_zmp:
+                for i in range(2):
+                    left = (1.0 - share) * ground.footholds[0, i]
+                    middle = left + share * ground.footholds[1, i]
+                    load.point[foot, i] = plan.zmp_reference[i] - middle
+                load.point[foot, 2] = -ground.ankle_height
         tilted[world] = load
         fill_gravity(plan, ground.gravity, False, tilted[world])
 
@@ -224,8 +223,8 @@ def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) ->
         fill_gravity(shown, gravity, is_level, load)
         for foot in range(2):
             load.mass[foot] = 0.0
+            load.point[foot] = 0.0
             for i in range(3):
-                load.point[foot, i] = 0.0
                 load.wrench[foot, 0, i] = shown.wrench[foot, 0, i]
                 load.wrench[foot, 1, i] = shown.wrench[foot, 1, i]
 
@@ -235,20 +234,18 @@ def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
     """Gravity in the frame of a pelvis that is level or tilted."""
     turned = (0.0, 0.0, -gravity)
     if not is_level:
-        turned = gravity_in_pelvis(shown.imu_attitude[0], shown.imu_attitude[1], gravity)
+        roll = shown.imu_attitude[0]
+        turned = gravity_in_pelvis(roll, shown.imu_attitude[1], gravity)
     for i in range(3):
         load.gravity[i] = turned[i]
 
 
 @compiled
-def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> tuple[float, float, float]:
+def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> Vector:
     """Gravity in the frame of a tilted pelvis [m/s²]."""
     cosine = math.cos(pitch)
-    return (
-        gravity * math.sin(pitch),
-        -gravity * (cosine * math.sin(roll)),
-        -gravity * (cosine * math.cos(roll)),
-    )
+    y = -gravity * (cosine * math.sin(roll))
+    return gravity * math.sin(pitch), y, -gravity * (cosine * math.cos(roll))
 
 
 @compiled
@@ -269,22 +266,21 @@ def shift_plan(observed: Any, shift: Array, spacing: float) -> None:
 
 @compiled
 def shifted_shares(
-    observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array
+    observed: Any, shift: Array, planned: Array, dt: float, spacing: float, found: Array
 ) -> None:
     """Load shares of the right foot after the last control period, under a shifted ZMP.
 
     Args:
         observed: Observations, rows with fields, (n,).
-        planned: Shares of the plan, one per control step.
-        period_s: Control period [s].
         shift: Of the ZMP, x forward and y left, (n, 2) [m].
+        planned: Shares of the plan, one per control step.
+        dt: Control period [s].
         spacing: Distance of the feet [m].
         found: To be filled, (n,).
     """
     for world in range(len(found)):
-        row = int(
-            min(max(np.rint(observed[world].clock[0] / period_s) - 1.0, 0.0), len(planned) - 1.0)
-        )
+        periods = np.rint(observed[world].clock[0] / dt)
+        row = int(min(max(periods - 1.0, 0.0), len(planned) - 1.0))
         found[world] = shifted_share(planned[row], shift[world, 1], spacing)
 
 

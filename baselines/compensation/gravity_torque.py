@@ -96,10 +96,8 @@ class HingeTorque:
     def __init__(self, model: RobotModel) -> None:
         names = model.joint_names
         if len(names) != 1:
-            raise ConfigurationError(
-                f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)};"
-                " choose tree"
-            )
+            found = f"got {len(names)}: {', '.join(names)}; choose tree"
+            raise ConfigurationError(f"gravity method 'hinge' needs one joint, {found}")
         body = RigidBody(model.rigid, names)
         zero = np.zeros(1)
         self._a = body.gravity_torque(zero)

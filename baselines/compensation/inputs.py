@@ -44,40 +44,18 @@ class InputKind:
 
 _PLANE: Mapping[str, Mirrored] = {"x": "same", "y": "opposite"}
 _TILT: Mapping[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
+_LENGTH: Mapping[str, Mirrored] = {"difference": "opposite"}
+_GAIN: Mapping[str, Mirrored] = {"all": "same"}
 
-INPUTS: Mapping[str, InputKind] = {
-    COMMAND: InputKind("rad", "offset of the command", default=0.02, limit=1e3),
-    DEFLECTION: InputKind(
-        "1", "relative change of the deflection that is compensated", default=0.6, limit=1e3
-    ),
-    "zmp": InputKind("m", "shift of the planned ZMP", default=0.02, limit=0.05, axes=_PLANE),
-    "com": InputKind(
-        "m", "shift of the planned center of mass", default=0.02, limit=0.05, axes=_PLANE
-    ),
-    "leg_length": InputKind(
-        "m",
-        "left less right leg length",
-        default=0.005,
-        limit=0.05,
-        axes={"difference": "opposite"},
-    ),
-    "hip": InputKind(
-        "rad", "offset of both hip rolls, of both hip pitches", default=0.02, limit=0.2, axes=_TILT
-    ),
-    "posture_gain": InputKind(
-        "1",
-        "relative change of the posture feedback's gains",
-        default=0.5,
-        limit=1.0,
-        axes={"all": "same"},
-    ),
-    "balance_gain": InputKind(
-        "1",
-        "relative change of the gains of foot forces and center of mass",
-        default=0.5,
-        limit=1.0,
-        axes={"all": "same"},
-    ),
+INPUTS: Mapping[str, InputKind] = {  # unit, meaning, default, limit, axes
+    COMMAND: InputKind("rad", "offset of the command", 0.02, 1e3),
+    DEFLECTION: InputKind("1", "change of the compensated deflection", 0.6, 1e3),
+    "zmp": InputKind("m", "shift of the planned ZMP", 0.02, 0.05, _PLANE),
+    "com": InputKind("m", "shift of the planned center of mass", 0.02, 0.05, _PLANE),
+    "leg_length": InputKind("m", "left less right leg length", 0.005, 0.05, _LENGTH),
+    "hip": InputKind("rad", "offset of both hip rolls or pitches", 0.02, 0.2, _TILT),
+    "posture_gain": InputKind("1", "change of the posture's gains", 0.5, 1.0, _GAIN),
+    "balance_gain": InputKind("1", "change of the balance's gains", 0.5, 1.0, _GAIN),
 }
 """All inputs by name.
 
@@ -93,7 +71,8 @@ def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
         columns = dict.fromkeys(model.joint_names, "same")
     if name == COMMAND:
         commands = model.observation_table.signals_of("last_command")
-        columns = dict(zip(columns, [signal.mirrored for signal in commands], strict=True))
+        pairs = zip(columns, commands, strict=True)
+        columns = {column: signal.mirrored for column, signal in pairs}
     return tuple(
         Signal(f"{name}.{column}", kind.unit, kind.meaning, mirrored=mirrored)
         for column, mirrored in columns.items()

@@ -11,7 +11,7 @@ The command leads by the model's deflection instead, which `baselines.adaptation
 what is measured.
 """  # noqa: E501
 
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from typing_extensions import override
@@ -43,10 +43,9 @@ def require_sensor(table: SignalTable, sensor: str, group: str | None = None) ->
         ConfigurationError: It does not have it.
     """
     if (group or sensor) not in {name.split(".")[0] for name in table.names}:
-        raise ConfigurationError(
-            f"this policy reads {sensor}, which the environment does not have; make it with"
-            f" sensors=[{sensor!r}]"
-        )
+        cure = f"make it with sensors=[{sensor!r}]"
+        lacks = "which the environment does not have"
+        raise ConfigurationError(f"this policy reads {sensor}, {lacks}; {cure}")
 
 
 class DeflectionSensors:
@@ -66,7 +65,7 @@ class DeflectionSensors:
         ConfigurationError: The observation does not have the sensor.
     """
 
-    def __init__(self, model: RobotModel, sensor: str, joints: tuple[str, ...] = ("",)) -> None:
+    def __init__(self, model: RobotModel, sensor: str, joints: Any = ("",)) -> None:
         table = model.observation_table
         require_sensor(table, sensor)
         self._stiffness = model.stiffness

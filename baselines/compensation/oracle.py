@@ -1,37 +1,100 @@
 """The upper bound: a policy that reads the truth."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.compensators import DriveMemory, DynamicCompensator
-from baselines.compensation.policy import Motion, Policy, PolicyAround, PolicyInputs
+from baselines.compensation.compensators import (
+    Compensated,
+    DriveMemory,
+    DynamicCompensator,
+)
+from baselines.compensation.policy import Motion, Policy, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
 
+_LIMIT_RAD = 0.05
+"""Largest correction of the integrator [rad]."""
 
-class OracleMemory(NamedTuple):
-    """Memory of the oracle.
+
+class TrueMemory(NamedTuple):
+    """Memory of the compensator that knows the truth.
 
     Attributes:
         steps: Control steps since the start of the episode, (num_worlds, 1).
         correction: Of the integrator, (num_worlds, n) [rad].
-        target: Reference of the last control step, (num_worlds, n) [rad].
-        compensator: Memory of the compensator.
-        inner: Memory of the policy.
+        target: Where the links were to be in the last control step, (num_worlds, n) [rad].
+        drives: Memory of the drives.
     """
 
     steps: IntArray
     correction: Array
     target: Array
-    compensator: DriveMemory
-    inner: Any
+    drives: DriveMemory
 
 
-class Oracle(PolicyAround):
+class TrueCompensator(DynamicCompensator):
+    """The dynamic compensator with the true parameters and the true links of an environment.
+
+    Args:
+        env: The environment itself.
+        ramp_s: Time after which the integrator begins [s].
+        friction: Whether the compensator knows the friction.
+        gain: Gain on the true link error [1/s].
+    """
+
+    def __init__(self, env: Any, ramp_s: float, friction: bool, gain: float) -> None:
+        self._env = env.unwrapped
+        super().__init__(self._env.truth().model, friction=friction)
+        self._gain = gain * self._dt
+        self._ramp = Ramp(self.model, ramp_s)
+        self._truth: Any = None
+
+    @override
+    def at(self, rows: Array) -> Self:
+        """The observations must be the environment's present ones."""
+        if not np.array_equal(rows, np.atleast_2d(self._env.task.observe())):
+            raise ElasticError(
+                "the oracle reads the truth of the environment that it was made for, and this is"
+                ' not its present observation; make one with baselines.make("oracle", env) for the'
+                " environment that it is to run in"
+            )
+        truth = self._env.truth()
+        bound = super().at(rows).with_stiffness(truth.stiffness)
+        bound._truth = truth
+        return bound
+
+    @override
+    def begin(self, motion: Motion) -> Any:
+        steps = np.zeros((len(motion.q), 1), dtype=np.int64)
+        zero = np.zeros_like(motion.q)
+        return TrueMemory(steps, zero, motion.q.copy(), super().begin(motion))
+
+    @override
+    def offset(self, motion: Motion, memory: Any) -> Step:
+        offset, drives = super().offset(motion, memory.drives)
+        if self._gain == 0.0:
+            return offset, memory._replace(drives=drives)
+        is_on = self._ramp.is_over(memory.steps)
+        error = np.where(is_on, memory.target - self._truth.q, 0.0)
+        correction = memory.correction + self._gain * error
+        correction = np.minimum(np.maximum(correction, -_LIMIT_RAD), _LIMIT_RAD)
+        memory = TrueMemory(memory.steps + 1, correction, motion.q, drives)
+        return offset + correction, memory
+
+    @override
+    def link_angle(self, theta: Array, memory: Any) -> Array:
+        return self._truth.q
+
+    @override
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        return self._truth.q_dot
+
+
+class Oracle(Compensated):
     """Perfect sensing and a perfect model: the only policy that may read the truth.
 
     The dynamic compensator with the true parameters around a policy that sees the true link angles;
@@ -47,9 +110,6 @@ class Oracle(PolicyAround):
             reference on purpose.
     """
 
-    integral_limit = 0.05
-    """Largest correction of the integrator [rad]."""
-
     def __init__(
         self,
         env: Any,
@@ -58,64 +118,6 @@ class Oracle(PolicyAround):
         friction: bool = True,
         integral_gain: float = 1.0,
     ) -> None:
-        self._env = env.unwrapped
-        model = self._env.truth().model
-        super().__init__(policy, model)
-        self.integral_gain = integral_gain
-        self._compensator = DynamicCompensator(model, friction=friction)
-        self._dt = model.control_period_s
-        self._ramp = Ramp(model, ramp_s)
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return ()
-
-    @override
-    def begin(self, rows: Array) -> OracleMemory:
-        self._require_present(rows)
-        motion = self.view.motion(rows)
-        stiffness = self._env.truth().stiffness
-        return OracleMemory(
-            steps=np.zeros((len(rows), 1), dtype=np.int64),
-            correction=np.zeros_like(motion.q),
-            target=motion.q.copy(),
-            compensator=self._compensator.at(rows).with_stiffness(stiffness).begin(motion),
-            inner=self.policy.begin(rows),
-        )
-
-    @override
-    def act(
-        self, rows: Array, memory: OracleMemory, inputs: PolicyInputs
-    ) -> tuple[Array, OracleMemory]:
-        """The observation must be the environment's present one."""
-        self._require_present(rows)
-        truth = self._env.truth()
-        motion = self.view.motion(rows)
-        wanted, inner = self.policy.act(
-            self.view.with_links(rows, truth.q, truth.q_dot), memory.inner, inputs
-        )
-        error = np.where(self._ramp.is_over(memory.steps), memory.target - truth.q, 0.0)
-        correction = memory.correction + self.integral_gain * self._dt * error
-        correction = np.clip(correction, -self.integral_limit, self.integral_limit)
-        compensator = self._compensator.at(rows).with_stiffness(truth.stiffness)
-        desired = Motion(motion.q + wanted, motion.q_dot, motion.q_ddot)
-        offset, own = compensator.offset(desired, memory.compensator)
-        steps = memory.steps + 1
-        action = wanted + self._ramp.table.take(steps, mode="clip") * offset + correction
-        return action.astype(np.float32), OracleMemory(
-            steps, correction, motion.q.copy(), own, inner
-        )
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        """The true link angles, (num_worlds, n) [rad]."""
-        return self._env.truth().q
-
-    def _require_present(self, rows: Array) -> None:
-        if not np.array_equal(rows, np.atleast_2d(self._env.task.observe())):
-            raise ElasticError(
-                "the oracle reads the truth of the environment that it was made for, and this is"
-                ' not its present observation; make one with baselines.make("oracle", env) for the'
-                " environment that it is to run in"
-            )
+        compensator = TrueCompensator(env, ramp_s, friction, integral_gain)
+        super().__init__(policy, compensator, ramp_s)
+        self.inputs = ()

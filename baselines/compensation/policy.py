@@ -24,6 +24,8 @@ from elastic_env.world.robot_model import RobotModel
 Action = npt.NDArray[np.float32]
 Records: TypeAlias = npt.NDArray[Any]
 """An array of a structured type, one row per world."""
+Step: TypeAlias = tuple[Array, Any]
+"""Offsets of the joints, (num_worlds, n) [rad], and the memory after a control step."""
 
 
 class Policy(Protocol):
@@ -87,11 +89,8 @@ class BatchPolicy(ABC):
     def __init__(self, model: RobotModel) -> None:
         self.model = model
         self.view = ObservationView(model)
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
+        self.inputs: tuple[str, ...] = ()
         """Names of its inputs beside `command`, and of those of the policies inside it."""
-        return ()
 
     def predict(
         self,
@@ -142,7 +141,7 @@ class BatchPolicy(ABC):
         """
 
     @abstractmethod
-    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> tuple[Array, Any]:
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """Offsets of the joints, (num_worlds, n) in single precision [rad], and the new memory.
 
         Args:
@@ -167,11 +166,7 @@ class PolicyAround(BatchPolicy):
     def __init__(self, policy: Any, model: RobotModel) -> None:
         super().__init__(model)
         self.policy = as_batch_policy(policy, model)
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return self.policy.inputs
+        self.inputs = self.policy.inputs
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:
@@ -191,17 +186,18 @@ class Zero(BatchPolicy):
         episode_start: Any = None,
         deterministic: bool = True,
         inputs: PolicyInputs = NO_INPUTS,
-    ) -> tuple[Action, Any]:
+    ) -> tuple[Any, None]:
         """Zero offset, (..., n) [rad], whatever the observation holds."""
-        return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
+        shape = (*observation.shape[:-1], self.view.num_joints)
+        return np.zeros(shape, dtype=np.float32), None
 
     @override
     def begin(self, rows: Array) -> None:
         return None
 
     @override
-    def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
-        return np.zeros((len(rows), self.view.num_joints), dtype=np.float32), None
+    def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> Step:
+        return self.predict(rows)
 
 
 class UserMemory(NamedTuple):
@@ -230,17 +226,13 @@ class UserPolicy(BatchPolicy):
         return UserMemory(np.zeros(len(rows), dtype=np.bool_), [None])
 
     @override
-    def act(
-        self, rows: Array, memory: UserMemory, inputs: PolicyInputs
-    ) -> tuple[Array, UserMemory]:
-        action, state = self._policy.predict(
-            rows[0] if inputs.is_single else rows,
-            memory.state[0],
-            ~memory.has_begun,
-            inputs.deterministic,
-        )
+    def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> Step:
+        shown = rows[0] if inputs.is_single else rows
+        own = memory.state[0]
+        start = ~memory.has_begun
+        action, own = self._policy.predict(shown, own, start, inputs.deterministic)
         offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
-        return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
+        return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [own])
 
     @override
     def link_angles(self, rows: Array, memory: UserMemory) -> Array:
@@ -274,12 +266,12 @@ def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> A
         if memory is not None:
             policy.view.require_start(rows, episode_start)
         return memory
-    number = count_rows(state)
-    if number != len(rows):
-        raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {number}")
+    n = len(rows)
+    if (number := count_rows(state)) != n:
+        raise ElasticError(f"`state` must have one row per world, {n}, got {number}")
     if episode_start is None or np.count_nonzero(episode_start) == 0:
         return state
-    fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
+    fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (n,))
     return put_rows(state, fresh, select_rows(policy.begin(rows), fresh))
 
 
@@ -372,10 +364,9 @@ class ObservationView:
         rows = np.asarray(observation, dtype=np.float64)
         rows = rows[None] if rows.ndim < 2 else rows
         if rows.ndim != 2 or rows.shape[1] != self._width:
-            raise ElasticError(
-                f"an observation must have the {self._width} columns of its table, one row per"
-                f" world, got shape {np.shape(observation)}"
-            )
+            needed = f"the {self._width} columns of its table, one row per world"
+            found = np.shape(observation)
+            raise ElasticError(f"an observation must have {needed}, got shape {found}")
         return rows
 
     def require_start(self, rows: Array, episode_start: Any) -> None:
@@ -388,11 +379,9 @@ class ObservationView:
         Raises:
             ElasticError: An episode goes on.
         """
-        starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
-        if not np.all(starts):
-            sign = "a reference at rest, and no command yet"
-            if self._clock is not None:
-                sign = "clock.time"
+        if not np.all(self.is_start(rows) if episode_start is None else episode_start):
+            at_rest = "a reference at rest, and no command yet"
+            sign = at_rest if self._clock is None else "clock.time"
             raise ElasticError(
                 "predict() was called without `state` in what looks like the middle of an episode"
                 f" (a beginning is known by {sign}): this policy has memory; pass the state that"
@@ -410,8 +399,9 @@ class ObservationView:
         if self._clock is not None:
             return rows[:, self._clock][:, 0] < 1.5 * self._period_s
         command = rows[:, self._command]
-        nothing = (command == rows[:, self._q]).all(axis=1) | (command == 0.0).all(axis=1)
-        return (rows[:, self._q_dot] == 0.0).all(axis=1) & nothing
+        stays = (command == rows[:, self._q]).all(axis=1)
+        is_at_rest = (rows[:, self._q_dot] == 0.0).all(axis=1)
+        return is_at_rest & (stays | (command == 0.0).all(axis=1))
 
 
 _GROUPS: Mapping[str, tuple[int, ...]] = {

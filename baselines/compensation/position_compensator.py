@@ -65,6 +65,9 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 "wrist_*": 300}.
 """
 
+Rates = npt.ArrayLike | None
+"""Rates or accelerations of a motion; None at rest."""
+_Settings = Mapping[str, JointSettings]
 _Motion = tuple[Array, Array | None, Array | None]
 """Angles, rates and accelerations of the links, (n,) each; None for none."""
 _LAST_STEP_RAD = 1e-8
@@ -145,7 +148,8 @@ class PositionCompensator:
         require_robot(model)
         is_free = joints is None
         if joints is None:
-            joints = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
+            named = stiffness if isinstance(stiffness, Mapping) else ()
+            joints = commanded_hinges(model, named)
         settings = _read_stiffness(model, stiffness, joints, is_held_left_out=is_free)
         self.joints = tuple(settings)
         self._links = RigidBody(model, self.joints, _held(model, self.joints))
@@ -165,7 +169,7 @@ class PositionCompensator:
         self._viscous = np.array([one.viscous_friction or 0.0 for one in settings.values()])
         self._lag_s = np.array([one.servo.braking for one in settings.values()]) / gains
         self._said: set[str] = set()
-        self._tip = int(model.jnt_bodyid[max(at, key=lambda j: int(model.jnt_bodyid[j]))])
+        self._tip = int(model.jnt_bodyid[at].max())
         self.reset()
         needed = self._of_command * self._most_passed(self._heaviest())
         if (needed > self._limit).any():
@@ -208,7 +212,7 @@ class PositionCompensator:
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(
-        self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None
+        self, mass_kg: float, at: npt.ArrayLike = (0, 0, 0), body: str | None = None
     ) -> None:
         """Let the robot carry another point mass.
 
@@ -229,15 +233,19 @@ class PositionCompensator:
         place = np.array(payload.at)
         carrier = self._tip
         if body is not None:
-            bodies = {self._model.body(i).name: i for i in range(self._model.nbody)}
-            sites = {self._model.site(i).name: i for i in range(self._model.nsite)}
-            require_known("body or site", [body], bodies | sites)
-            carrier = bodies[body] if body in bodies else int(self._model.site_bodyid[sites[body]])
-            if body not in bodies:
-                site = self._model.site(body)
+            model = self._model
+            bodies = {model.body(i).name: i for i in range(model.nbody)}
+            sites = [model.site(i).name for i in range(model.nsite)]
+            require_known("body or site", [body], [*bodies, *sites])
+            if body in bodies:
+                carrier = bodies[body]
+            else:
+                site = model.site(body)
+                carrier = int(site.bodyid[0])
                 mujoco.mju_rotVecQuat(place, np.array(payload.at), site.quat)
                 place += site.pos
-        before = None if self._asked is None else self._torque(*self._asked)
+        asked = self._asked
+        before = None if asked is None else self._torque(*asked)
         if (carrier, *place) != (self._carrier, *self._place):
             self._load = 0.0
             self._carrier = carrier
@@ -247,24 +255,14 @@ class PositionCompensator:
         if self._ramp == 0.0:
             self._load = payload.mass_kg
         self._links.set_load(self._carrier, self._load, self._place)
-        if before is not None and self._asked is not None:
-            self._warn_of_jump(self._of_command * (self._torque(*self._asked) - before))
+        if asked is not None and before is not None:
+            self._warn_of_jump(self._of_command * (self._torque(*asked) - before))
 
-    def torque(
-        self,
-        q: npt.ArrayLike,
-        q_dot: npt.ArrayLike | None = None,
-        q_ddot: npt.ArrayLike | None = None,
-    ) -> Array:
+    def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
         return self._torque(*self._motion(q, q_dot, q_ddot))
 
-    def command(
-        self,
-        q_desired: npt.ArrayLike,
-        q_dot: npt.ArrayLike | None = None,
-        q_ddot: npt.ArrayLike | None = None,
-    ) -> Array:
+    def command(self, q_desired: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Servo command that brings the links to where they should be.
 
         Args:
@@ -284,14 +282,15 @@ class PositionCompensator:
         if self._count < self._steps and self._ramp > 0.0:
             self._count += 1
             offset *= minimum_jerk(np.array(self._count / self._steps))
+        wanted = offset + motion[0]
         within = np.minimum(np.maximum(offset, -self._limit), self._limit) + motion[0]
         command = np.minimum(np.maximum(within, self._lowest), self._highest)
-        self.clipped = command != offset + motion[0]
+        self.clipped = command != wanted
         self._asked = motion
         if self.clipped.any():
             if np.abs(offset).max() > self._limit:
                 self._warn_of_offset(np.abs(offset), "now")
-            self._warn_of_range(offset + motion[0])
+            self._warn_of_range(wanted)
         return command
 
     def link_angle(self, theta: npt.ArrayLike) -> Array:
@@ -375,14 +374,9 @@ class PositionCompensator:
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
         """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
-        found = follow_load(
-            theta,
-            self._compliance,
-            self._passed_at_rest,
-            self._passed_gradient,
-            tolerance=_LAST_RESIDUAL_RAD,
-            within=(self._lowest, self._highest),
-        )
+        ends = (self._lowest, self._highest)
+        springs = (self._compliance, self._passed_at_rest, self._passed_gradient)
+        found = follow_load(theta, *springs, tolerance=_LAST_RESIDUAL_RAD, within=ends)
         if found.lost.any():
             raise ElasticError(
                 f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
@@ -444,9 +438,7 @@ class PositionCompensator:
         calm_s = max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5)
         cure = f"ramp_s={calm_s:.3g} takes it over in that time"
         if self._ramp > 0.0:
-            cure = (
-                "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
-            )
+            cure = "set the payload to 0 where it was, and let ramp_s pass before"
         self._warn_once(
             "jump",
             f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g}"
@@ -460,28 +452,26 @@ class PositionCompensator:
             _warn(text)
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> _Motion:
-        return (
-            self._checked("q_desired", q, "rad"),
-            None if q_dot is None else self._checked("q_dot", q_dot, "rad/s"),
-            None if q_ddot is None else self._checked("q_ddot", q_ddot, "rad/s²"),
-        )
+        q = self._checked("q_desired", q, "rad")
+        if q_dot is not None:
+            q_dot = self._checked("q_dot", q_dot, "rad/s")
+        if q_ddot is not None:
+            q_ddot = self._checked("q_ddot", q_ddot, "rad/s²")
+        return q, q_dot, q_ddot
 
     def _checked(self, name: str, given: Any, unit: str) -> Array:
         """An argument of a public method, as (n,)."""
         n = len(self.joints)
         values = _array(given)
         if values.shape != (n,):
-            size = f", an array of shape {values.shape}" if isinstance(given, np.ndarray) else ""
-            raise ActionError(
-                f"{name} must be {n} numbers [{unit}], of {', '.join(self.joints)}; got"
-                f" {quote(given)}{size}"
-            )
+            is_array = isinstance(given, np.ndarray)
+            size = f", an array of shape {values.shape}" if is_array else ""
+            needed = f"{n} numbers [{unit}], of {', '.join(self.joints)}"
+            raise ActionError(f"{name} must be {needed}; got {quote(given)}{size}")
         if not np.isfinite(values).all():
             bad = np.array(self.joints)[~np.isfinite(values)]
-            raise ActionError(
-                f"{name} must be finite [{unit}], got {quote(values.tolist())}; see"
-                f" {', '.join(bad)}"
-            )
+            found = f"{quote(values.tolist())}; see {', '.join(bad)}"
+            raise ActionError(f"{name} must be finite [{unit}], got {found}")
         return values
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
@@ -515,21 +505,15 @@ def _warn(message: str) -> None:
 def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
     """Positions of the joints that are not commanded, by their number [rad], [m]."""
     home = home_of(model)
-    return {
-        j: float(home[model.jnt_qposadr[j]])
-        for j in range(model.njnt)
-        if model.joint(j).name not in joints
-    }
+    others = [j for j in range(model.njnt) if model.joint(j).name not in joints]
+    return {j: float(home[model.jnt_qposadr[j]]) for j in others}
 
 
-def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
+def _of_file(model: mujoco.MjModel, file: Path, commanded: Any) -> dict[str, Any]:
     """Content of a file of joints, in which the hinges that it leaves out are rigid."""
     mapping = read_mapping(file)
-    names = [
-        model.joint(j).name
-        for j in range(model.njnt)
-        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
-    ]
+    hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    names = [model.joint(int(j)).name for j in hinges]
     left_out = [name for name in names if name and key_of(mapping, name) is None]
     said = [name for name in left_out if commanded is None or name in commanded]
     if not said or len(left_out) == len(names):
@@ -618,7 +602,7 @@ def _read_stiffness(
     return found
 
 
-def _servo_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], given: Any) -> Array:
+def _servo_gains(model: mujoco.MjModel, settings: _Settings, given: Any) -> Array:
     """k_p of servos that give way, infinite for those that hold their angle, (n,) [N·m/rad].
 
     Args:
@@ -632,7 +616,8 @@ def _servo_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], g
     unsaid: dict[str, float] = {}
     for joint, own in settings.items():
         servo = own.servo
-        found = None if servo.position_gain is not None else position_servo(model, joint)
+        is_known = servo.position_gain is not None
+        found = None if is_known else position_servo(model, joint)
         of_model = ServoSettings() if found is None else found.settings
         if _is_said(servo):
             gains.append(servo.over(of_model).sagging_gain(joint))
@@ -671,7 +656,7 @@ def _is_said(servo: ServoSettings) -> bool:
     return servo.position_gain is not None or servo.integral_gain is not None
 
 
-def _given_gains(model: mujoco.MjModel, settings: Mapping[str, JointSettings], given: Any) -> Array:
+def _given_gains(model: mujoco.MjModel, settings: _Settings, given: Any) -> Array:
     """The argument `position_gain`, (n,) [N·m/rad]."""
     by_joint = _by_joint("position_gain", given, list(settings))
     names = _joint_names(model)
@@ -710,10 +695,8 @@ def _by_joint(name: str, given: Any, joints: Sequence[str]) -> Mapping[str, Any]
     if not isinstance(given, list | tuple | np.ndarray):
         return dict.fromkeys(joints, given)
     if len(given) != len(joints):
-        raise ConfigurationError(
-            f"{name} must be {len(joints)} numbers [N·m/rad], of {', '.join(joints)}, got"
-            f" {len(given)}"
-        )
+        needed = f"{len(joints)} numbers [N·m/rad], of {', '.join(joints)}"
+        raise ConfigurationError(f"{name} must be {needed}, got {len(given)}")
     return dict(zip(joints, given, strict=True))
 
 

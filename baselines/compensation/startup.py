@@ -35,10 +35,9 @@ class Ramp:
         self._period_s = model.control_period_s
         self._delay = 0.0
         if isinstance(model, WalkerModel):
-            half_period = (
-                np.pi
-                / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
-            )
+            held = _held_stiffness(model)
+            sway = sway_frequencies(model.biped, model.plan.pelvis[0], held)
+            half_period = np.pi / sway[0]
             if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
                 self._delay = float(half_period)
         steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)
@@ -48,7 +47,8 @@ class Ramp:
         """Share after a number of control steps, elementwise."""
         time = steps * self._period_s
         each = self._duration - self._delay
-        return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
+        second = minimum_jerk((time - self._delay) / each)
+        return 0.5 * (minimum_jerk(time / each) + second)
 
     def is_over(self, steps: Array | IntArray) -> BoolArray:
         """True where the compensation is complete."""

@@ -95,16 +95,8 @@ class BendingObserver:
         seen, expected = self.disagreement(rows, bending)
         memory = memory.copy()
         found = np.empty((len(rows), len(self.signals)))
-        regress(
-            observed=self._view.fields(rows),
-            seen=seen,
-            expected=expected,
-            carried_n=self._carried,
-            loaded_n=LOADED_SHARE * self._carried,
-            deviation_rad=DISAGREEMENT_RAD,
-            memory=memory,
-            found=found,
-        )
+        observed = self._view.fields(rows)
+        regress(observed, seen, expected, self._carried, memory, found)
         return found, memory
 
     def bending(self, rows: Array) -> Array:
@@ -116,7 +108,7 @@ class BendingObserver:
         """Tilt of the pelvis over each flat foot by the bending, s, (num_worlds, 2, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]
 
-    def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
+    def disagreement(self, rows: Array, bending: Array) -> Array:
         """Tilt of a flat foot's sole by motors and IMU, e, and the bending that is expected, s.
 
         Args:
@@ -124,7 +116,7 @@ class BendingObserver:
             bending: Of the joints, (num_worlds, 12) [rad].
 
         Returns:
-            (num_worlds, 2 legs, 2) each, roll and pitch [rad].
+            Both, (2, num_worlds, 2 legs, 2), roll and pitch [rad].
         """
         chains = self._model.biped.chains
         return chains.sole_tilts(rows[:, self._theta], rows[:, self._attitude], bending)
@@ -132,14 +124,7 @@ class BendingObserver:
 
 @compiled
 def regress(
-    observed: Any,
-    seen: Array,
-    expected: Array,
-    carried_n: float,
-    loaded_n: float,
-    deviation_rad: float,
-    memory: Any,
-    found: Array,
+    observed: Any, seen: Array, expected: Array, carried_n: float, memory: Any, found: Array
 ) -> None:
     """A step of recursive least squares for seen − expected = ρ · expected + c of loaded feet.
 
@@ -148,8 +133,6 @@ def regress(
         seen: Tilts of the soles, (n, 2, 2) [rad].
         expected: Tilts that are expected, (n, 2, 2) [rad].
         carried_n: Force that the feet carry [N].
-        loaded_n: Force of a loaded foot [N].
-        deviation_rad: Standard deviation of a measurement [rad].
         memory: Rows of `ESTIMATE`, to be updated, (n,).
         found: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured over
             assumed load less one.
@@ -162,20 +145,20 @@ def regress(
             for axis in range(2):
                 x = memory[world].unknowns[leg, axis]
                 P = memory[world].covariance[leg, axis]
-                if force >= loaded_n:
+                if force >= LOADED_SHARE * carried_n:
                     at = (world, leg, axis)
-                    update(x, P, expected[at], seen[at], deviation_rad)
+                    update(x, P, expected[at], seen[at], DISAGREEMENT_RAD)
                 found[world, 2 * leg + axis] = x[0]
                 found[world, 4 + 2 * leg + axis] = math.sqrt(P[0])
         found[world, 8] = load / carried_n - 1.0
 
 
 @compiled
-def update(x: Array, P: Array, expected: float, seen: float, deviation_rad: float) -> None:
+def update(x: Array, P: Array, expected: float, seen: float, sigma: float) -> None:
     """Take in a measurement of (expected, 1) · x = seen − expected with a standard deviation."""
     first = P[0] * expected + P[1]
     second = P[1] * expected + P[2]
-    variance = (expected * first + second) + deviation_rad**2
+    variance = (expected * first + second) + sigma**2
     error = (seen - expected) - (expected * x[0] + x[1])
     gain = first / variance
     second_gain = second / variance

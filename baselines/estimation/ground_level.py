@@ -25,7 +25,7 @@ On two feet that is too much about x, where a leaning weight goes from one foot 
 than to the ankles.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class GroundLevel:
         mean_s: Time constant of the mean, after as much time [s].
     """
 
-    def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
+    def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6) -> None:
         table = model.observation_table
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
@@ -84,9 +84,8 @@ class GroundLevel:
 
     def begin(self, num_worlds: int) -> GroundMemory:
         """Memory before the first measurement."""
-        return GroundMemory(
-            np.zeros(num_worlds), np.zeros((num_worlds, 2)), np.full((num_worlds, 2), np.nan)
-        )
+        mean = np.zeros((num_worlds, 2))
+        return GroundMemory(np.zeros(num_worlds), mean, np.full_like(mean, np.nan))
 
     def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         """Values after a measurement, see `signals`, and the new memory.
@@ -105,7 +104,7 @@ class GroundLevel:
         own = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
         return np.hstack([own, wrenches]), memory
 
-    def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
+    def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, Any]:
         """Tilt of the ground [rad], level foot wrenches, (num_worlds, 12), and new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
@@ -126,9 +125,10 @@ class GroundLevel:
         change = self._gravity * TILT_RAD * self._period_s * number
         return change**2 / (change**2 + VELOCITY_M_PER_S**2)
 
-    def _mean(self, force: Array, velocity: Array, memory: GroundMemory) -> tuple[Array, Array]:
+    def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
         """The mean after a measurement, about x and y [rad], and of how many it is."""
-        is_known = (force[:, 2] >= self._least_n) & np.isfinite(memory.velocity).all(axis=1)
+        has_velocity = np.isfinite(memory.velocity).all(axis=1)
+        is_known = (force[:, 2] >= self._least_n) & has_velocity
         accelerated = (velocity - memory.velocity) / (self._period_s * self._gravity)
         direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
         seen = direction - np.where(is_known[:, None], accelerated, 0.0)

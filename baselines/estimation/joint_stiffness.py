@@ -16,14 +16,8 @@ lemma solves in closed form.
 [Gelman2013] A. Gelman et al., "Bayesian Data Analysis", 3rd edition.
 """
 
-from typing import NamedTuple
-
-import numpy as np
-
-from baselines.compensation.dry_friction import presliding_friction
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.robot_model import RobotModel
+from elastic_env.core.signals import Array
 
 
 class StiffnessPrior(Model):
@@ -61,70 +55,5 @@ def regress(sums: Array, prior: StiffnessPrior) -> Array:
     rank_one = common / (own * (own + n * common))
     alone = right / diagonal
     shared = rank_one / diagonal
-    return alone + shared * (alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1)))[..., None]
-
-
-class RegressionMemory(NamedTuple):
-    """Memory of the regression.
-
-    Attributes:
-        friction: That holds the links back, (num_worlds, n) [N·m].
-        q: Link angles of the last measurement, (num_worlds, n) [rad].
-        sums: As of `regress`, (num_worlds, 5, n).
-    """
-
-    friction: Array
-    q: Array
-    sums: Array
-
-
-class StiffnessRegression:
-    """The regression of the module, measurement by measurement.
-
-    Args:
-        model: Assumed robot.
-        prior: What is known before.
-
-    Raises:
-        ConfigurationError: Friction changes with load or speed.
-    """
-
-    def __init__(self, model: RobotModel, prior: StiffnessPrior) -> None:
-        self._prior = prior
-        model.require_constant_friction("the estimate of the stiffness")
-        self._coulomb = model.coulomb_friction
-
-    def begin(self, num_worlds: int) -> RegressionMemory:
-        """Memory before the first measurement."""
-        zero = np.zeros((num_worlds, len(self._coulomb)))
-        return RegressionMemory(zero, zero, np.stack([zero] * 5, axis=1))
-
-    def friction(self, q: Array, memory: RegressionMemory) -> Array:
-        """Coulomb friction of links that have moved to q, (num_worlds, n) [rad] to [N·m]."""
-        moved = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
-        return presliding_friction(memory.friction, moved, self._coulomb)
-
-    def add(
-        self,
-        h: Array,
-        deflection: Array,
-        friction: Array,
-        q: Array,
-        memory: RegressionMemory,
-        measured: BoolArray,
-    ) -> tuple[Array, RegressionMemory]:
-        """Relative errors r after a measurement, (num_worlds, n) [1], and the new memory.
-
-        Args:
-            h: Expected deflection, (num_worlds, n) [rad].
-            deflection: Measured deflection [rad].
-            friction: As of `friction` [N·m].
-            q: Link angles [rad].
-            memory: That of the last measurement.
-            measured: Which joints have a sensor, (n,).
-        """
-        y = deflection - h
-        own = np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
-        sums = memory.sums + measured * own
-        error = regress(sums.swapaxes(0, 1), self._prior)
-        return error, RegressionMemory(friction, q, sums)
+    common = alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1))
+    return alone + shared * common[..., None]

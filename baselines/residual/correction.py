@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, input_signals, inputs_of
+from baselines.compensation import inputs as named_inputs
+from baselines.compensation.inputs import COMMAND, INPUTS, InputKind
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
     Action,
-    Policy,
-    PolicyInputs,
+    Step,
     as_action,
     as_batch_policy,
     resume_memory,
@@ -48,8 +48,8 @@ class Corrected:
             caution without a walker.
     """
 
-    def __init__(self, base: Policy, model: RobotModel, settings: ResidualSettings) -> None:
-        has = inputs_of(base)
+    def __init__(self, base: Any, model: RobotModel, settings: ResidualSettings) -> None:
+        has = named_inputs.inputs_of(base)
         if lacking := [name for name in settings.acts_on if name not in has]:
             raise ConfigurationError(
                 f"the residual acts on {', '.join(lacking)}, which {type(base).__name__} does not"
@@ -92,9 +92,7 @@ class Corrected:
         action, memory = self.correct(rows, residual, memory, inputs)
         return as_action(action, inputs.is_single), memory
 
-    def correct(
-        self, rows: Array, residual: Array, memory: CorrectedMemory, inputs: PolicyInputs
-    ) -> tuple[Array, CorrectedMemory]:
+    def correct(self, rows: Array, residual: Array, memory: Any, inputs: Any) -> Step:
         """`act` for rows: offsets of the joints, (num_worlds, n) [rad], and the new memory.
 
         Args:
@@ -146,7 +144,8 @@ class Channels:
         for name in settings.acts_on:
             first = len(bounds)
             of_input = _bounds(name, settings, model.joint_names).tolist()
-            for column, bound in zip(input_signals(name, model), of_input, strict=True):
+            columns = named_inputs.input_signals(name, model)
+            for column, bound in zip(columns, of_input, strict=True):
                 shared = settings.shared and INPUTS[name].axes is None
                 source = _without_side(column.name) if shared else column.name
                 if bound > 0.0:
@@ -155,11 +154,10 @@ class Channels:
             bounds += of_input
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
-        order = list(signals)
-        self._source = np.array([order.index(source) if source else 0 for source in sources])
-        self.signals = tuple(
-            replace(signal, name=name, low=-1.0, high=1.0) for name, signal in signals.items()
-        )
+        order = {name: number for number, name in enumerate(signals)}
+        self._source = np.array([order.get(source or "", 0) for source in sources])
+        named = [replace(signal, name=name) for name, signal in signals.items()]
+        self.signals = tuple(replace(signal, low=-1.0, high=1.0) for signal in named)
 
     def approach(self, values: Array, residual: Array, share: float) -> Array:
         """Values of all columns after a share of their way to a residual, (num_worlds, width).
@@ -182,15 +180,16 @@ def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Ar
     bound = settings.bounds[name]
     names = kind.columns(joint_names)
     chosen = np.ones(len(names), dtype=np.bool_)
-    if kind.axes is None and settings.joints is not None:
-        chosen = np.any([fit_columns(wanted, names, kind) for wanted in settings.joints], axis=0)
+    joints = settings.joints if kind.axes is None else None
+    if joints is not None:
+        chosen = np.any([fit_columns(wanted, names, kind) for wanted in joints], axis=0)
     if not isinstance(bound, dict):
         return np.where(chosen, bound, 0.0)
     bounds = np.zeros(len(names))
     for wanted, value in bound.items():
         bounds[fit_columns(wanted, names, kind)] = value
     missing = np.array(names)[chosen & (bounds == 0.0)].tolist()
-    if missing and kind.axes is None and settings.joints is not None:
+    if missing and joints is not None:
         raise ConfigurationError(
             f"{name} must have a bound for every joint of `joints`, none fits {missing}"
         )
@@ -205,7 +204,8 @@ def fit_columns(wanted: str, names: list[str], kind: InputKind) -> BoolArray:
     """
     fits = np.array([name == wanted or name.endswith(f"_{wanted}") for name in names])
     if not fits.any():
-        raise unknown_name("joint" if kind.axes is None else "axis of an input", wanted, names)
+        what = "joint" if kind.axes is None else "axis of an input"
+        raise unknown_name(what, wanted, names)
     return fits
 
 

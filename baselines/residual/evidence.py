@@ -14,12 +14,11 @@ the robot yet, too. Pitch does not count, where friction hides more of the bendi
 error would show.
 """  # noqa: E501
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from baselines.adaptation.estimators import mean_load
-from baselines.compensation.policy import Records
+from baselines.adaptation.estimators import LegEstimator
 from baselines.estimation.bending import BendingObserver
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import WalkerModel
@@ -33,17 +32,8 @@ and with less.
 """
 
 _SEEN = SignalTable(BendingObserver.signals)
-_ERROR, _UNCERTAINTY = (
-    _SEEN.columns(f"{group}.l_roll", f"{group}.r_roll") for group in ("model_error", "uncertainty")
-)
-_LOAD = _SEEN.names.index("excess_load")
-
-
-class EvidenceMemory(NamedTuple):
-    """Number and sum of the measured excess loads, (num_worlds, 2), and the observer's memory."""
-
-    loads: Array
-    bending: Records
+_ERROR = _SEEN.columns("model_error.l_roll", "model_error.r_roll")
+_UNCERTAINTY = _SEEN.columns("uncertainty.l_roll", "uncertainty.r_roll")
 
 
 class Evidence:
@@ -55,19 +45,15 @@ class Evidence:
     """
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
-        self._bending = BendingObserver(model)
-        self._prior_loads = PRIOR_S / period_s
+        self._legs = LegEstimator(model, prior_loads=PRIOR_S / period_s)
+        self.begin = self._legs.begin
+        """Memory before the first measurement, by the number of worlds."""
 
-    def begin(self, num_worlds: int) -> EvidenceMemory:
-        """Memory before the first measurement."""
-        return EvidenceMemory(np.zeros((num_worlds, 2)), self._bending.begin(num_worlds))
-
-    def observe(self, rows: Array, memory: EvidenceMemory) -> tuple[Array, EvidenceMemory]:
+    def observe(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         """Evidence after a measurement, (num_worlds, m) to (num_worlds, 1), and the new memory."""
-        seen, bending = self._bending.observe(rows, memory.bending)
-        excess_load, loads = mean_load(memory.loads, seen[:, [_LOAD]], self._prior_loads)
-        g = evidence(seen[:, _ERROR], seen[:, _UNCERTAINTY], excess_load[:, 0])
-        return g[:, None], EvidenceMemory(loads, bending)
+        seen, load, memory = self._legs.observe(rows, memory)
+        g = evidence(seen[:, _ERROR], seen[:, _UNCERTAINTY], load[:, 0])
+        return g[:, None], memory
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:

@@ -64,24 +64,23 @@ class Features:
         seen = [signal for source in self._sources for signal in source.signals]
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
         self._history = settings.history
-        commands = model.observation_table.signals_of("last_command") if self._acts else ()
-        self.signals = (*seen, *rename_group(commands, BASE_ACTION))
+        commands = model.observation_table.signals_of("last_command")
+        acts = rename_group(commands, BASE_ACTION) if self._acts else ()
+        self.signals = (*seen, *acts)
         self.width = len(self.signals) + self._history * len(self._measured)
-        measured = [seen[i] for i in self._measured]
-        self._mirror = LeftFirst(self.signals, measured, corrected) if settings.mirror else None
+        self._mirror: LeftFirst | None = None
+        if settings.mirror:
+            measured = [seen[i] for i in self._measured]
+            self._mirror = LeftFirst(self.signals, measured, corrected)
 
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
         past = np.zeros((num_worlds, self._history * len(self._measured)))
-        return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
+        sources = [source.begin(num_worlds) for source in self._sources]
+        return FeaturesMemory(past, tuple(sources))
 
     def at(
-        self,
-        rows: Array,
-        memory: FeaturesMemory | None,
-        fresh: BoolArray,
-        state: Any,
-        episode_start: Any,
+        self, rows: Array, memory: Any, fresh: BoolArray, state: Any, episode_start: Any
     ) -> tuple[Array, FeaturesMemory]:
         """Features of a decision, and the memory for the next one.
 
@@ -102,9 +101,11 @@ class Features:
             kept = put_rows(memory, fresh, select_rows(kept, fresh))
         pairs = zip(self._sources, kept.sources, strict=True)
         observed = [source.observe(rows, own) for source, own in pairs]
-        seen = np.hstack([np.zeros((len(rows), 0)), *(values for values, _ in observed)])
+        values = [values for values, _ in observed]
+        seen = np.hstack([np.zeros((len(rows), 0)), *values])
         measured = seen[:, self._measured]
-        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), kept.past)
+        repeated = np.tile(measured, (1, self._history))
+        past = np.where(fresh[:, None], repeated, kept.past)
         parts = [seen]
         if self._acts:
             action = self._corrected.base_action(rows, state, episode_start)
@@ -124,12 +125,15 @@ class Features:
             rows: Observations of the decision.
             residual: What was decided by their features.
         """
-        return residual if self._mirror is None else self._mirror.turn_back(rows, residual)
+        if self._mirror is None:
+            return residual
+        return self._mirror.turn_back(rows, residual)
 
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
-    return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
+    names = model.observation_table.names
+    return list(dict.fromkeys(name.split(".")[0] for name in names))
 
 
 def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
@@ -162,14 +166,12 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
         signals = rename_group(table.signals_of("encoder_angle"), name)
         return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
     if isinstance(model, WalkerModel):
-        match name:
-            case "contact_error":
-                return _ContactError(model, period_s)
-            case "level":
-                return GroundLevel(model, period_s)
-            case "bending":
-                return BendingObserver(model)
-        further += ["contact_error", "level", "bending"]
+        if name == "bending":
+            return BendingObserver(model)
+        timed = {"contact_error": _ContactError, "level": GroundLevel}
+        if name in timed:
+            return timed[name](model, period_s)
+        further += [*timed, "bending"]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 
@@ -177,7 +179,7 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
 class _Instant:
     """A source that remembers nothing."""
 
-    def __init__(self, signals: tuple[Signal, ...], function: Callable[[Array], Array]) -> None:
+    def __init__(self, signals: Any, function: Callable[..., Array]) -> None:
         self.signals = signals
         self._function = function
 
@@ -203,14 +205,9 @@ class _ContactError:
     """
 
     signals = (
-        Signal("contact_error.x", "m", "ZMP less the planned one, forward", mirrored="same"),
+        Signal("contact_error.x", "m", "ZMP less the planned one", mirrored="same"),
         Signal("contact_error.y", "m", "likewise, to the left", mirrored="opposite"),
-        Signal(
-            "contact_error.share",
-            "1",
-            "share of the load on the right foot, likewise",
-            mirrored="opposite",
-        ),
+        Signal("contact_error.share", "1", "likewise, of load", mirrored="opposite"),
     )
     _LEAST_N = 50.0
 
@@ -218,7 +215,8 @@ class _ContactError:
         table = model.observation_table
         biped = model.biped
         self._level = GroundLevel(model, period_s)
-        self._planned = table.columns("zmp_reference.x", "zmp_reference.y", "load_share")
+        planned = ("zmp_reference.x", "zmp_reference.y", "load_share")
+        self._planned = table.columns(*planned)
         self._sensors = FootSensors.of_biped(biped)
         self._ankles = biped.ankles
 
@@ -228,9 +226,8 @@ class _ContactError:
     def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         _, wrenches, memory = self._level.upright(rows, memory)
         wrench = wrenches.reshape(-1, 2, 2, 3)
-        force, moment = self._sensors.ground_wrench(
-            wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
-        )
+        flat = np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
+        force, moment = self._sensors.ground_wrench(wrench, flat)
         zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N)
         vertical = force[:, :, 2].sum(axis=1)
         share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)

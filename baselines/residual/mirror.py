@@ -23,6 +23,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signal
 from elastic_env.world.robot_model import WalkerModel
 
+Signals = Sequence[Signal]
 _SIGN = {"same": 1.0, "opposite": -1.0, "complement": -1.0}
 _SIDE = re.compile(r"(?<=\.)[lr]_")
 
@@ -38,7 +39,7 @@ class Mirror:
             side alone.
     """
 
-    def __init__(self, signals: Sequence[Signal]) -> None:
+    def __init__(self, signals: Signals) -> None:
         columns = {signal.name: column for column, signal in enumerate(signals)}
         others = [_other_side(name) for name in columns]
         if lacking := [name for name in others if name not in columns]:
@@ -48,7 +49,8 @@ class Mirror:
             )
         self._source = np.array([columns[name] for name in others], dtype=np.int64)
         self._sign = np.array([_sign(signal) for signal in signals])
-        self._offset = np.array([float(signal.mirrored == "complement") for signal in signals])
+        complements = [signal.mirrored == "complement" for signal in signals]
+        self._offset = np.array(complements, dtype=np.float64)
 
     def __call__(self, values: Array) -> Array:
         """Values in the mirror, (..., columns)."""
@@ -68,24 +70,19 @@ class LeftFirst:
             the other leg's.
     """
 
-    def __init__(
-        self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected
-    ) -> None:
+    def __init__(self, signals: Signals, measured: Signals, corrected: Corrected) -> None:
         model = corrected.model
         settings = corrected.settings
         if not isinstance(model, WalkerModel):
-            raise ConfigurationError(
-                "mirror is for a walker, whose legs are mirror images, got a"
-                f" {type(model).__name__}; set mirror: false"
-            )
+            found = f"got a {type(model).__name__}; set mirror: false"
+            raise ConfigurationError(f"mirror is for a walker, with legs that are alike, {found}")
+        unlike: list[str] = []
         bounds = corrected.channels.parts(corrected.channels.bounds)
-        unlike = [
-            joint
-            for name, of_input in bounds.items()
-            if INPUTS[name].axes is None
-            for joint, *pair in zip(model.joint_names, *np.split(of_input, 2), strict=False)
-            if np.ptp(pair) > 0.0
-        ]
+        for name, of_input in bounds.items():
+            if INPUTS[name].axes is None:
+                left, right = np.split(of_input, 2)
+                differ = np.flatnonzero(left != right)
+                unlike += [model.joint_names[joint] for joint in differ]
         if unlike:
             raise ConfigurationError(
                 "mirror needs joints and bounds that are the same on both legs, they are not for"
@@ -110,11 +107,13 @@ class LeftFirst:
         """
         now, past = np.split(features, [self._split], axis=1)
         past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
-        return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
+        mirrored = np.hstack([self._now(now), past])
+        return np.where(rows[:, self._support] == 1.0, mirrored, features)
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
         """A residual as it acts, (num_worlds, k): a decision of the mirror is turned back."""
-        return np.where(rows[:, self._support] == 1.0, self._residual(residual), residual)
+        on_right = rows[:, self._support] == 1.0
+        return np.where(on_right, self._residual(residual), residual)
 
 
 def _other_side(name: str) -> str:

@@ -28,13 +28,10 @@ def require_network(tensors: Tensors) -> int:
         ConfigurationError: Tensors that are missing, have a wrong shape or type, or are not finite.
     """
     depth = sum(name.startswith("weight") for name in tensors)
-    layers = range(depth)
-    names = {"mean", "std", *(f"weight{i}" for i in layers), *(f"bias{i}" for i in layers)}
-    if not 1 <= depth <= _MOST_LAYERS or set(tensors) != names:
-        raise ConfigurationError(
-            f"weights must be mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers; "
-            f"got {quote(sorted(tensors))}"
-        )
+    names = {f"{kind}{i}" for kind in ("weight", "bias") for i in range(depth)}
+    if not 1 <= depth <= _MOST_LAYERS or set(tensors) != {"mean", "std", *names}:
+        needed = f"mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers"
+        raise ConfigurationError(f"weights must be {needed}; got {quote(sorted(tensors))}")
     for name, tensor in tensors.items():
         _require_numbers(name, tensor)
     vectors = ["mean", *(f"bias{i}" for i in range(depth))]
@@ -46,25 +43,24 @@ def require_network(tensors: Tensors) -> int:
     widths = [len(tensors[name]) for name in vectors]
     for i in range(depth):
         shape = (widths[i + 1], widths[i])
-        if tensors[f"weight{i}"].shape != shape:
-            raise ConfigurationError(
-                f"weight{i} must have the shape {shape}, got {tensors[f'weight{i}'].shape}"
-            )
-    if tensors["std"].shape != tensors["mean"].shape or not (tensors["std"] > 0.0).all():
-        raise ConfigurationError(
-            f"std must have one positive value per feature, {widths[0]} of them"
-        )
+        found = tensors[f"weight{i}"].shape
+        if found != shape:
+            shapes = f"the shape {shape}, got {found}"
+            raise ConfigurationError(f"weight{i} must have {shapes}")
+    std = tensors["std"]
+    if std.shape != (widths[0],) or not (std > 0.0).all():
+        raise ConfigurationError(f"std must be {widths[0]} positive values, as mean")
     return depth
 
 
 def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
     if tensor.dtype not in _TYPES:
-        raise ConfigurationError(
-            f"{name} must be of type {' or '.join(_TYPES)}, got {tensor.dtype}"
-        )
+        types = " or ".join(_TYPES)
+        raise ConfigurationError(f"{name} must be of type {types}, got {tensor.dtype}")
     largest = np.inf if name in ("mean", "std") else _LARGEST
     if not np.isfinite(tensor).all() or (np.abs(tensor) > largest).any():
-        raise ConfigurationError(f"{name} must be finite, weights and biases within ±{_LARGEST:g}")
+        bound = f"weights and biases within ±{_LARGEST:g}"
+        raise ConfigurationError(f"{name} must be finite, {bound}")
 
 
 class Network:
@@ -105,7 +101,8 @@ class Network:
 
     def __call__(self, features: Array) -> Array:
         """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
-        x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
+        normalised = (features - self._mean) / self._std
+        x = np.clip(normalised, -self._clip, self._clip).astype(np.float32)
         for number, (W, b) in enumerate(self._layers):
             x = affine(x, W, b)
             if number < len(self._layers) - 1:

@@ -5,6 +5,7 @@ A folder holds `residual.json` (base, settings, network, how it was trained) and
 normalised in here; the base policy sees it as it is.
 """
 
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 from safetensors.numpy import save
 from typing_extensions import override
 
-from baselines.compensation.policy import BatchPolicy, PolicyInputs, put_rows, select_rows
+from baselines.compensation import policy as policies
 from baselines.residual.correction import Corrected, CorrectedMemory
 from baselines.residual.evidence import Evidence
 from baselines.residual.features import Features, FeaturesMemory
@@ -48,7 +49,7 @@ class ResidualMemory(NamedTuple):
     inner: CorrectedMemory
 
 
-class ResidualPolicy(BatchPolicy):
+class ResidualPolicy(policies.BatchPolicy):
     """A base policy with a network that corrects it.
 
     Args:
@@ -78,22 +79,19 @@ class ResidualPolicy(BatchPolicy):
 
     @override
     def begin(self, rows: Array) -> ResidualMemory:
-        return ResidualMemory(
-            wait=np.full(len(rows), _UNDECIDED),
-            residual=np.zeros((len(rows), self.corrected.num_residuals)),
-            features=self._features.begin(len(rows)),
-            caution=self._caution.begin(len(rows)) if self._caution is not None else None,
-            inner=self.corrected.begin(rows),
-        )
+        n = len(rows)
+        caution = None if self._caution is None else self._caution.begin(n)
+        wait = np.full(n, _UNDECIDED)
+        residual = np.zeros((n, self.corrected.num_residuals))
+        own = (wait, residual, self._features.begin(n), caution)
+        return ResidualMemory(*own, self.corrected.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs
-    ) -> tuple[Array, ResidualMemory]:
+    def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:
         due = memory.wait <= 0
         if np.count_nonzero(due) > 0:
-            decided = self._decide(rows, memory, due)
-            memory = put_rows(memory, due, select_rows(decided, due))
+            decided = policies.select_rows(self._decide(rows, memory, due), due)
+            memory = policies.put_rows(memory, due, decided)
         residual = memory.residual
         action, inner = self.corrected.correct(rows, residual, memory.inner, inputs)
         return action, memory._replace(wait=memory.wait - 1, inner=inner)
@@ -102,43 +100,42 @@ class ResidualPolicy(BatchPolicy):
     def link_angles(self, rows: Array, memory: ResidualMemory) -> Array:
         return self.corrected.base.link_angles(rows, memory.inner.inner)
 
-    def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> ResidualMemory:
+    def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> Any:
         """Memory after a decision, of the worlds that are due."""
-        seen, features = self._features.at(
-            rows, memory.features, memory.wait == _UNDECIDED, memory.inner, None
-        )
+        inner = memory.inner
+        fresh = memory.wait == _UNDECIDED
+        seen, features = self._features.at(rows, memory.features, fresh, inner, None)
         known = None
         residual = memory.residual.copy()
         residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
-        if self._caution is not None and memory.caution is not None:
+        if self._caution is not None:
             trust, known = self._caution.observe(rows, memory.caution)
             residual[due] *= trust[due]
         wait = np.full_like(memory.wait, self._period)
-        return ResidualMemory(wait, residual, features, known, memory.inner)
+        return ResidualMemory(wait, residual, features, known, inner)
 
 
 _UNDECIDED = -1
 
 
-def save_residual(folder: Path, description: ResidualDescription, tensors: Tensors) -> None:
+def save_residual(folder: Path, residual: Any, tensors: Tensors) -> None:
     """Write a residual that `load_residual` reads; the network must be valid.
 
     Raises:
         ConfigurationError: Tensors that do not fit.
     """
-    Network(description, tensors)
+    Network(residual, tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+    weights = save({name: np.ascontiguousarray(own) for name, own in tensors.items()})
     write_whole(folder / WEIGHTS, weights)
-    description = description.replace(weights_sha256=sha256(weights).hexdigest())
-    write_whole(folder / DESCRIPTION, description.model_dump_json(indent=2) + "\n")
+    residual = residual.replace(weights_sha256=sha256(weights).hexdigest())
+    write_whole(folder / DESCRIPTION, residual.model_dump_json(indent=2) + "\n")
 
 
 def shipped_names() -> list[str]:
     """Names of the residuals that come with the package, such as testbed/seed_0."""
-    return sorted(
-        path.parent.relative_to(_SHIPPED).as_posix() for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}")
-    )
+    folders = [path.parent for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}")]
+    return sorted(folder.relative_to(_SHIPPED).as_posix() for folder in folders)
 
 
 def find_folder(folder: Path) -> Path:
@@ -157,13 +154,9 @@ def read_description(folder: Path) -> ResidualDescription:
         ConfigurationError: There is none, or it is not valid.
     """
     folder = find_folder(folder)
-    return load_json(
-        folder / DESCRIPTION,
-        ResidualDescription,
-        what="residual",
-        missing=lambda why: _none_at(folder, why),
-        within=folder,
-    )
+    file = folder / DESCRIPTION
+    missing = partial(_none_at, folder)
+    return load_json(file, ResidualDescription, "residual", missing, within=folder)
 
 
 def _none_at(folder: Path, why: str) -> str:
@@ -174,10 +167,9 @@ def _none_at(folder: Path, why: str) -> str:
         inside = []
     if inside:  # the last policy first: the best one flatters itself
         folders = sorted((path.parent.name != "last", path.parent) for path in inside)
-        return (
-            f"{folder} is no residual but has some inside; give one of them:"
-            f" {', '.join(str(path) for _, path in folders)}"
-        )
+        listed = ", ".join(str(path) for _, path in folders)
+        cure = f"give one of them: {listed}"
+        return f"{folder} is no residual but has some inside; {cure}"
     families: dict[str, list[str]] = {}
     for name in shipped_names():
         family, _, seed = name.partition("/")
@@ -201,7 +193,8 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     try:
         network = Network(description, tensors)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{shorten(folder / WEIGHTS)} holds no network: {error}") from None
+        file = shorten(folder / WEIGHTS)
+        raise ConfigurationError(f"{file} holds no network: {error}") from None
     found = sha256(content).hexdigest()
     if description.weights_sha256 not in (None, found):
         raise ConfigurationError(

@@ -15,6 +15,8 @@ Bound = float | dict[str, float]
 RESIDUAL = "residual:"
 """Before the folder of a trained residual, where policies are named."""
 
+_Titles = Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)]
+_Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _OLD_SPACES = {"model": DEFLECTION, "joint": COMMAND}
 
 
@@ -32,7 +34,7 @@ class ResidualSettings(Model):
     """Control steps between decisions [1]."""
     cutoff_hz: float = quantity("Hz", 2.0, gt=0, le=1e6)
     """Cut-off of the first-order low-pass of the correction [Hz]."""
-    joints: Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)] | None = None
+    joints: _Titles | None = None
     """Joints in which it acts, where an input has one column per joint, by the end of their names
     (ankle_roll means both); None for all."""
     shared: bool = False
@@ -46,9 +48,7 @@ class ResidualSettings(Model):
     """It is played only as far as there is `evidence` that the model is wrong
     (`baselines.residual.evidence`), and else leaves the base alone. In training, under the wrappers
     of `train`, it acts freely. For a walker."""
-    observe: tuple[Title, ...] = Field(
-        default=("observation",), min_length=1, max_length=MOST_ENTRIES
-    )
+    observe: _Titles = ("observation",)
     """Features that it sees: groups of the observation such as (clock, load_share), or all of it,
     and what `baselines.residual.features` makes of it and of the plan."""
     history: int = quantity("1", 0, ge=0, le=1000)
@@ -61,26 +61,22 @@ class ResidualSettings(Model):
         if not isinstance(values, Mapping) or not {"space", "scale"} & values.keys():
             return values
         if "acts_on" in values:
-            raise ValueError("acts_on says what space and scale said before; leave these two out")
+            raise ValueError("acts_on takes the place of space and scale; leave them out")
         space = values.get("space", "model")
         if not isinstance(space, str) or space not in _OLD_SPACES:
-            raise ValueError(
-                f"space must be one of {', '.join(_OLD_SPACES)}, got {quote(space)}; better give"
-                " acts_on"
-            )
-        others = {key: value for key, value in values.items() if key not in ("space", "scale")}
-        return {**others, "acts_on": {_OLD_SPACES[space]: values.get("scale")}}
+            known = ", ".join(_OLD_SPACES)
+            raise ValueError(f"space must be one of {known}, got {quote(space)}")
+        acts_on = {_OLD_SPACES[space]: values.get("scale")}
+        others = {key: values[key] for key in values if key not in ("space", "scale")}
+        return {**others, "acts_on": acts_on}
 
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:
         require_known("input", self.acts_on, INPUTS)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
-            given = (
-                bound.values()
-                if isinstance(bound, dict)
-                else [kind.default if bound is None else bound]
-            )
+            whole = kind.default if bound is None else bound
+            given = list(whole.values()) if isinstance(whole, dict) else [whole]
             if not given or not all(0.0 < one < kind.limit for one in given):
                 limit = f"{kind.limit:g} {kind.unit}".removesuffix(" 1")
                 raise ValueError(
@@ -91,10 +87,8 @@ class ResidualSettings(Model):
     @property
     def bounds(self) -> dict[str, Bound]:
         """`acts_on` with the defaults put in."""
-        return {
-            name: INPUTS[name].default if bound is None else bound
-            for name, bound in self.acts_on.items()
-        }
+        given = self.acts_on.items()
+        return {k: INPUTS[k].default if bound is None else bound for k, bound in given}
 
 
 class TrainedOn(Model):
@@ -102,7 +96,7 @@ class TrainedOn(Model):
 
     model_config = ConfigDict(extra="ignore")
 
-    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[], max_length=MOST_ENTRIES)
+    seeds: Annotated[list[_Seed], Field(max_length=MOST_ENTRIES)] = []
     scenarios: list[Title] | None = Field(default=None, max_length=MOST_ENTRIES)
     reference: str | float | list[float] | dict[str, Any] | None = None
 
@@ -113,7 +107,7 @@ class Origin(Model):
     model_config = ConfigDict(extra="ignore")
 
     config: TrainedOn = TrainedOn()
-    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    seed: _Seed | None = None
     commit: Title | None = None
 
 
@@ -164,9 +158,7 @@ def require_plain_base(name: str) -> str:
             which a folder from elsewhere must not run.
     """
     if name.startswith(RESIDUAL):
-        raise ValueError(
-            f"the base of a residual must be no residual itself, got {name!r}; name a baseline"
-        )
+        raise ValueError(f"a base must be no residual itself, got {name!r}; name a baseline")
     if ":" in name:
         raise ValueError(
             f"the base of a residual must be no residual and no code, got {quote(name)}; name a "

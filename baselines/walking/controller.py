@@ -37,6 +37,7 @@ from baselines.compensation.policy import (
     BatchPolicy,
     PolicyInputs,
     Records,
+    Step,
     WalkView,
 )
 from baselines.walking.zmp_shift import (
@@ -100,6 +101,7 @@ def _sole(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
+_GAINS = [name for name in WalkingGains.model_fields if not name.endswith("filter_s")]
 CONTROLLER = record_type(
     period_s=(),
     is_com_fed_back=bool,
@@ -113,15 +115,10 @@ CONTROLLER = record_type(
     per_pelvis=(2,),  # motion of the center of mass per motion of the pelvis [1]
     ankle_stiffness=(2, 2),  # pitch and roll of the legs [N·m/rad]
     friction_deflection=(2, 6),  # [rad]
-    friction_rate_rad_s=(),
-    force_difference=(),
-    force_difference_decay_s=(),
-    force_difference_limit_m=(),
-    dcm=(),
-    zmp_limit_m=(),
     velocity_share=(),  # of a step in a period [1]
     zmp_share=(),  # likewise
     weight_share=(),  # likewise
+    **dict.fromkeys(_GAINS, ()),
 )
 """Assumptions of the controller, and its gains."""
 
@@ -172,6 +169,7 @@ class WalkingController(BatchPolicy):
         ramp_s: float = STAND_S,
     ) -> None:
         super().__init__(model)
+        self.inputs = ("zmp", "com", "leg_length", "hip", "balance_gain")
         table = model.observation_table
         self._biped = model.biped
         self._walk_view = WalkView(table)
@@ -188,12 +186,6 @@ class WalkingController(BatchPolicy):
         self._period_s = model.control_period_s
         self._stances = Stances.of(model)
         self._sole = _sole(self._biped)
-        self._foot_spacing = self._biped.foot_spacing
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return ("zmp", "com", "leg_length", "hip", "balance_gain")
 
     @override
     def begin(self, rows: Array) -> Records:
@@ -202,12 +194,12 @@ class WalkingController(BatchPolicy):
         return memory
 
     @override
-    def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> tuple[Array, Records]:
+    def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> Step:
         """With a `deflection` r, handed on by a compensator, springs are wound by 1 + r as much."""
         observed = self._walk_view.fields(rows)
-        com, soles = self._biped.chains.com_and_feet(
-            rows[:, self._theta], self._sole, rows[:, self._attitude]
-        )
+        theta = rows[:, self._theta]
+        attitude = rows[:, self._attitude]
+        com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
         action = np.empty((len(rows), 12))
         now = np.empty(len(rows), MEMORY)
         coming = np.empty(len(rows), dtype=np.int64)
@@ -228,7 +220,7 @@ class WalkingController(BatchPolicy):
             action=action,
         )
         if is_moved:
-            move_pelvis(*self._stances, steps=coming, shift=pelvis, offset=action)
+            move_pelvis(*self._stances, coming, pelvis, action)
         return action.astype(np.float32), now
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
@@ -239,14 +231,9 @@ class WalkingController(BatchPolicy):
         if shift is None:
             return _NO_SHARES
         shares = np.empty(len(observed))
-        shifted_shares(
-            observed,
-            planned=self._planned_shares,
-            period_s=self._period_s,
-            shift=np.ascontiguousarray(shift),
-            spacing=self._foot_spacing,
-            found=shares,
-        )
+        shift = np.ascontiguousarray(shift)
+        constants = (self._planned_shares, self._period_s, self._biped.foot_spacing)
+        shifted_shares(observed, shift, *constants, shares)
         return shares
 
 
@@ -259,7 +246,7 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
     stiffness = model.stiffness.reshape(2, 6)
     period_s = model.control_period_s
     constants: Any = np.zeros(1, CONTROLLER)
-    for name in set(WalkingGains.model_fields) & set(CONTROLLER.names or ()):
+    for name in _GAINS:
         constants[name] = getattr(gains, name)
     constants["period_s"] = period_s
     constants["is_com_fed_back"] = com_feedback
@@ -267,17 +254,17 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
     constants["shank"] = biped.leg.shank
     constants["footholds"] = biped.footholds
     constants["weight"] = biped.weight
-    constants["weight_of_feet"] = biped.weight - biped.chains_above_feet.mass * biped.gravity
+    above_feet = biped.chains_above_feet.mass * biped.gravity
+    constants["weight_of_feet"] = biped.weight - above_feet
     constants["omega"] = model.plan.omega
     constants["following_share"] = following_share(model.plan.omega, period_s)
     constants["per_pelvis"] = center_of_mass_per_pelvis(model)
     constants["ankle_stiffness"] = stiffness[:, 4:]
     constants["friction_deflection"] = model.coulomb_friction.reshape(2, 6) / stiffness
-    constants["velocity_share"] = _share(period_s, gains.velocity_filter_s)
-    constants["zmp_share"] = _share(period_s, gains.zmp_filter_s)
-    constants["weight_share"] = (
-        0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s)
-    )
+    for name in ("velocity", "zmp", "weight"):
+        filter_s = getattr(gains, f"{name}_filter_s")
+        share = 0.0 if filter_s is None else 1.0 - float(np.exp(-period_s / filter_s))
+        constants[f"{name}_share"] = share
     return constants
 
 
@@ -291,11 +278,6 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
         if values is not None:
             dense[name] = values.reshape(dense[name].shape)
     return dense
-
-
-def _share(period_s: float, time_constant_s: float) -> float:
-    """Share of a step that a first-order filter makes in one period."""
-    return 1.0 - float(np.exp(-period_s / time_constant_s))
 
 
 @compiled
@@ -338,17 +320,15 @@ def control(
         own = now[world]
         last = before[world]
         given = inputs[world]
-        row = int(
-            min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0)
-        )
+        periods = np.rint(shown.clock[0] / constants.period_s)
+        row = int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))
         coming[world] = min(row + 1, len(plan) - 1)
         planned = plan[row]
         own.steps = last.steps + 1.0
         ramped = ramp[int(min(own.steps, len(ramp) - 1.0))]
+        following = constants.following_share
         for i in range(2):
-            own.following[i] = follow_zmp(
-                last.following[i], given.zmp[i], constants.following_share
-            )
+            own.following[i] = follow_zmp(last.following[i], given.zmp[i], following)
             own.planned[i] = ramped * (own.following[i] + given.com[i])
             pelvis[world, i] = own.planned[i] / constants.per_pelvis[i]
             is_shifted = is_shifted or own.planned[i] != 0.0
@@ -376,7 +356,8 @@ def follow_zmp(center: float, zmp: float, share: float) -> float:
 @compiled
 def weigh(controller: Any, shown: Any, last: Any, own: Any) -> None:
     """The weight as the feet show it, filtered; a share of zero keeps it."""
-    load = (vertical_force(shown, 0) + vertical_force(shown, 1)) + controller.weight_of_feet
+    of_soles = vertical_force(shown, 0) + vertical_force(shown, 1)
+    load = of_soles + controller.weight_of_feet
     own.weight = last.weight
     if controller.weight_share > 0.0:
         own.weight = last.weight + controller.weight_share * (load - last.weight)
@@ -416,18 +397,18 @@ def follow_com(
             before = com - last.planned[i]
             deviation = now + controller.footholds[support, i] - planned.com[i]
             deviating = (now - before) / controller.period_s - planned.com_dot[i]
-            own.velocity[i] = last.velocity[i] + controller.velocity_share * (
-                deviating - last.velocity[i]
-            )
+            further = deviating - last.velocity[i]
+            own.velocity[i] = last.velocity[i] + controller.velocity_share * further
             error = deviation + own.velocity[i] / controller.omega
             gain = (1.0 + change) * controller.dcm
             wanted = within(gain * error, controller.zmp_limit_m)
-            own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
+            missing = wanted - last.shift[i]
+            own.shift[i] = last.shift[i] + controller.zmp_share * missing
 
 
 @compiled
 def offset_leg(
-    controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array
+    controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, out: Array
 ) -> None:
     """Offsets of a leg's joints [rad].
 
@@ -436,7 +417,8 @@ def offset_leg(
     first = 6 * leg
     sign = 1.0 - 2.0 * leg
     difference = own.difference + given.leg_length
-    hip, knee, ankle = lengthening(controller, shown.reference_angle[first + 3], difference, sign)
+    bent = shown.reference_angle[first + 3]
+    hip, knee, ankle = lengthening(controller, bent, difference, sign)
     share = shown.load_share if leg == 1 else 1.0 - shown.load_share
     carried = share * controller.weight
     pitch = carried * own.shift[0] / controller.ankle_stiffness[leg, 0]
@@ -455,8 +437,8 @@ def offset_leg(
         elif i == 5:
             moved = wound * roll
         rate = shown.reference_rate[first + i] / controller.friction_rate_rad_s
-        against_friction = wound * (controller.friction_deflection[leg, i] * math.tanh(rate))
-        action[first + i] = ramp * moved + against_friction
+        friction = controller.friction_deflection[leg, i] * math.tanh(rate)
+        out[first + i] = ramp * moved + wound * friction
 
 
 @compiled

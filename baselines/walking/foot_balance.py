@@ -29,12 +29,12 @@ share, not halves. A foot out of reach comes as near as the leg allows. The join
 further feedback.
 """  # noqa: E501
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import BatchPolicy, PolicyInputs
+from baselines.compensation.policy import BatchPolicy, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
@@ -107,53 +107,48 @@ class FootBalance(BatchPolicy):
         self._wrench = table.group("wrench")
         self._clock = table.group("clock")
         acceleration, _ = derivatives(self._plan.com_dot, self._dt)
-        wanted = np.hstack([acceleration / self._biped.gravity, np.ones((len(acceleration), 1))])
-        self._wanted = (
-            self._biped.weight * shares(self._plan.share)[..., None] * wanted[:, None]
-        )  # (T, 2, 3)
+        upright = np.ones((len(acceleration), 1))
+        wanted = np.hstack([acceleration / self._biped.gravity, upright])
+        of_feet = self._biped.weight * shares(self._plan.share)
+        self._wanted = of_feet[..., None] * wanted[:, None]  # (T, 2, 3)
 
     @override
     def begin(self, rows: Array) -> BalanceMemory:
-        return BalanceMemory(
-            np.zeros((len(rows), 1), dtype=np.int64), self._imu(rows), rows[:, self._wrench].copy()
-        )
+        steps = np.zeros((len(rows), 1), dtype=np.int64)
+        return BalanceMemory(steps, self._imu(rows), rows[:, self._wrench].copy())
 
     @override
-    def act(
-        self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs
-    ) -> tuple[Array, BalanceMemory]:
+    def act(self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs) -> Step:
         steps = memory.steps + 1
-        imu = memory.imu + self._share(self._gains.imu_cutoff_hz) * (self._imu(rows) - memory.imu)
-        wrench_share = self._share(self._gains.wrench_cutoff_hz)
-        wrench = memory.wrench + wrench_share * (rows[:, self._wrench] - memory.wrench)
+        share = self._share(self._gains.imu_cutoff_hz)
+        imu = memory.imu + share * (self._imu(rows) - memory.imu)
+        share = self._share(self._gains.wrench_cutoff_hz)
+        wrench = memory.wrench + share * (rows[:, self._wrench] - memory.wrench)
         q_ref = self.view.motion(rows).q
-        shift, turn = self._adjustments(rows, imu, wrench)
-        action = self._ramp.take(steps, mode="clip") * (self._move_feet(q_ref, shift, turn) - q_ref)
+        q = self._move_feet(q_ref, *self._adjustments(rows, imu, wrench))
+        action = self._ramp.take(steps, mode="clip") * (q - q_ref)
         return action.astype(np.float32), BalanceMemory(steps, imu, wrench)
 
     def _imu(self, rows: Array) -> Array:
         return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
-    def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> tuple[Array, Array]:
+    def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> Any:
         """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y [rad]."""
         gains = self._gains
-        row = np.clip(
-            np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1,
-            0,
-            self._plan.num_steps,
-        )
+        periods = np.round(rows[:, self._clock][:, 0] / self._dt)
+        row = np.clip(periods.astype(np.int64) - 1, 0, self._plan.num_steps)
         force, moment = np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0)
         together = gains.attitude * imu[:, :2] + gains.gyro_s * imu[:, 2:]
-        gain = np.array([gains.force_horizontal, gains.force_horizontal, gains.force_vertical])
+        horizontal = gains.force_horizontal
+        gain = np.array([horizontal, horizontal, gains.force_vertical])
         shift = gain * (force - self._wanted[row])
         ankles = self._plan.ankles[row, :, :2]
         from_middle = ankles - ankles.mean(axis=1, keepdims=True)
-        shift[..., 2] += np.einsum("wi,wfi->wf", rotation_of_tilt(together)[:, 2, :2], from_middle)
+        lifts = rotation_of_tilt(together)[:, 2, :2]
+        shift[..., 2] += np.einsum("wi,wfi->wf", lifts, from_middle)
         turn = together[:, None] + gains.moment * moment[..., :2]
-        return (
-            np.clip(shift, -gains.shift_limit_m, gains.shift_limit_m),
-            np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad),
-        )
+        shift = np.clip(shift, -gains.shift_limit_m, gains.shift_limit_m)
+        return shift, np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad)
 
     def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
         """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)."""

@@ -25,7 +25,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
@@ -83,7 +83,7 @@ class HipTorque(PolicyAround):
         ConfigurationError: The observation does not have the sensors.
     """
 
-    def __init__(self, policy: Policy, model: WalkerModel, gains: HipTorqueGains) -> None:
+    def __init__(self, policy: Any, model: WalkerModel, gains: HipTorqueGains) -> None:
         super().__init__(policy, model)
         table = model.observation_table
         require_sensor(table, TORQUE_SENSOR)
@@ -99,9 +99,7 @@ class HipTorque(PolicyAround):
         return HipTorqueMemory(torque, np.zeros_like(torque), self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: HipTorqueMemory, inputs: PolicyInputs
-    ) -> tuple[Array, HipTorqueMemory]:
+    def act(self, rows: Array, memory: HipTorqueMemory, inputs: PolicyInputs) -> Step:
         gains = self._gains
         action, inner = self.policy.act(rows, memory.inner, inputs)
         measured = rows[:, self._torque][:, _HIP_ROLLS]

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, WalkView
+from baselines.compensation import policy as policies
+from baselines.compensation.policy import Records, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.world.robot_model import WalkerModel
 
 # of six joints of a leg
 _HIP_ROLL = 1
@@ -54,13 +54,10 @@ class PostureGains(Model):
     """Largest part of the integral, and of the whole [rad]."""
 
 
+_GAINS = ("proportional", "integral", "derivative", "leak_s", "limit_rad")
 POSTURE = record_type(
     period_s=(),
-    proportional=(),  # [1]
-    integral=(),  # [1/s]
-    derivative=(),  # [s]
-    leak_s=(),
-    limit_rad=(),
+    **dict.fromkeys(_GAINS, ()),
     integral_limit=(),  # [rad·s]
     filter_share=(),  # of a step in a period [1]
     swing_share=(),  # likewise
@@ -83,7 +80,7 @@ class PostureMemory(NamedTuple):
     inner: Any
 
 
-class PostureFeedback(PolicyAround):
+class PostureFeedback(policies.PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Args:
@@ -94,39 +91,29 @@ class PostureFeedback(PolicyAround):
     """
 
     def __init__(
-        self,
-        policy: Any,
-        model: WalkerModel,
-        gains: PostureGains,
-        ramp_s: float = STAND_S,
+        self, policy: Any, model: Any, gains: PostureGains, ramp_s: float = STAND_S
     ) -> None:
         super().__init__(policy, model)
-        self._walk_view = WalkView(model.observation_table)
+        self.inputs = (*self.policy.inputs, "posture_gain")
+        self._walk_view = policies.WalkView(model.observation_table)
         self._ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
         self._gains: Any = np.zeros(1, POSTURE)
-        for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):
+        for name in _GAINS:
             self._gains[name] = getattr(gains, name)
         self._gains["period_s"] = period_s
-        self._gains["integral_limit"] = (
-            gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
-        )
+        self._gains["integral_limit"] = np.inf
+        if gains.integral > 0.0:
+            self._gains["integral_limit"] = gains.limit_rad / gains.integral
         self._gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
         self._gains["swing_share"] = period_s / max(gains.swing_s, period_s)
-
-    @property
-    @override
-    def inputs(self) -> tuple[str, ...]:
-        return (*self.policy.inputs, "posture_gain")
 
     @override
     def begin(self, rows: Array) -> PostureMemory:
         return PostureMemory(np.zeros(len(rows), FEEDBACK), self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: PostureMemory, inputs: PolicyInputs
-    ) -> tuple[Array, PostureMemory]:
+    def act(self, rows: Array, memory: PostureMemory, inputs: Any) -> Step:
         """It takes the input `posture_gain`."""
         change = _NO_CHANGE
         if inputs.posture_gain is not None:
@@ -135,15 +122,9 @@ class PostureFeedback(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         total = action.astype(np.float64)
         feedback = np.empty(len(rows), FEEDBACK)
-        hold_posture(
-            gains=self._gains,
-            observed=self._walk_view.fields(rows),
-            ramp=self._ramp,
-            change=change,
-            before=memory.feedback,
-            now=feedback,
-            action=total,
-        )
+        observed = self._walk_view.fields(rows)
+        memories = (memory.feedback, feedback)
+        hold_posture(self._gains, observed, self._ramp, change, *memories, total)
         return total.astype(np.float32), PostureMemory(feedback, inner)
 
 
@@ -166,7 +147,7 @@ def hip_offsets(turn: Array) -> Array:
 
 @compiled
 def hold_posture(
-    gains: Any, observed: Any, ramp: Array, change: Array, before: Any, now: Any, action: Array
+    gains: Any, observed: Any, ramp: Array, change: Array, before: Any, now: Any, out: Array
 ) -> None:
     """Add the turn of the hips against the pelvis' tilt, and keep the memory after a control step.
 
@@ -178,10 +159,10 @@ def hold_posture(
             on as it is.
         before: Rows of `FEEDBACK`, (n,).
         now: The same after the control step, to be filled.
-        action: Offsets of the joints, (n, 12) [rad].
+        out: Offsets of the joints, (n, 12) [rad].
     """
     own = gains[0]
-    for world in range(len(action)):
+    for world in range(len(out)):
         shown = observed[world]
         last = before[world]
         kept = now[world]
@@ -189,34 +170,30 @@ def hold_posture(
         share = ramp[int(min(kept.steps, len(ramp) - 1.0))]
         further = change[world, 0] if len(change) > 0 else 0.0
         for i in range(2):
-            tilt = last.tilt[i] + own.filter_share * (shown.imu_attitude[i] - last.tilt[i])
-            integral = last.integral[i] + own.period_s * (tilt - last.integral[i] / own.leak_s)
+            missing = shown.imu_attitude[i] - last.tilt[i]
+            tilt = last.tilt[i] + own.filter_share * missing
+            gained = tilt - last.integral[i] / own.leak_s
+            integral = last.integral[i] + own.period_s * gained
             kept.tilt[i] = tilt
             kept.integral[i] = within(integral, own.integral_limit)
-            turn = (
-                own.proportional * tilt
-                + own.integral * kept.integral[i]
-                + own.derivative * shown.imu_rate[i]
-            )
+            turn = own.proportional * tilt + own.integral * kept.integral[i]
+            turn += own.derivative * shown.imu_rate[i]
             turn = share * within((1.0 + further) * turn, own.limit_rad)
             for leg in range(2):
                 if i == 0:
-                    action[world, 6 * leg + 1] += turn
+                    out[world, 6 * leg + 1] += turn
                 else:
-                    action[world, 6 * leg + 2] += pitch_of_leg(
-                        own, shown.load_share, leg, turn, last, kept
-                    )
+                    pitch = pitch_of_leg(own, shown.load_share, leg, turn, last, kept)
+                    out[world, 6 * leg + 2] += pitch
 
 
 @compiled
-def pitch_of_leg(
-    own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any
-) -> float:
+def pitch_of_leg(own: Any, right: Any, leg: int, turn: float, last: Any, kept: Any) -> Any:
     """Hip pitch of a leg [rad].
 
     A leg that carries half of the weight stands and turns, one in the air follows slowly.
     """
-    share = share_right if leg == 1 else 1.0 - share_right
+    share = right if leg == 1 else 1.0 - right
     standing = min(2.0 * share, 1.0)
     following = own.swing_share if standing < 1.0 else 1.0
     kept.kept[leg] = last.kept[leg] + following * (turn - last.kept[leg])

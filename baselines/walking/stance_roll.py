@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import RIGHT
@@ -53,8 +53,9 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
     angle = gains.angle_rad * minimum_jerk(1.0 - np.abs(2.0 * swing - 1.0))
     of_stance = np.where(support == RIGHT, -angle, angle)
     stands = np.stack([support != RIGHT, support == RIGHT], axis=-1)
+    shares = np.where(stands, 1.0, -gains.swing_share)
     offsets = np.zeros((len(swing), 2, 6))
-    offsets[..., _HIP_ROLL] = np.where(stands, 1.0, -gains.swing_share) * of_stance[:, None]
+    offsets[..., _HIP_ROLL] = shares * of_stance[:, None]
     return offsets.reshape(len(swing), 12)
 
 
@@ -69,7 +70,7 @@ class StanceRoll(PolicyAround):
         gains: Angle and share.
     """
 
-    def __init__(self, policy: Policy, model: WalkerModel, gains: StanceRollGains) -> None:
+    def __init__(self, policy: Any, model: WalkerModel, gains: StanceRollGains) -> None:
         super().__init__(policy, model)
         self._gains = gains
         self._clock = model.observation_table.group("clock")
@@ -79,10 +80,11 @@ class StanceRoll(PolicyAround):
         return self.policy.begin(rows)
 
     @override
-    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> tuple[Array, Any]:
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         _, swing, support = rows[:, self._clock].T
         action, memory = self.policy.act(rows, memory, inputs)
-        return (action + stance_roll(swing, support, self._gains)).astype(np.float32), memory
+        total = action + stance_roll(swing, support, self._gains)
+        return total.astype(np.float32), memory
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.world.ground_contact import FootSensors
@@ -68,13 +68,10 @@ class ZmpOffset(PolicyAround):
         return ZmpOffsetMemory(np.zeros((len(rows), 2)), self.policy.begin(rows))
 
     @override
-    def act(
-        self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs
-    ) -> tuple[Array, ZmpOffsetMemory]:
+    def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
-        measured = self._sensors.zmp_of_flat_feet(
-            rows[:, self._wrench], self._ankles, self._least_n
-        )
+        wrench = rows[:, self._wrench]
+        measured = self._sensors.zmp_of_flat_feet(wrench, self._ankles, self._least_n)
         error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
         shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift

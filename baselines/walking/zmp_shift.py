@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg
 
 from elastic_env.core.compiled import compiled, record_type
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry
 from elastic_env.world.robot_model import WalkerModel
 
@@ -107,7 +107,8 @@ class Stances(NamedTuple):
         """Those of the assumed walker and its plan."""
         plan = model.plan
         leg = model.biped.leg
-        legs = np.array([(leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)], LEGS)
+        row = (leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)
+        legs = np.array([row], LEGS)
         rows = np.zeros(len(plan.q), STANCE)
         rows["pelvis"] = plan.pelvis
         rows["ankles"] = plan.ankles
@@ -134,13 +135,12 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     stances = Stances.of(model)
     offsets = np.zeros((len(zmp), len(model.joint_names)))
     shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
-    steps = np.arange(len(zmp))
-    move_pelvis(*stances, steps=steps, shift=shift, offset=offsets)
+    move_pelvis(*stances, np.arange(len(zmp)), shift, offsets)
     return offsets
 
 
 @compiled
-def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: Array) -> None:
+def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> None:
     """Add the offsets that move the planned pelvis over feet that stay; no shift changes no bit.
 
     Where a foot would be out of reach, the leg is as long as it can be.
@@ -150,7 +150,7 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
         stances: Rows of `STANCE`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
         shift: Forward and to the left, (n, 2) [m].
-        offset: To be added to, (n, 12) [rad].
+        out: To be added to, (n, 12) [rad].
     """
     leg = legs[0]
     for row in range(len(shift)):
@@ -165,14 +165,9 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
             z = ankle[2] - stance.pelvis[2] - hip[2]
             pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
             roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
-            first = 6 * side
-            q = stance.q[side]
-            offset[row, first] -= q[0]
-            offset[row, first + 1] += roll - q[1]
-            offset[row, first + 2] += pitch - q[2]
-            offset[row, first + 3] += knee - q[3]
-            offset[row, first + 4] += -(pitch + knee) - q[4]
-            offset[row, first + 5] += -roll - q[5]
+            q = (0.0, roll, pitch, knee, -(pitch + knee), -roll)
+            for i in range(6):
+                out[row, 6 * side + i] += q[i] - stance.q[side, i]
 
 
 @compiled

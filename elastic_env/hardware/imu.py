@@ -15,7 +15,7 @@ import subprocess
 import time
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from elastic_env.hardware.buses.port_lock import lock_port
 from elastic_env.hardware.errors import HardwareError
@@ -30,7 +30,10 @@ _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
 _SIZE = _COUNTER.size + _SAMPLE.size
 _TRIES = 100
+_READER = "elastic_env.hardware.imu_reader"
 _END_S = 2.0
+_WAIT_S = 8.0
+"""Time to wait for the first sample, with the start of the reader on a busy computer [s]."""
 
 
 class AttitudeError(HardwareError):
@@ -132,8 +135,9 @@ class SharedSample:
         for _ in range(_TRIES):
             before = self._counter()
             values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
-            if before == self._counter() and before % 2 == 0:
-                self._last = Attitude(*values) if before else None
+            # packing a counter clears it first: a zero is none, once there was a sample
+            if before and before % 2 == 0 and before == self._counter():
+                self._last = Attitude(*values)
                 break
         return self._last
 
@@ -148,53 +152,28 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         port: Device, such as /dev/ttyACM0.
         baudrate: Bits per second.
         oldest_s: Age at which a sample counts as missing [s].
-        wait_s: How long to wait for the first one, with the start of the reader on a busy computer
-            [s].
 
     Raises:
         PortError: There is no such port, it may not be opened, or another program has it.
         AttitudeError: Nothing comes that is an attitude.
     """
 
-    def __init__(
-        self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0
-    ) -> None:
+    def __init__(self, port: str, baudrate: int = 115200, oldest_s: float = 0.05) -> None:
         self.port = port
         self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
         self._lock: int | None = lock_port(port)
         self._process: subprocess.Popen[str] | None = None
         try:
-            self._shared = self._start(port, baudrate)
-            deadline = time.monotonic() + wait_s
+            self._process, self._shared = _start(port, baudrate)
+            deadline = time.monotonic() + _WAIT_S
             while self._shared.get() is None:
-                if (
-                    self._process is None
-                    or self._process.poll() is not None
-                    or time.monotonic() > deadline
-                ):
+                if self._process.poll() is not None or time.monotonic() > deadline:
                     raise self._silence()
                 time.sleep(0.01)
         except BaseException:
             self.close()
             raise
-
-    def _start(self, port: str, baudrate: int) -> SharedSample:
-        """Start the reader."""
-        file = SharedSample.file()
-        try:
-            self._process = start_child(
-                "elastic_env.hardware.imu_reader",
-                str(file),
-                port,
-                str(baudrate),
-                pass_fds=[file],
-                stdin=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-            )
-            return SharedSample(file)
-        finally:
-            os.close(file)
 
     def latest(self) -> Attitude:
         """The newest sample.
@@ -246,3 +225,15 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             f"{1e3 * (time.monotonic() - last.time_s):.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
             "allowed (imu_oldest_s); look at its cable and its data rate"
         )
+
+
+def _start(port: str, baudrate: int) -> tuple["subprocess.Popen[str]", SharedSample]:
+    """Start the reader of a port; the process, and the memory that it writes."""
+    file = SharedSample.file()
+    try:
+        pipes: Any = dict.fromkeys(("stdin", "stderr"), subprocess.PIPE)
+        arguments = (str(file), port, str(baudrate))
+        reader = start_child(_READER, *arguments, pass_fds=[file], **pipes)
+        return reader, SharedSample(file)
+    finally:
+        os.close(file)

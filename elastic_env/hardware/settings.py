@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.hardware.buses.packets import HIGHEST_RATE, LARGEST_ID, LOWEST_RATE
+from elastic_env.hardware.buses.packets import LARGEST_ID, RANGE_OF_RATES
 from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
 
 _TURN = 2.0 * math.pi
@@ -44,10 +44,9 @@ class SafetyLimits(Model):
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
-            raise ValueError(
-                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got "
-                f"{self.lowest_rad} and {self.highest_rad}"
-            )
+            needed = f"below highest_rad, by at least {_LEAST_RANGE_RAD} rad"
+            given = f"{self.lowest_rad} and {self.highest_rad}"
+            raise ValueError(f"lowest_rad must be {needed}, got {given}")
         return self
 
 
@@ -61,7 +60,7 @@ class HardwareSettings(Model):
     """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
     servo_id: int = quantity("1", 1, ge=0, le=LARGEST_ID)
     """Id of the servo [1]."""
-    baudrate: int = quantity("bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    baudrate: int = quantity("bit/s", 3_000_000, **RANGE_OF_RATES)
     """Rate of the servo's bus [bit/s]."""
     direction: Literal[1, -1] = 1
     """Sign of the joint angle against the servo's."""
@@ -69,7 +68,7 @@ class HardwareSettings(Model):
     """Servo angle where the pendulum hangs [rad]."""
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
-    imu_baudrate: int = quantity("bit/s", 115_200, ge=LOWEST_RATE, le=HIGHEST_RATE)
+    imu_baudrate: int = quantity("bit/s", 115_200, **RANGE_OF_RATES)
     """Rate of the IMU's port [bit/s]."""
     imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1)
     """Age at which an attitude counts as missing [s]."""
@@ -92,19 +91,18 @@ class HardwareSettings(Model):
         named = (self.port, self.imu_port)
         ports = [os.path.realpath(port) for port in named if port is not None]
         if len(set(ports)) < len(ports):
-            raise ValueError(
-                f"servo and IMU each have a port of their own, got {self.port} for both"
-            )
+            raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
         return self
 
     @model_validator(mode="after")
     def _limits_are_a_turn(self) -> Self:
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:
+            lowest = self.limits.lowest_rad
+            highest = self.limits.highest_rad
             raise ValueError(
-                f"lowest_rad {self.limits.lowest_rad:g} and highest_rad "
-                f"{self.limits.highest_rad:g} with zero_rad {self.zero_rad:g} are {low:.2f} to "
-                f"{high:.2f} rad of the servo, which has ±{_TURN:.2f}"
+                f"lowest_rad {lowest:g} and highest_rad {highest:g} with zero_rad {self.zero_rad:g}"
+                f" are {low:.2f} to {high:.2f} rad of the servo, which has ±{_TURN:.2f}"
             )
         return self
 

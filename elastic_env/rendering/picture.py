@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -27,24 +27,8 @@ _CHARACTERS_PER_ROW = 37
 """Width of a picture over the size of its letters."""
 
 
-class Picture(Protocol):
-    """Draws the present state of a task from its signals."""
-
-    def rgb(self, signals: Signals, world: int = 0) -> Image:
-        """An image of a world, (height, width, 3)."""
-        ...
-
-    def show(self, signals: Signals) -> None:
-        """Update the window, which shows the first world."""
-        ...
-
-    def close(self) -> None:
-        """Free renderer and window."""
-        ...
-
-
-class ModelPicture(ABC):
-    """A `Picture` made from a display model, which is posed and never stepped.
+class Picture(ABC):
+    """Draws the present state of a task by a display model, which is posed and never stepped.
 
     Args:
         spec: What is drawn, with a camera named `CAMERA`.
@@ -116,15 +100,10 @@ def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
     spec.visual.headlight.diffuse = [0.15] * 3
     spec.visual.headlight.specular = [0.0] * 3
     spec.visual.rgba.haze = [*_BACKGROUND, 1.0]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=_BACKGROUND,
-        rgb2=_BACKGROUND,
-        width=64,
-        height=64,
-    )
+    kind = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    flat = mujoco.mjtBuiltin.mjBUILTIN_FLAT
+    sky = spec.add_texture(name="sky", type=kind, builtin=flat, width=64, height=64)
+    sky.rgb1 = sky.rgb2 = _BACKGROUND
 
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:

@@ -1,13 +1,14 @@
 """Bodies to look at for links without shapes: rods from joint to joint, and balls at the ends."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
-
-from elastic_env.core.signals import Array
 
 _RADIUS = 0.02
 """Of a rod, over the size of the robot."""
 _RGBA = (0.75, 0.76, 0.78, 1.0)
+_LOOK: dict[str, Any] = {"rgba": _RGBA, "mass": 0.0, "contype": 0, "conaffinity": 0}
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
@@ -23,11 +24,8 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
     model = spec.copy().compile()
     radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
     for body in [body for body in spec.bodies if not body.geoms]:
-        ends = [
-            model.body_pos[c]
-            for c in np.flatnonzero(model.body_parentid == body.id)
-            if c != body.id
-        ]
+        children = np.flatnonzero(model.body_parentid == body.id)
+        ends = [model.body_pos[child] for child in children if child != body.id]
         rods = [end for end in ends if np.linalg.norm(end) > radius]
         for end in rods:
             _add(body, _CAPSULE, radius, fromto=np.concatenate([np.zeros(3), end]))
@@ -35,7 +33,5 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
             _add(body, _SPHERE, radius, pos=model.body_ipos[body.id])
 
 
-def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, radius: float, **place: Array) -> None:
-    body.add_geom(
-        type=kind, size=[radius, 0.0, 0.0], rgba=_RGBA, mass=0.0, contype=0, conaffinity=0, **place
-    )  # pyright: ignore[reportArgumentType]
+def _add(body: Any, kind: mujoco.mjtGeom, radius: float, **place: Any) -> None:
+    body.add_geom(type=kind, size=[radius, 0.0, 0.0], **_LOOK, **place)

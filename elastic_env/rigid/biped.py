@@ -81,7 +81,8 @@ class Biped:
     @property
     def ankles(self) -> Array:
         """Ankles with the feet flat on their footholds, left first, (2, 3) [m]."""
-        return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
+        heights = np.full((2, 1), self.ankle_height)
+        return np.hstack([self.footholds, heights])
 
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
         """Inverse kinematics with level pelvis and soles.
@@ -98,4 +99,5 @@ class Biped:
         """
         target = ankles - pelvis[..., None, :] - self.hips
         level = np.broadcast_to(np.eye(3), (*target.shape, 3))
-        return leg_angles(self.leg, target, level).reshape(*pelvis.shape[:-1], 2 * len(JOINTS))
+        q = leg_angles(self.leg, target, level)
+        return q.reshape(*pelvis.shape[:-1], 2 * len(JOINTS))

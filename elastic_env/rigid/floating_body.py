@@ -28,15 +28,11 @@ class FloatingBody:
     """
 
     def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
-        free = [
-            model.joint(j).name
-            for j in range(model.njnt)
-            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
-        ]
+        are_free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        free = [model.joint(int(j)).name for j in are_free]
         if len(free) != 1:
-            raise ConfigurationError(
-                f"a floating robot needs one free joint, this model has {len(free)}"
-            )
+            found = f"this model has {len(free)}"
+            raise ConfigurationError(f"a floating robot needs one free joint, {found}")
         require_hinge_tree(model, joints, but=free)
         self._model = pinocchio_model(model)
         self._data = self._model.createData()
@@ -45,7 +41,8 @@ class FloatingBody:
         self._base_q = base.idx_q
         self._base_v = base.idx_v
         self._q = np.array([joint.idx_q for joint in names])
-        self._zero = np.array([model.qpos0[model.joint(joint).qposadr[0]] for joint in joints])
+        addresses = [int(model.joint(joint).qposadr[0]) for joint in joints]
+        self._zero = model.qpos0[addresses]
         self._v = np.array([joint.idx_v for joint in names])
 
     def inverse_dynamics(
@@ -64,41 +61,41 @@ class FloatingBody:
             Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N,
             n) [N·m].
         """
-        base_q = self._base_q
-        base_v = self._base_v
-        position = np.zeros(self._model.nq)
-        velocity = np.zeros(self._model.nv)
-        acceleration = np.zeros(self._model.nv)
-        position[base_q + 6] = 1.0  # the unit quaternion of a level base
+        base = self._base_v
+        rate = np.zeros(self._model.nv)
+        change = np.zeros(self._model.nv)
         wrench = np.empty((len(q), 6))
         torque = np.empty(q.shape)
         for i in range(len(q)):
-            position[self._q] = q[i] - self._zero
-            velocity[base_v : base_v + 3] = base_dot[i]
-            velocity[self._v] = q_dot[i]
-            acceleration[base_v : base_v + 3] = base_ddot[i]
-            acceleration[self._v] = q_ddot[i]
-            effort = pinocchio.rnea(self._model, self._data, position, velocity, acceleration)
-            wrench[i] = effort[base_v : base_v + 6]
+            rate[base : base + 3] = base_dot[i]
+            rate[self._v] = q_dot[i]
+            change[base : base + 3] = base_ddot[i]
+            change[self._v] = q_ddot[i]
+            position = self._position(q[i])
+            effort = pinocchio.rnea(self._model, self._data, position, rate, change)
+            wrench[i] = effort[base : base + 6]
             torque[i] = effort[self._v]
         return wrench, torque
 
+    def _position(self, q: Array) -> Array:
+        """Pinocchio's position of hinges (n,) [rad] on a level base."""
+        position = np.zeros(self._model.nq)
+        position[self._base_q + 6] = 1.0  # the unit quaternion of a level base
+        position[self._q] = q - self._zero
+        return position
+
     def mass_matrix(self, q: Array) -> Array:
         """Inertia of base translation, base rotation, hinges: (n,) [rad] to (6 + n, 6 + n) [SI]."""
-        position = np.zeros(self._model.nq)
-        position[self._base_q + 6] = 1.0
-        position[self._q] = q - self._zero
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
-        full = pinocchio.crba(self._model, self._data, position)
-        return np.triu(full)[np.ix_(rows, rows)] + np.triu(full, 1).T[np.ix_(rows, rows)]
+        full = pinocchio.crba(self._model, self._data, self._position(q))
+        upper = np.triu(full)
+        return (upper + np.triu(full, 1).T)[np.ix_(rows, rows)]
 
     def center_of_mass(self, q: Array) -> Array:
         """Center of mass of the robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
-        position = np.zeros(self._model.nq)
-        position[self._base_q + 6] = 1.0
         com = np.empty((len(q), 3))
         for i in range(len(q)):
-            position[self._q] = q[i] - self._zero
+            position = self._position(q[i])
             com[i] = pinocchio.centerOfMass(self._model, self._data, position)
         return com
 
@@ -113,24 +110,22 @@ def pinocchio_model(model: mujoco.MjModel) -> pinocchio.Model:
         parent = int(model.body_parentid[b])
         T = T_joint_body[parent] * _placement(model.body_pos[b], model.body_quat[b])
         carrier = joint_of[parent]
-        for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+        for j in np.flatnonzero(model.jnt_bodyid == b):
+            name = model.joint(int(j)).name
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-                freeflyer = pinocchio.JointModelFreeFlyer()
-                carrier = tree.addJoint(
-                    carrier, freeflyer, pinocchio.SE3.Identity(), model.joint(j).name
-                )
                 T = pinocchio.SE3.Identity()
+                free = pinocchio.JointModelFreeFlyer()
+                carrier = tree.addJoint(carrier, free, T, name)
                 continue
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())
-            carrier = tree.addJoint(carrier, revolute, T * T_body_anchor, model.joint(j).name)
+            carrier = tree.addJoint(carrier, revolute, T * T_body_anchor, name)
             T = T_body_anchor.inverse()
         joint_of[b] = carrier
         T_joint_body[b] = T
         T_body_com = _placement(model.body_ipos[b], model.body_iquat[b])
-        inertia = pinocchio.Inertia(
-            float(model.body_mass[b]), np.zeros(3), np.diag(model.body_inertia[b])
-        )
+        moments = np.diag(model.body_inertia[b])
+        inertia = pinocchio.Inertia(float(model.body_mass[b]), np.zeros(3), moments)
         tree.appendBodyToJoint(carrier, inertia, T * T_body_com)
     return tree
 

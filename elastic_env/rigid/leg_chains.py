@@ -79,7 +79,7 @@ class LegChains:
         kernels.local_frames(self._links, _dense(q), _dense(attitude), point, com, feet)
         return com, feet
 
-    def sole_tilts(self, q: Array, attitude: Array, bending: Array) -> tuple[Array, Array]:
+    def sole_tilts(self, q: Array, attitude: Array, bending: Array) -> Array:
         """Tilt of the soles by motors and IMU, and the share of it that the joints' bending makes.
 
         Args:
@@ -88,11 +88,12 @@ class LegChains:
             bending: Of the joints, (rows, n) [rad].
 
         Returns:
-            (rows, L, 2) [rad] each.
+            Both, (2, rows, L, 2) [rad].
         """
-        seen, expected = np.empty((2, len(q), self._legs, 2))
-        kernels.tip_tilts(self._links, _dense(q), _dense(attitude), _dense(bending), seen, expected)
-        return seen, expected
+        tilts = np.empty((2, len(q), self._legs, 2))
+        motion = (_dense(q), _dense(attitude), _dense(bending))
+        kernels.tip_tilts(self._links, *motion, *tilts)
+        return tilts
 
     def loads(
         self,

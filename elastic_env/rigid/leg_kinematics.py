@@ -65,7 +65,8 @@ def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
     Raises:
         ElasticError: A target is out of reach.
     """
-    hip = -np.einsum("...ji,...j->...i", R, position)  # hip from the ankle, in the foot frame
+    # the hip from the ankle, in the foot frame
+    hip = -np.einsum("...ji,...j->...i", R, position)
     distance = np.linalg.norm(hip, axis=-1)
     _require_reach(leg, distance)
     A = leg.thigh
@@ -73,10 +74,10 @@ def leg_angles(leg: LegGeometry, position: Array, R: Array) -> Array:
     knee = np.arccos(np.clip((distance**2 - A**2 - B**2) / (2.0 * A * B), -1.0, 1.0))
     ankle_roll = np.arctan2(hip[..., 1], hip[..., 2])
     in_plane = np.hypot(hip[..., 1], hip[..., 2])
-    ankle_pitch = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee)) - np.arctan2(
-        hip[..., 0], in_plane
-    )
-    M = R @ rotation_x(-ankle_roll) @ rotation_y(-ankle_pitch - knee)  # Rz Rx Ry of the hip
+    of_knee = np.arctan2(-A * np.sin(knee), B + A * np.cos(knee))
+    ankle_pitch = of_knee - np.arctan2(hip[..., 0], in_plane)
+    # Rz Rx Ry of the hip
+    M = R @ rotation_x(-ankle_roll) @ rotation_y(-ankle_pitch - knee)
     yaw = np.arctan2(-M[..., 0, 1], M[..., 1, 1])
     roll = np.arctan2(M[..., 2, 1], np.hypot(M[..., 2, 0], M[..., 2, 2]))
     pitch = np.arctan2(-M[..., 2, 0], M[..., 2, 2])

@@ -1,6 +1,6 @@
 """Rigid-body dynamics of robots on a fixed base, batches in one pass."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -10,7 +10,7 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
-from elastic_env.rigid.tree.links import Tree
+from elastic_env.rigid.tree.links import Held, Tree
 
 
 class RigidBody:
@@ -31,10 +31,7 @@ class RigidBody:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        held: Mapping[str, float] | Mapping[int, float] | None = None,
+        self, model: mujoco.MjModel, joints: Sequence[str], held: Held | None = None
     ) -> None:
         held = held or {}
         require_hinge_tree(model, joints, but=list(held))
@@ -47,37 +44,33 @@ class RigidBody:
         self._spring = model.jnt_stiffness[at].copy()
         self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
         self._has_springs = bool(self._spring.any())
-        compile_now(
-            self._compile, np.zeros((1, len(joints)))
-        )  # the first command of a live robot cannot wait
+        # the first command of a live robot cannot wait
+        compile_now(self._compile, np.zeros((1, len(joints))))
 
     def gravity_torque(self, q: Array) -> Array:
         """Torque that holds the robot at rest, (..., n) [rad] to (..., n) [N·m]."""
         rows = self._rows(q)
-        torque = np.empty(q.shape)
-        kernels.gravity_torques(self._links, self._loads, rows, torque.reshape(rows.shape))
+        torque = np.empty(rows.shape)
+        kernels.gravity_torques(self._links, self._loads, rows, torque)
         return self._with_springs(torque, q)
 
     def gravity_gradient(self, q: Array) -> Array:
         """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
         rows = self._rows(q)
-        n = self._n
-        gradient = np.empty((*q.shape, n))
-        kernels.gravity_gradients(self._links, self._loads, rows, gradient.reshape(len(rows), n, n))
+        gradient = np.empty((*rows.shape, self._n))
+        kernels.gravity_gradients(self._links, self._loads, rows, gradient)
         if self._has_springs:
             np.einsum("...ii->...i", gradient)[...] += self._spring
-        return gradient
+        return gradient.reshape(*q.shape, self._n)
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
         if not q.shape == q_dot.shape == q_ddot.shape:
-            raise ElasticError(
-                f"angles, rates and accelerations must have one shape, got {q.shape}, {q_dot.shape}"
-                f" and {q_ddot.shape}"
-            )
+            shapes = f"{q.shape}, {q_dot.shape} and {q_ddot.shape}"
+            raise ElasticError(f"angles, rates, accelerations must have one shape, got {shapes}")
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
-        torque = np.empty(q.shape)
-        kernels.inverse_dynamics(self._links, self._loads, motion, torque.reshape(motion[0].shape))
+        torque = np.empty(motion[0].shape)
+        kernels.inverse_dynamics(self._links, self._loads, motion, torque)
         return self._with_springs(torque, q)
 
     def set_load(self, body: int, mass: float, place: Array) -> None:
@@ -91,16 +84,17 @@ class RigidBody:
         self._links = self._tree.add_load(body, mass, place)
 
     def _with_springs(self, torque: Array, q: Array) -> Array:
-        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
+        torque = torque.reshape(q.shape)
+        if self._has_springs:
+            torque = torque + self._spring * (q - self._spring_rest)
+        return torque
 
     def _rows(self, values: Array) -> Array:
         """(..., n) as (rows, n) in one piece, so that one kernel fits all."""
         if values.shape[-1:] != (self._n,):
             # compiled code reads where nothing is, without a word
-            raise ElasticError(
-                f"one value per joint is needed, (..., {self._n}), got an array of shape"
-                f" {values.shape}"
-            )
+            needed = f"(..., {self._n}), got an array of shape {values.shape}"
+            raise ElasticError(f"one value per joint is needed, {needed}")
         return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, self._n)
 
     def _compile(self, zero: Array) -> None:
@@ -122,8 +116,9 @@ def require_hinge_tree(
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
-    others = [j for j in range(model.njnt) if j not in but and model.joint(j).name not in but]
-    kinds = {model.joint(j).name: model.jnt_type[j] for j in others}
+    joints_of = [(j, model.joint(j).name) for j in range(model.njnt)]
+    others = [(j, name) for j, name in joints_of if j not in but and name not in but]
+    kinds = {name: model.jnt_type[j] for j, name in others}
     names = list(kinds)
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:
@@ -132,7 +127,5 @@ def require_hinge_tree(
             )
     require_known("joint of the rigid model", joints, names)
     if sorted(joints) != sorted(names):
-        raise ConfigurationError(
-            f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}:"
-            f" {', '.join(joints)}"
-        )
+        needed = f"all {len(names)} joints must be named ({', '.join(names)})"
+        raise ConfigurationError(f"{needed}, got {len(joints)}: {', '.join(joints)}")

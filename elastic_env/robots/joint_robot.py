@@ -34,7 +34,7 @@ from elastic_env.motion.arm_references import (
 )
 from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, as_model
-from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
+from elastic_env.rendering.picture import CAMERA, Picture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
@@ -236,7 +236,7 @@ class JointRobot:
         return JointTask(config, self.plant(config), num_worlds)
 
 
-class JointPicture(ModelPicture):
+class JointPicture(Picture):
     """The robot with its deviations enlarged, and the reference as a translucent robot.
 
     Args:

@@ -1,4 +1,4 @@
-"""Dynamixel servos on one port: registers, goals in one packet, states in another.
+"""Dynamixel servos on one port or several: registers, goals in one packet, states in another.
 
 A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none
 of the last ones still awaits. So a reply that comes late is known as old and left out. Temperatures
@@ -7,35 +7,30 @@ lie farther off and change slowly: only every 25th request is for a block that r
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.hardware.buses import packets
-from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States, servo_name
+from elastic_env.hardware.buses import packets, servo_models
+from elastic_env.hardware.buses import port as ports
+from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States
 from elastic_env.hardware.buses.packets import word
-from elastic_env.hardware.buses.port import (
-    COMM_SUCCESS,
-    DEFAULT_BAUDRATE,
-    PacketHandler,
-    Port,
-    bus_gone,
-)
-from elastic_env.hardware.buses.servo_models import (
-    NUM_BLOCKS,
-    ServoModel,
-    explain_errors,
-    servo_model,
-)
-from elastic_env.hardware.errors import HardwareError, ReplyError
+from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE, bus_gone
+from elastic_env.hardware.buses.servo_models import ServoModel
+from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
 
 _TRIES = 3
 _QUIET_S = 0.03
 _REPLY_TIMEOUT_S = 0.05
 _WATCHDOG_COUNTS = 3  # of 20 ms
 _STATUS_BYTES = 11
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class ServoInfo:
 
 
 class DynamixelBus:
-    """Dynamixel servos of Protocol 2.0 on a port; a `Bus`.
+    """Dynamixel servos of Protocol 2.0 on a port.
 
     Args:
         port: Device, such as /dev/ttyUSB0.
@@ -61,13 +56,13 @@ class DynamixelBus:
 
     def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
         self.name = port
-        self.port = Port(port, baudrate)
+        self.port = ports.Port(port, baudrate)
         self.models: dict[int, ServoModel] = {}
         self.reply_timeout_s = _REPLY_TIMEOUT_S
         self.num_retries = 0
-        self._handler = PacketHandler()
+        self._handler = ports.PacketHandler()
         self._cycles_without_temperature = TEMPERATURE_CYCLES
-        self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)
+        self._awaited: deque[range | None] = deque(maxlen=servo_models.NUM_BLOCKS - 1)
         """Blocks that the last requests asked for; None where all servos answered."""
 
     def open(self) -> None:
@@ -129,7 +124,8 @@ class DynamixelBus:
         Raises:
             HardwareError: A model is not known, or they do not go together.
         """
-        self.models = {i: servo_model(number) for i, number in numbers.items()}
+        kinds = {i: servo_models.servo_model(number) for i, number in numbers.items()}
+        self.models = kinds
         if len({model.blocks for model in self.models.values()}) > 1:
             names = ", ".join(f"{i}: {model.name}" for i, model in self.models.items())
             raise HardwareError(
@@ -179,13 +175,13 @@ class DynamixelBus:
 
     def read_condition(self, servo_id: int) -> Condition:
         """Velocity, temperature and hardware error of one servo."""
-        speed = self.read(servo_id, "present_velocity")
-        return Condition(
-            velocity=speed * self.models[servo_id].velocity_unit,
-            temperature=float(self.read(servo_id, "present_temperature")),
-            temperature_limit=float(self.read(servo_id, "temperature_limit")),
-            error=explain_errors(self.read(servo_id, "hardware_error_status")),
-        )
+        counts = self.read(servo_id, "present_velocity")
+        temperature = float(self.read(servo_id, "present_temperature"))
+        highest = float(self.read(servo_id, "temperature_limit"))
+        status = self.read(servo_id, "hardware_error_status")
+        error = servo_models.explain_errors(status)
+        unit = self.models[servo_id].velocity_unit
+        return Condition(counts * unit, temperature, highest, error)
 
     def write_goal(self, servo_id: int, angle: float) -> None:
         """Command one servo [rad], which confirms it.
@@ -285,34 +281,29 @@ class DynamixelBus:
             return free[0]
         return next(filter(model.has_temperature, free), free[0])
 
-    def _decode(self, block: range, replies: Mapping[int, bytes], alerts: set[int]) -> States:
+    def _decode(self, block: range, replies: dict[int, bytes], alerts: Any) -> States:
         values = np.full((len(self.ids), 4), np.nan)
         for row, (servo_id, model) in enumerate(self.models.items()):
             if servo_id in replies:
                 values[row] = model.decode_block(block, replies[servo_id])
-        position, velocity, current, temperature = values.T.copy()
-        return States(
-            position=position,
-            velocity=velocity,
-            current=current,
-            is_fresh=np.array([servo_id in replies for servo_id in self.ids]),
-            has_alert=np.array([servo_id in alerts for servo_id in self.ids]),
-            time_s=time.monotonic(),
-            temperature=temperature,
-        )
+        angle, velocity, current, temperature = values.T.copy()
+        now = time.monotonic()
+        is_fresh = np.array([servo_id in replies for servo_id in self.ids])
+        has_alert = np.array([servo_id in alerts for servo_id in self.ids])
+        return States(angle, velocity, current, is_fresh, has_alert, now, temperature)
 
-    def _request(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
+    def _request(self, servo_id: int, kind: int, data: bytes, length: int) -> bytes:
         """The data of a reply.
 
         A few tries, with silence in between so that no late reply answers the next one.
         """
         problem = "does not answer"
         for _ in range(_TRIES):
-            self._send(servo_id, instruction, parameters)
+            self._send(servo_id, kind, data)
             wire_ms = self.port.tx_time_per_byte * (_STATUS_BYTES + length)
             self.port.setPacketTimeoutMillis(wire_ms + 1e3 * self.reply_timeout_s)
             while (reply := self._receive()) is not None:
-                sender, status, data = reply
+                sender, status, found = reply
                 error = status & ~packets.ALERT
                 if sender != servo_id:
                     continue
@@ -323,8 +314,8 @@ class DynamixelBus:
                     unknown = f"error {error}, which the protocol does not have"
                     reason = packets.STATUS_ERRORS.get(error, unknown)
                     raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
-                if len(data) == length:
-                    return data
+                if len(found) == length:
+                    return found
             self._wait_for_silence()
             self.num_retries += 1
         raise ReplyError(
@@ -333,13 +324,13 @@ class DynamixelBus:
             f"servos and not the IMU's, see: elastic hardware scan {self.name}"
         )
 
-    def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
-        length = word(len(parameters) + 3)
-        frame = [0, 0, 0, 0, servo_id, *length, instruction, *parameters, 0, 0]
+    def _send(self, servo_id: int, instruction: int, data: bytes) -> None:
+        length = word(len(data) + 3)
+        frame = [0, 0, 0, 0, servo_id, *length, instruction, *data, 0, 0]
         self.port.release()
         with bus_gone(self.name):
             result = self._handler.txPacket(self.port, frame)
-        if result != COMM_SUCCESS:
+        if result:  # 0 is success
             problem = self._handler.getTxRxResult(result)
             raise ReplyError(f"cannot send at {self.name}: {problem}")
 
@@ -347,9 +338,7 @@ class DynamixelBus:
         """Id, error and data of the next status; None if it is damaged, or none comes in time."""
         with bus_gone(self.name):
             received, result = self._handler.rxPacket(self.port, False)
-        if result != COMM_SUCCESS:
-            return None
-        return received[4], received[8], bytes(received[9:-2])
+        return None if result else (received[4], received[8], bytes(received[9:-2]))
 
     def _wait_for_silence(self) -> None:
         with bus_gone(self.name):
@@ -359,3 +348,96 @@ class DynamixelBus:
             while time.monotonic() < min(end, deadline):
                 if self.port.readPort(256):
                     end = time.monotonic() + _QUIET_S
+
+
+class BusGroup:
+    """Several buses as one. Each has a reader of its own, so that they work at the same time.
+
+    Args:
+        buses: With their servos attached; an array of all servos has theirs in this order.
+    """
+
+    def __init__(self, buses: Sequence[DynamixelBus]) -> None:
+        self.buses = tuple(buses)
+        self._readers = [ThreadPoolExecutor(1, bus.name) for bus in buses[1:]]
+
+    @property
+    def servos(self) -> list[tuple[DynamixelBus, int]]:
+        """Bus and id of each servo."""
+        return [(bus, servo_id) for bus in self.buses for servo_id in bus.ids]
+
+    @property
+    def names(self) -> list[str]:
+        """The servos' names in messages."""
+        return [servo_name(bus, servo_id) for bus, servo_id in self.servos]
+
+    def write_goals(self, angles: Array) -> None:
+        """Command all servos, (n,) [rad]."""
+        ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]
+        parts = zip(self.buses, np.split(angles, ends), strict=True)
+        self._call_all([partial(bus.write_goals, part) for bus, part in parts])
+
+    def read_states(self, timeout_s: float) -> States:
+        """States of all servos; waits for at most a time [s]."""
+        if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
+            return self.buses[0].read_states(timeout_s)
+        calls = [partial(bus.read_states, timeout_s) for bus in self.buses]
+        return States.join(self._call_all(calls))
+
+    def torque_off(self, when_sent: Any = None) -> HardwareError | None:
+        """Switch all torque off, at every bus before any servo is asked whether it is.
+
+        A lost bus keeps no other on.
+
+        Args:
+            when_sent: Called in between; servos that do not answer make the rest last.
+
+        Returns:
+            What is not certain: a `BusGoneError` where a bus is gone, else a `ReplyError`; None if
+            all is off.
+        """
+        self._call_all([partial(_call, bus.torque_off) for bus in self.buses])
+        if when_sent is not None:
+            when_sent()
+        calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
+        answers = self._call_all(calls)
+        errors = [answer for answer in answers if isinstance(answer, HardwareError)]
+        lists = [answer for answer in answers if isinstance(answer, list)]
+        silent = [name for names in lists for name in names]
+        problems = [str(error) for error in errors]
+        if silent:
+            who = f"{', '.join(silent)}: switch the power off"
+            problems.append(f"torque off was sent, but not confirmed by {who}")
+        if not problems:
+            return None
+        pairs = zip(self.buses, answers, strict=True)
+        if off := [bus.name for bus, answer in pairs if answer == []]:
+            problems.append(f"torque is off at {', '.join(off)}")
+        is_gone = any(isinstance(error, BusGoneError) for error in errors)
+        return (BusGoneError if is_gone else ReplyError)("; ".join(problems))
+
+    def _call_all(self, calls: Sequence[Callable[[], T]]) -> list[T]:
+        """Call one function for each bus, the first in this thread.
+
+        All of them are done when an error is raised.
+        """
+        pairs = zip(self._readers, calls[1:], strict=True)
+        others = [reader.submit(call) for reader, call in pairs]
+        try:
+            first = calls[0]()
+        finally:
+            wait(others)
+        return [first, *(future.result() for future in others)]
+
+
+def servo_name(bus: DynamixelBus, servo_id: int) -> str:
+    """A servo's name in messages."""
+    return f"servo {servo_id} at {bus.name}"
+
+
+def _call(function: Callable[[], T]) -> T | HardwareError:
+    """The result of a call, or its error."""
+    try:
+        return function()
+    except HardwareError as error:
+        return error

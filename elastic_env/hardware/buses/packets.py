@@ -45,9 +45,8 @@ STATUS_ERRORS = {
 
 RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 """Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
-LOWEST_RATE = 9_600
-HIGHEST_RATE = 10_500_000
-"""Range of servos and IMU, by their manuals [bit/s]."""
+RANGE_OF_RATES = {"ge": 9_600, "le": 10_500_000}
+"""Bounds of servos and IMU, by their manuals [bit/s]."""
 LONGEST_PACKET = 1024
 """Longest packet of the SDK [bytes]."""
 

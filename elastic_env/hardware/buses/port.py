@@ -26,8 +26,8 @@ from elastic_env.hardware.buses.port_lock import cannot_open, lock_port
 from elastic_env.hardware.errors import BusGoneError, PortError
 
 try:
+    import dynamixel_sdk as sdk
     import serial
-    from dynamixel_sdk import COMM_PORT_BUSY, COMM_SUCCESS, COMM_TX_ERROR, COMM_TX_FAIL, PortHandler
     from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 except ModuleNotFoundError as error:
     purpose = "the testbed on real hardware"
@@ -56,7 +56,7 @@ def bus_gone(port: str) -> Iterator[None]:
         ) from None
 
 
-class Port(PortHandler):
+class Port(sdk.PortHandler):
     """A serial port for one program alone.
 
     Args:
@@ -78,10 +78,8 @@ class Port(PortHandler):
         """
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
-            raise PortError(
-                f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of"
-                f" {packets.RATES}"
-            )
+            rates = f"{self.baudrate} bit/s for {name}; try one of {packets.RATES}"
+            raise PortError(f"the SDK has no rate of {rates}")
         self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)
@@ -94,9 +92,9 @@ class Port(PortHandler):
 
     def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
         """Open the device such that a read blocks for a short while instead of not at all."""
-        self.ser = serial.Serial(
-            self.port_name, self.baudrate, timeout=_READ_SLICE_S, write_timeout=0.1
-        )
+        name = self.port_name
+        rate = self.baudrate
+        self.ser = serial.Serial(name, rate, timeout=_READ_SLICE_S, write_timeout=0.1)
         self.is_open = True
         self.tx_time_per_byte = 1e4 / self.baudrate
         return True
@@ -139,11 +137,8 @@ class Port(PortHandler):
     @property
     def latency_timer(self) -> Path:
         """The file that holds the adapter's latency timer, if it has one."""
-        return (
-            Path("/sys/bus/usb-serial/devices")
-            / Path(os.path.realpath(self.port_name)).name
-            / "latency_timer"
-        )
+        device = Path(os.path.realpath(self.port_name)).name
+        return Path("/sys/bus/usb-serial/devices") / device / "latency_timer"
 
     @property
     def latency_timer_ms(self) -> int | None:
@@ -163,17 +158,17 @@ class PacketHandler(Protocol2PacketHandler):
     def txPacket(self, port: Any, txpacket: list[int]) -> Any:  # noqa: N802  the SDK's name
         """Send an instruction that the SDK has laid out."""
         if port.is_using:
-            return COMM_PORT_BUSY
+            return sdk.COMM_PORT_BUSY
         length = txpacket[5] | txpacket[6] << 8
         wire = packets.packet(txpacket[4], txpacket[7], bytes(txpacket[8 : 5 + length]))
         if len(wire) > packets.LONGEST_PACKET:
-            return COMM_TX_ERROR
+            return sdk.COMM_TX_ERROR
         port.is_using = True
         port.clearPort()
         if port.writePort(wire) != len(wire):
             port.is_using = False
-            return COMM_TX_FAIL
-        return COMM_SUCCESS
+            return sdk.COMM_TX_FAIL
+        return sdk.COMM_SUCCESS
 
     def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
         """A received packet without its stuffing; its length field fits again."""

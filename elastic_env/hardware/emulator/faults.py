@@ -53,7 +53,7 @@ class Faults(Model):
     """Share of IMU packets with a flipped bit [1]."""
 
 
-def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tuple[bytes, float]:
+def damage(faults: Faults, reply: bytes, generator: Any) -> tuple[bytes, float]:
     """A reply as the line delivers it: its bytes, none if it is lost, and its delay [s]."""
     delay = faults.latency_s
     chance = generator.random(4)

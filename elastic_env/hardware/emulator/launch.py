@@ -17,6 +17,7 @@ from elastic_env.hardware.safety.processes import end_child, start_child
 from elastic_env.robots.testbed.config import TestbedConfig
 
 _END_S = 10.0
+_PROCESS = "elastic_env.hardware.emulator.process"
 
 
 class EmulatorConfig(Model):
@@ -32,7 +33,7 @@ class EmulatorConfig(Model):
     """The joints behind them, and through its scenario the quality of the IMU."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
     """Packets of the IMU per second [Hz]."""
-    baudrate: int = quantity("bit/s", 3_000_000, ge=packets.LOWEST_RATE, le=packets.HIGHEST_RATE)
+    baudrate: int = quantity("bit/s", 3_000_000, **packets.RANGE_OF_RATES)
     """Rate of the bus; no other is heard [bit/s]."""
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0)
@@ -62,12 +63,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def __init__(self, config: EmulatorConfig | None = None) -> None:
         text = (config or EmulatorConfig()).model_dump_json()
-        self._process = start_child(
-            "elastic_env.hardware.emulator.process",
-            text,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
+        pipes: Any = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+        self._process = start_child(_PROCESS, text, **pipes)
         self._take_ports(self._receive())
 
     def faults(self, **changes: Any) -> None:
@@ -83,10 +80,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         Monotonic time, id, register, value [count]; `present_position` is what a state that was
         asked for is to tell.
         """
-        return [
-            (float(t), int(i), str(name), int(value))
-            for t, i, name, value in self._request({"events": True})
-        ]
+        events = self._request({"events": True})
+        return [(float(t), int(i), str(name), int(count)) for t, i, name, count in events]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""

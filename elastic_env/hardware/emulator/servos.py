@@ -3,14 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses import packets, servo_models
 from elastic_env.hardware.buses.packets import Packet, word, words
-from elastic_env.hardware.buses.servo_models import (
-    LARGEST_TORQUE_NM,
-    Register,
-    ServoModel,
-    current_of_torque,
-)
+from elastic_env.hardware.buses.servo_models import Register, ServoModel
 
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""
@@ -61,7 +56,8 @@ class EmulatedServo:
     def __post_init__(self) -> None:
         self._memory = bytearray(self.model.table.size)
         limit = self.model.current_limit
-        allowed = int(current_of_torque(LARGEST_TORQUE_NM) / self.model.current_unit)
+        strongest = servo_models.current_of_torque(servo_models.LARGEST_TORQUE_NM)
+        allowed = int(strongest / self.model.current_unit)
         for register in self.model.table.values():
             self[register.name] = register.initial
         self["model_number"] = self.model_number or self.model.number
@@ -96,7 +92,7 @@ class EmulatedServo:
         """Put what it measures into its registers."""
         self["present_position"] = round(self.motor.position / self.model.position_unit)
         self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        current = current_of_torque(self.motor.torque)
+        current = servo_models.current_of_torque(self.motor.torque)
         self["present_current"] = round(current / self.model.current_unit)
 
     def heat(self, is_hot: bool) -> None:

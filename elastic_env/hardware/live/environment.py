@@ -20,7 +20,7 @@ SCENARIO = "hardware"
 _OF_A_SIMULATION = ("form", "timestep_s")
 
 
-def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTestbedTask:
+def configure_hardware(port: Any = None, **arguments: Any) -> HardwareTestbedTask:
     """The task of `gymnasium.make("elastic_env/HardwareTestbed-v0", port=..., ...)`.
 
     Args:
@@ -33,9 +33,8 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if port is None:
-        raise ConfigurationError(
-            f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT"
-        )
+        cure = "such as /dev/ttyUSB0; see: elastic hardware scan PORT"
+        raise ConfigurationError(f"{ID} needs port, {cure}")
     of_settings = list(HardwareSettings.model_fields)
     parameters = inspect.signature(configure_testbed).parameters
     of_testbed = [name for name in parameters if name not in _OF_A_SIMULATION]

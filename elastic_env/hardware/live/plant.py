@@ -14,8 +14,8 @@ from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.guard import exceeds
-from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
@@ -80,7 +80,7 @@ class ServoPlant:
         self._bus: SupervisedBus | None = None
         self._imu: AttitudeStream | None = None
         self._is_agreed = not settings.confirm
-        self._pace = Pace(period_s)
+        self._pace = realtime.Pace(period_s)
         self._goal = 0.0
         self._read_s = 0.0
         self._is_kept = False
@@ -169,7 +169,7 @@ class ServoPlant:
             if imu is not None:
                 imu.close()
             if bus is not None:
-                give_up_realtime()
+                realtime.give_up_realtime()
 
     def restart(self, worlds: BoolArray) -> None:
         """Nothing: an episode begins with `begin`."""
@@ -199,10 +199,9 @@ class ServoPlant:
             ports = {settings.port: [settings.servo_id]}
             self._bus = SupervisedBus(ports, settings.baudrate)
             if settings.imu_port is not None:
-                self._imu = AttitudeStream(
-                    settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s
-                )
-            prefer_realtime(Priority.LOOP)
+                stream = (settings.imu_baudrate, settings.imu_oldest_s)
+                self._imu = AttitudeStream(settings.imu_port, *stream)
+            realtime.prefer_realtime(realtime.Priority.LOOP)
         return self._bus
 
     @contextmanager
@@ -234,8 +233,8 @@ class ServoPlant:
         Where the reply is missing the command is held and the cycle repeated.
         """
         bus = self._open_bus()
-        missed = 0
-        overruns = 0
+        missed = self.record.missed_replies
+        overruns = self.record.overruns
         is_limited = False
         while True:
             due_s = self._pace.next()
@@ -248,31 +247,25 @@ class ServoPlant:
             missed += 1
         self._read(cycle)
         torque = float(torque_of_current(cycle.states.current[0]))
-        self.record = CycleRecord(
-            joint_torque=self.settings.direction * torque,
-            jitter=late_s,
-            period=cycle.states.time_s - self._read_s,
-            overruns=self.record.overruns + overruns,
-            missed_replies=self.record.missed_replies + missed,
-            limited=self.record.limited + is_limited,
-        )
+        period_s = cycle.states.time_s - self._read_s
+        timing = (late_s, period_s, overruns, missed, self.record.limited + is_limited)
+        self.record = CycleRecord(self.settings.direction * torque, *timing)
         self._read_s = cycle.states.time_s
 
     def _read(self, cycle: Cycle) -> None:
         """Put the measurements of a cycle into the state vectors."""
         settings = self.settings
         states = cycle.states
+        at = self._at
         self._goal = settings.joint_angle(float(cycle.goals[0]))
-        theta = settings.joint_angle(float(states.position[0]))
-        self.qpos[0, self._at.theta[0]] = theta
-        theta_dot = settings.direction * float(states.velocity[0])
-        self.qvel[0, self._at.theta_dot[0]] = theta_dot
+        self.qpos[0, at.theta[0]] = settings.joint_angle(float(states.position[0]))
+        self.qvel[0, at.theta_dot[0]] = settings.direction * float(states.velocity[0])
         if self._imu is not None:
             sample = self._imu.latest()
             mounting = (settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
             q = sample.link_angle(*mounting)
             self._require_together(q, states.time_s - sample.time_s)
-            self.qpos[0, self._at.q[0]] = q
+            self.qpos[0, at.q[0]] = q
 
     def _require_together(self, q: float, age_s: float) -> None:
         """Refuse a link that is where no gear bends to.
@@ -294,13 +287,13 @@ class ServoPlant:
             )
 
 
-def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: float) -> None:
+def require_agreement(settings: HardwareSettings, angle: float, load_nm: float) -> None:
     """Ask at the terminal whether the way of a motion is free.
 
     Args:
         settings: Port and limits.
         angle: Where the motion goes first [rad].
-        pendulum_nm: Torque of the pendulum at the horizontal [N·m].
+        load_nm: Torque of the pendulum at the horizontal [N·m].
 
     Raises:
         HardwareError: Nobody is there, or agrees.
@@ -309,7 +302,7 @@ def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: flo
     question = (
         f"The servo at {settings.port} will move to {angle:.3f} rad, then anywhere between its "
         f"limits, {limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of "
-        f"{pendulum_nm:.1f} N·m. Is its way free, and the power switch in reach? Type the whole "
+        f"{load_nm:.1f} N·m. Is its way free, and the power switch in reach? Type the whole "
         "word yes: "
     )
     if not sys.stdin.isatty():

@@ -39,8 +39,10 @@ TIMING_METRICS = (
     Metric("limited", "limited", "max", over="all"),
 )
 _KINDS = {float: REAL, int: WHOLE}
-_CYCLE = record_type(*((name, _KINDS[of]) for name, of in get_type_hints(CycleRecord).items()))
+_FIELDS = get_type_hints(CycleRecord).items()
+_CYCLE = record_type(*((name, _KINDS[kind]) for name, kind in _FIELDS))
 _LINK = JointTask.world_type
+_OF_LINK = [(name, _LINK[name]) for name in _LINK.names or ()]
 
 
 class HardwareTestbedTask(TestbedTask):
@@ -51,9 +53,7 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
-    world_type = record_type(
-        *((name, _LINK[name]) for name in _LINK.names or ()), ("cycle", _CYCLE)
-    )
+    world_type = record_type(*_OF_LINK, ("cycle", _CYCLE))
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         # the IMU is read in every cycle
@@ -103,10 +103,8 @@ class HardwareTestbedTask(TestbedTask):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """Signals of a step, as in the table of the module."""
         cycle = worlds["cycle"]
-        return {
-            **super()._signals(joints, worlds),
-            **{name: cycle[name].copy() for name in _CYCLE.names or ()},
-        }
+        own = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        return {**super()._signals(joints, worlds), **own}
 
     @property
     def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]

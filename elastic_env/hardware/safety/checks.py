@@ -8,13 +8,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
+from elastic_env.hardware.buses import servo_models
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.servo_models import (
-    LARGEST_TORQUE_NM,
-    current_of_torque,
-    explain_errors,
-)
+from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
 
 _POSITION_MODE = 3
 _FULL_REPLIES = 2
@@ -71,9 +69,8 @@ def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
 def _check_line(bus: DynamixelBus, servo_id: int) -> list[Check]:
     """Latency of the adapter, and round trips of pings to a servo."""
     latency = bus.port.latency_timer_ms
-    told = "not an FTDI adapter, or not told; see the round trip"
-    if latency is not None:
-        told = f"{latency} ms"
+    unknown = "not an FTDI adapter, or not told; see the round trip"
+    told = unknown if latency is None else f"{latency} ms"
     cure = f"echo 1 | sudo tee {bus.port.latency_timer}"
     times = []
     retries = bus.num_retries
@@ -97,14 +94,12 @@ def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
     model = bus.models[servo_id]
     read = partial(bus.read, servo_id)
 
-    def check(
-        what: str, value: str, is_good: bool = True, cure: str = "", is_vital: bool = True
-    ) -> None:
-        checks.append(Check(f"{servo_id}: {what}", value, is_good, cure, is_vital))
+    def check(what: str, *found: Any, **marks: bool) -> None:
+        checks.append(Check(f"{servo_id}: {what}", *found, **marks))
 
     firmware = read("firmware_version")
     check("model, firmware", f"{model.number} {model.name}, version {firmware}")
-    error = explain_errors(read("hardware_error_status"))
+    error = servo_models.explain_errors(read("hardware_error_status"))
     restart = "remove the cause, then switch the power off and on"
     check("hardware error", error or "none", not error, restart)
     volts = read("present_input_voltage") / 10.0
@@ -126,7 +121,7 @@ def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
     mend = f"write {_FULL_REPLIES} to status_return_level"
     check("status return level", str(level), level == _FULL_REPLIES, mend)
     amperes = read(model.current_limit) * model.current_unit
-    strongest = current_of_torque(LARGEST_TORQUE_NM)
+    strongest = servo_models.current_of_torque(LARGEST_TORQUE_NM)
     mend = (
         f"with torque off, write {round(strongest / model.current_unit)} to {model.current_limit}:"
         f" more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"

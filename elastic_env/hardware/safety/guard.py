@@ -5,6 +5,7 @@ comparison would let a motion go on whose measurement is none.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +40,7 @@ def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
     return ~(np.isfinite(values) & np.isfinite(most) & (values <= most))
 
 
-def is_outside(value: npt.ArrayLike, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
+def is_outside(value: Any, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
     """True where a value is not known to lie between two bounds, or on one of them.
 
     Shapes as in `exceeds`.
@@ -107,16 +108,13 @@ class Guard:
             FaultError: A goal is not a finite number, or the time is none.
         """
         asked = np.asarray(goals, dtype=np.float64)
-        if asked.shape != self.goals.shape or not np.isfinite(asked).all():
-            raise FaultError(
-                f"goals must be {len(self.goals)} finite angles [rad], got"
-                f" {np.asarray(goals).tolist()}"
-            )
+        n = len(self.goals)
+        if asked.shape != (n,) or not np.isfinite(asked).all():
+            found = np.asarray(goals).tolist()
+            raise FaultError(f"goals must be {n} finite angles [rad], got {found}")
         if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
-            raise FaultError(
-                "the time since the last command must be at least 0 s and finite, got"
-                f" {elapsed_s} s"
-            )
+            needed = f"at least 0 s and finite, got {elapsed_s} s"
+            raise FaultError(f"the time since the last command must be {needed}")
         if not self.is_holding:
             reach = self.limits.slew_rad_s * elapsed_s
             within = np.clip(asked, self.limits.lowest_rad, self.limits.highest_rad)
@@ -150,10 +148,9 @@ class Guard:
         highest = limits.highest_rad + limits.margin_rad
         outside = is_fresh & is_outside(states.position, lowest, highest)
         if outside.any():
-            return (
-                f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
-                f"{self._list(outside, states.position)} rad"
-            )
+            ends = f"{limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad"
+            servos = self._list(outside, states.position)
+            return f"a position is outside {ends}: {servos} rad"
         fast = is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
         if fast.any():
             speeds = self._list(fast, states.velocity)
@@ -187,13 +184,11 @@ class Guard:
         hot = ~is_missing & exceeds(temperature, self._hottest)
         if hot.any():
             return explain_heat(self._list(hot, temperature), self._hottest[hot])
-        unknown = self._without_temperature > _LONGEST_WITHOUT_TEMPERATURE
+        longest = _LONGEST_WITHOUT_TEMPERATURE
+        unknown = self._without_temperature > longest
         if unknown.any():
             servos = self._list(unknown)
-            return (
-                f"no temperature from {servos} in {_LONGEST_WITHOUT_TEMPERATURE} cycles: elastic"
-                " hardware check"
-            )
+            return f"no temperature from {servos} in {longest} cycles: elastic hardware check"
         return ""
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:

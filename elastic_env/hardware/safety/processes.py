@@ -24,7 +24,9 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+Process: TypeAlias = "subprocess.Popen[str]"
 
 _PACKAGE = "elastic_env"
 _PATH = "PYTHONPATH"
@@ -49,7 +51,7 @@ def child_command(module: str, *arguments: str) -> list[str]:
     return [sys.executable, "-P", this, folders, module, *arguments]
 
 
-def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Popen[str]":
+def start_child(module: str, *arguments: str, **options: Any) -> Process:
     """Run a module of ours in a process and a session of its own.
 
     Args:
@@ -63,7 +65,7 @@ def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Pop
     )
 
 
-def end_child(process: "subprocess.Popen[str]", within_s: float) -> None:
+def end_child(process: Process, within_s: float) -> None:
     """End a child that stops when its input is closed.
 
     One that does not within a time [s] is killed.

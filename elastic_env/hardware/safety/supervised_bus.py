@@ -4,7 +4,7 @@ import contextlib
 import subprocess
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware import errors
-from elastic_env.hardware.buses.bus import BusGroup, States
-from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.bus import States
+from elastic_env.hardware.buses.dynamixel_bus import BusGroup, DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
@@ -21,6 +21,7 @@ from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
 
+_SUPERVISOR = "elastic_env.hardware.safety.supervisor"
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
 """Longest silence of a supervisor beyond what was asked for [s].
@@ -92,14 +93,10 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         own, other = Channel.pair()
         self._channel = Channel(own)
         with other:
-            self._process = start_child(
-                "elastic_env.hardware.safety.supervisor",
-                str(other.fileno()),
-                str(baudrate),
-                *ports,
-                pass_fds=[other.fileno()],
-                stdin=subprocess.DEVNULL,
-            )
+            file = other.fileno()
+            arguments = (str(file), str(baudrate), *ports)
+            options = {"pass_fds": [file], "stdin": subprocess.DEVNULL}
+            self._process = start_child(_SUPERVISOR, *arguments, **options)
         try:
             self._receive(0, _START_S)
             servos = list(self._ports.values())
@@ -153,13 +150,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             with contextlib.suppress(HardwareError, OSError):
                 self._request("disable", _ANSWER_S)
             raise
-        return Cycle(
-            states=States.load(answer),
-            goals=np.array(answer["goals"]),
-            is_limited=np.array(answer["is_limited"]),
-            is_held=bool(answer["is_held"]),
-            late_s=float(answer["late_s"]),
-        )
+        goals, is_limited = (np.array(answer[name]) for name in ("goals", "is_limited"))
+        last = (bool(answer["is_held"]), float(answer["late_s"]))
+        return Cycle(States.load(answer), goals, is_limited, *last)
 
     def read(self) -> States:
         """States without a command."""
@@ -172,8 +165,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """
         self.stop_keeping()
         self._is_kept.set()
-        end_s = time.monotonic() + limit_s
-        arguments = (goals, end_s, threading.get_native_id())
+        arguments = (goals, time.monotonic() + limit_s, threading.get_native_id())
         self._keeper = threading.Thread(target=self._keep, args=arguments, daemon=True)
         self._keeper.start()
 
@@ -232,12 +224,12 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _request(self, action: str, within_s: float, **arguments: Any) -> dict[str, Any]:
+    def _request(self, action: str, within_s: float, **arguments: Any) -> Any:
         """The answer to a request, which must come within a time [s]."""
         with self._lock:
             self._number += 1
+            request = {"number": self._number, "do": action, "with": arguments}
             try:
-                request = {"number": self._number, "do": action, "with": arguments}
                 self._channel.send(request)
             except OSError:
                 raise self._replace_supervisor() from None
@@ -269,10 +261,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             how = f"ended (exit code {self._process.poll()})"
         else:
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
-        return FaultError(
-            f"the supervisor process {how};"
-            f" {emergency_stop(self._ports, self._baudrate, self.models)}"
-        )
+        outcome = emergency_stop(self._ports, self._baudrate, self.models)
+        return FaultError(f"the supervisor process {how}; {outcome}")
 
 
 def emergency_stop(
@@ -292,16 +282,25 @@ def emergency_stop(
         What came of it, in words.
     """
     problems: list[str] = []
+
+    @contextlib.contextmanager
+    def noting(kind: type[HardwareError]) -> Iterator[None]:
+        try:
+            yield
+        except kind as error:
+            problems.append(f"torque could not be switched off: {error}")
+
     buses = [DynamixelBus(port, baudrate) for port in ports]
     try:
         for number, (bus, ids) in enumerate(zip(buses, ports.values(), strict=True)):
-            try:
+            with noting(HardwareError):
                 bus.open()
-                known = models[number] if models else _ask_models(bus, ids, problems)
-                numbers = dict(zip(ids, known, strict=True))
-                bus.attach_known({i: number for i, number in numbers.items() if number})
-            except HardwareError as error:
-                problems.append(f"torque could not be switched off: {error}")
+                known = dict(zip(ids, models[number], strict=True)) if models else {}
+                for servo_id in ids if not models else ():
+                    # one that does not answer keeps no other on
+                    with noting(ReplyError):
+                        known[servo_id] = bus.ping(servo_id).model_number
+                bus.attach_known(known)
         reached = [bus for bus in buses if bus.models]
         problem = BusGroup(reached).torque_off() if reached else None
     finally:
@@ -314,15 +313,3 @@ def emergency_stop(
     elif reached:
         problems.append("torque of the others is off" if problems else "torque is off")
     return "; ".join(dict.fromkeys(problems))
-
-
-def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> list[int]:
-    """Model numbers of the servos, 0 of those that do not answer, which is a problem more."""
-    models = []
-    for servo_id in ids:
-        try:
-            models.append(bus.ping(servo_id).model_number)
-        except ReplyError as error:
-            models.append(0)
-            problems.append(f"torque could not be switched off: {error}")
-    return models

@@ -20,18 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.buses.bus import BusGroup, Condition, States, servo_name
-from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.bus import Condition, States
+from elastic_env.hardware.buses.dynamixel_bus import BusGroup, DynamixelBus, servo_name
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
+from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.guard import Guard, exceeds, explain_heat
 from elastic_env.hardware.safety.processes import Channel, is_ending
-from elastic_env.hardware.safety.realtime import (
-    LONGEST_WAIT_S,
-    Priority,
-    prefer_realtime,
-    sleep_until,
-)
+from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.settings import SafetyLimits
 
 _REPLY_TIMEOUT_S = 0.003
@@ -54,7 +50,7 @@ class Supervisor:
         program: Process id of the program.
     """
 
-    def __init__(self, channel: Channel, buses: list[DynamixelBus], program: int) -> None:
+    def __init__(self, channel: Channel, buses: list[Any], program: int) -> None:
         self._channel = channel
         self._program = program
         self._buses = buses
@@ -84,9 +80,11 @@ class Supervisor:
 
     def _next_request(self) -> dict[str, Any] | None:
         """The next request; a program that hangs loses its torque meanwhile."""
-        while not self._channel.is_waiting(
-            None if self._guard is None else min(self._patience_s(), _GLANCE_S)
-        ):
+        while True:
+            is_moving = self._guard is not None
+            glance_s = min(self._patience_s(), _GLANCE_S) if is_moving else None
+            if self._channel.is_waiting(glance_s):
+                break
             if is_ending(self._program):
                 return None
             self._stop_if_hanging()
@@ -103,20 +101,13 @@ class Supervisor:
 
     def _stop_if_hanging(self) -> None:
         if self._guard is not None and self._patience_s() == 0.0:
-            self._stop(
-                f"no command for {1e3 * self._guard.limits.hang_s:.0f} ms: the program hangs"
-            )
+            hang_ms = 1e3 * self._guard.limits.hang_s
+            self._stop(f"no command for {hang_ms:.0f} ms: the program hangs")
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        actions = {
-            "attach": self._attach,
-            "enable": self._enable,
-            "exchange": self._exchange,
-            "read": self._read,
-            "disable": self._disable,
-        }
+        action = getattr(self, f"_{request['do']}")  # by a program of ours
         try:
-            return actions[request["do"]](**request["with"])
+            return action(**request["with"])
         except HardwareError as error:
             fault = error
             if self._guard is not None:  # torque is still on
@@ -125,15 +116,13 @@ class Supervisor:
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, servo_ids in zip(self._buses, ids, strict=True):
-            problems = [
-                f"{check.what} is {check.value}: {check.cure}"
-                for check in check_bus(bus, servo_ids)
-                if check.is_vital and not check.is_good
-            ]
-            if problems:
-                words = "; ".join(problems)
-                raise HardwareError(f"nothing can move at {bus.name} yet: {words}")
-        models = [list(bus.models.values()) for bus in self._buses]
+            checks = check_bus(bus, servo_ids)
+            bad = [check for check in checks if check.is_vital and not check.is_good]
+            if bad:
+                words = [f"{one.what} is {one.value}: {one.cure}" for one in bad]
+                listed = "; ".join(words)
+                raise HardwareError(f"nothing can move at {bus.name} yet: {listed}")
+        models = [bus.models.values() for bus in self._buses]
         return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
@@ -180,14 +169,16 @@ class Supervisor:
         """
         guard = self._require_motion()
         now = time.monotonic()
-        if exceeds(at - now, LONGEST_WAIT_S):
-            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
+        wait_s = at - now
+        if exceeds(wait_s, LONGEST_WAIT_S):
+            asked = f"asked for {wait_s:.3f} s"
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, {asked}")
         is_held = guard.is_holding
         elapsed_s = min(now - self._commanded_s, LONGEST_WAIT_S)
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
         self._servos.write_goals(allowed)
         self._commanded_s = now
-        sleep_until(at)
+        realtime.sleep_until(at)
         begin = time.monotonic()
         states = self._servos.read_states(_REPLY_TIMEOUT_S)
         reason = guard.check(states)
@@ -195,13 +186,8 @@ class Supervisor:
             fault = self._stop(reason)
             raise type(fault)(f"{fault}{self._explain_alerts(states)}")
         self._served_s = time.monotonic()
-        return {
-            **states.dump(),
-            "goals": allowed.tolist(),
-            "is_limited": is_limited.tolist(),
-            "is_held": is_held,
-            "late_s": begin - at,
-        }
+        commands = {"goals": allowed.tolist(), "is_limited": is_limited.tolist()}
+        return {**states.dump(), **commands, "is_held": is_held, "late_s": begin - at}
 
     def _read(self) -> dict[str, Any]:
         """States without any command; while torque is on this counts as none."""
@@ -224,7 +210,7 @@ class Supervisor:
 
     def _explain_alerts(self, states: States) -> str:
         """Hardware errors of the servos that raised the alert bit, in words."""
-        errors = []
+        errors: list[str] = []
         for number in np.flatnonzero(states.has_alert):
             bus, servo_id = self._servos.servos[number]
             try:
@@ -274,10 +260,9 @@ def require_ready(name: str, condition: Condition, limit_c: float) -> None:
         raise FaultError(f"{name} reports {condition.error}; {cure}")
     speed = abs(condition.velocity)
     if exceeds(speed, _REST_RAD_S):
-        raise FaultError(
-            f"{name} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g}"
-            " rad/s: wait until it hangs still, then try again"
-        )
+        moves = f"{name} moves at {speed:.2f} rad/s"
+        cure = f"below {_REST_RAD_S:g} rad/s: wait until it hangs still, then try again"
+        raise FaultError(f"{moves}; torque goes on at rest, {cure}")
     hottest = min(limit_c, condition.temperature_limit)
     if exceeds(condition.temperature, hottest):
         which = f"{name}: {condition.temperature:g}"
@@ -301,7 +286,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     for number in _SIGNALS:
         signal.signal(number, _end)
     # a thread for each of several buses
-    prefer_realtime(Priority.SUPERVISOR, with_threads=True)
+    realtime.prefer_realtime(realtime.Priority.SUPERVISOR, with_threads=True)
     buses = [DynamixelBus(port, baudrate) for port in ports]
     try:
         for bus in buses:

@@ -1,17 +1,18 @@
 """Pose of the end effector of a tree of hinges, for a batch of postures at once."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree import kernels
-from elastic_env.rigid.tree.links import Tree
+from elastic_env.rigid.tree.links import Held, Tree
 
 
 class EndEffector:
@@ -28,11 +29,7 @@ class EndEffector:
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        name: str,
-        held: Mapping[str, float] | None = None,
+        self, model: MjModel, joints: Sequence[str], name: str, held: Held | None = None
     ) -> None:
         self.body, self.place, R = _found(model, name)
         tree = Tree.of(model, joints, held or {})
@@ -41,8 +38,9 @@ class EndEffector:
             raise ConfigurationError(
                 f"end_effector {name!r} is on {model.body(self.body).name!r}, which no joint moves"
             )
-        self._chain[-1]["R"] = tree.R[self.body] @ R
-        self._chain[-1]["anchor"] = tree.place[self.body] + tree.R[self.body] @ self.place
+        R_lb = tree.R[self.body]
+        self._chain[-1]["R"] = R_lb @ R
+        self._chain[-1]["anchor"] = tree.place[self.body] + R_lb @ self.place
         self._n = len(joints)
         compile_now(self.pose, np.zeros((1, self._n)))
 
@@ -56,7 +54,8 @@ class EndEffector:
         position, _, axes, anchors = self._walked(q)
         moved, turned = np.zeros((2, len(position), 3, self._n))
         columns = self._chain["column"][:-1]
-        moved[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
+        levers = position[:, None] - anchors
+        moved[:, :, columns] = np.cross(axes, levers).swapaxes(1, 2)
         turned[:, :, columns] = axes.swapaxes(1, 2)
         shape = (*q.shape[:-1], 3, self._n)
         return moved.reshape(shape), turned.reshape(shape)
@@ -67,7 +66,8 @@ class EndEffector:
         found, R_found = self.pose(q)
         # of small angles the sine of the half angle is exact, the cosine is not
         half = np.linalg.norm(R_found - R_wanted, axis=(-2, -1)) / math.sqrt(8.0)
-        return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
+        angle = 2.0 * np.arcsin(np.minimum(half, 1.0))
+        return np.linalg.norm(found - wanted, axis=-1), angle
 
     def parts(self, q_ref: Array, q: Array) -> Array:
         r"""Error of the position that the deviation of each joint makes alone, to first order.
@@ -88,12 +88,13 @@ class EndEffector:
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
         count = len(rows)
         hinges = len(self._chain) - 1
-        made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
+        shapes = ((3,), (3, 3), (hinges, 3), (hinges, 3))
+        made = [np.empty((count, *shape)) for shape in shapes]
         kernels.poses(self._chain, rows, *made)
         return tuple(made)
 
 
-def outermost_body(model: mujoco.MjModel) -> str:
+def outermost_body(model: MjModel) -> str:
     """The named body with the most bodies between it and the base; the last of several.
 
     A body that no joint moves is none.
@@ -108,13 +109,12 @@ def outermost_body(model: mujoco.MjModel) -> str:
         moves[body] |= moves[model.body_parentid[body]]
     named = [body for body in np.flatnonzero(moves) if model.body(body).name]
     if not named:
-        raise ConfigurationError(
-            "no body of the model has a name; give one to the body that is the end effector"
-        )
+        cure = "give one to the body that is the end effector"
+        raise ConfigurationError(f"no body of the model has a name; {cure}")
     return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
 
 
-def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
+def _found(model: MjModel, name: str) -> tuple[int, Array, Array]:
     """Body of a site or body, place and orientation in it."""
     sites = {model.site(i).name: i for i in range(model.nsite)}
     bodies = {model.body(i).name: i for i in range(1, model.nbody)}
@@ -124,9 +124,8 @@ def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
         mujoco.mju_quat2Mat(R, model.site_quat[at])
         return int(model.site_bodyid[at]), model.site_pos[at].copy(), R.reshape(3, 3)
     if name not in bodies:
-        raise unknown_name(
-            "site or body for end_effector", name, [one for one in (*sites, *bodies) if one]
-        )
+        known = [one for one in (*sites, *bodies) if one]
+        raise unknown_name("site or body for end_effector", name, known)
     return bodies[name], np.zeros(3), np.eye(3)
 
 

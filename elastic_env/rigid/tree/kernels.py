@@ -47,6 +47,7 @@ BLOCK = 72
 of nine cache lines spreads it over that cache.
 """
 
+_VECTORS = ("up", "lever", "rate", "angular", "linear", "force", "moment")
 LINK = np.dtype(
     [
         ("parent", np.int64),
@@ -62,16 +63,8 @@ LINK = np.dtype(
         ("tip", np.int64),
         ("tip_R", np.float64, (3, 3)),
         ("tip_place", np.float64, (3,)),
-        ("carried", np.float64, (BLOCK,)),
-        ("cosine", np.float64, (BLOCK,)),
-        ("sine", np.float64, (BLOCK,)),
-        ("up", np.float64, (3, BLOCK)),
-        ("lever", np.float64, (3, BLOCK)),
-        ("rate", np.float64, (3, BLOCK)),
-        ("angular", np.float64, (3, BLOCK)),
-        ("linear", np.float64, (3, BLOCK)),
-        ("force", np.float64, (3, BLOCK)),
-        ("moment", np.float64, (3, BLOCK)),
+        *((name, np.float64, (BLOCK,)) for name in ("carried", "cosine", "sine")),
+        *((name, np.float64, (3, BLOCK)) for name in _VECTORS),
     ],
     align=True,
 )
@@ -128,7 +121,7 @@ def gravity_gradients(links: Any, loads: Any, q: Array, gradient: Array) -> None
 
 
 @compiled
-def solutions(links: Any, loads: Any, q: Array, stiffness: Array, torque: Array, x: Array) -> bool:
+def solutions(links: Any, loads: Any, q: Array, K: Array, torque: Array, x: Array) -> bool:
     """Solve (K + ∂τ_g/∂q) x = τ, leg by leg; Gauss' elimination with the largest pivot.
 
     Args:
@@ -136,7 +129,7 @@ def solutions(links: Any, loads: Any, q: Array, stiffness: Array, torque: Array,
             joints, whose columns follow one another.
         loads: See there.
         q: See there.
-        stiffness: K, (n,) [N·m/rad].
+        K: Stiffness, (n,) [N·m/rad].
         torque: τ, (rows, n) [N·m]; none for τ_g, (0, n).
         x: To be filled, (rows, n) [rad].
 
@@ -164,9 +157,9 @@ def solutions(links: Any, loads: Any, q: Array, stiffness: Array, torque: Array,
                 b = found[row, first : first + joints]
                 for i in range(joints):  # every row by its own stiffness
                     for k in range(joints):
-                        A[i, k] = gradient[first + i, first + k, row] / stiffness[first + i]
+                        A[i, k] = gradient[first + i, first + k, row] / K[first + i]
                     A[i, i] += 1.0
-                    b[i] /= stiffness[first + i]
+                    b[i] /= K[first + i]
                 solve(A, b)
                 for i in range(joints):
                     is_small = is_small and abs(b[i]) < math.pi
@@ -223,9 +216,8 @@ def local_frames(
             tip = links[i]["tip"]
             if tip >= 0:
                 place = links[i]["force"]
-                from_link = total(
-                    vector(links[i]["tip_place"]), times(matrix(links[i]["tip_R"]), vector(point))
-                )
+                from_tip = times(matrix(links[i]["tip_R"]), vector(point))
+                from_link = total(vector(links[i]["tip_place"]), from_tip)
                 for row in range(len(rows)):
                     put(place, row, from_link)
                 k = i
@@ -321,17 +313,10 @@ def poses(links: Any, q: Array, place: Array, R: Array, axes: Array, anchors: Ar
                 c = math.cos(angle)
                 s = math.sin(angle)
                 xx, xy, xz, yx, yy, yz, zx, zy, zz = turned
-                turned = (
-                    c * xx + s * xy,
-                    c * xy - s * xx,
-                    xz,
-                    c * yx + s * yy,
-                    c * yy - s * yx,
-                    yz,
-                    c * zx + s * zy,
-                    c * zy - s * zx,
-                    zz,
-                )
+                x = (c * xx + s * xy, c * xy - s * xx, xz)
+                y = (c * yx + s * yy, c * yy - s * yx, yz)
+                z = (c * zx + s * zy, c * zy - s * zx, zz)
+                turned = x + y + z
                 fill(axes[row, i], (xz, yz, zz))
                 fill(anchors[row, i], moved)
         fill(place[row], moved)
@@ -413,7 +398,8 @@ def carry(links: Any, rows: int, has_wrenches: bool) -> None:
             above["carried"][row] += carried
             if has_wrenches:
                 force = into_parent(R, c, s, at(link["force"], row))
-                moment = total(into_parent(R, c, s, at(link["moment"], row)), cross(anchor, force))
+                moment = into_parent(R, c, s, at(link["moment"], row))
+                moment = total(moment, cross(anchor, force))
                 put(above["force"], row, total(at(above["force"], row), force))
                 put(above["moment"], row, total(at(above["moment"], row), moment))
 
@@ -499,7 +485,8 @@ def differentiate(links: Any, has_wrenches: bool, rows: int, gradient: Array) ->
                 if has_wrenches:
                     moved = into_parent(R, c, s, at(force, row))
                     put(force, row, moved)
-                    moved = total(into_parent(R, c, s, at(moment, row)), cross(anchor, moved))
+                    lever = cross(anchor, moved)
+                    moved = total(into_parent(R, c, s, at(moment, row)), lever)
                     put(moment, row, moved)
                     gradient[before, column, row] += moved[2]
 
@@ -550,25 +537,17 @@ def move(links: Any, q_dot: Array, q_ddot: Array) -> None:
             turn = q_dot[row, column]
             rate = at(above["rate"], row)
             angular = at(above["angular"], row)
-            linear = into_link(
-                R, c, s, total(at(above["linear"], row), acceleration_of(anchor, rate, angular))
-            )
+            linear = acceleration_of(anchor, rate, angular)
+            linear = into_link(R, c, s, total(at(above["linear"], row), linear))
             x, y, z = into_link(R, c, s, rate)
-            angular = total(into_link(R, c, s, angular), (y * turn, -x * turn, q_ddot[row, column]))
+            own = (y * turn, -x * turn, q_ddot[row, column])
+            angular = total(into_link(R, c, s, angular), own)
             rate = (x, y, z + turn)
             put(link["rate"], row, rate)
             put(link["angular"], row, angular)
             put(link["linear"], row, linear)
             spun = acceleration_of(moment, rate, angular)
-            put(
-                link["force"],
-                row,
-                (
-                    mass * linear[0] + spun[0],
-                    mass * linear[1] + spun[1],
-                    mass * linear[2] + spun[2],
-                ),
-            )
+            put(link["force"], row, total(scale(mass, linear), spun))
             needed = total(times(inertia, angular), cross(rate, times(inertia, rate)))
             put(link["moment"], row, total(needed, cross(moment, linear)))
 
@@ -607,11 +586,9 @@ def into_parent(R: Matrix, c: float, s: float, v: Vector) -> Vector:
 @compiled
 def times(A: Matrix, v: Vector) -> Vector:
     """A v."""
-    return (
-        A[0] * v[0] + A[1] * v[1] + A[2] * v[2],
-        A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
-        A[6] * v[0] + A[7] * v[1] + A[8] * v[2],
-    )
+    x = A[0] * v[0] + A[1] * v[1] + A[2] * v[2]
+    y = A[3] * v[0] + A[4] * v[1] + A[5] * v[2]
+    return x, y, A[6] * v[0] + A[7] * v[1] + A[8] * v[2]
 
 
 @compiled
@@ -626,7 +603,9 @@ def product(A: Matrix, B: Matrix) -> Matrix:
 @compiled
 def cross(a: Vector, b: Vector) -> Vector:
     """A × b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    return x, y, a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
@@ -650,7 +629,9 @@ def vector(v: Array) -> Vector:
 @compiled
 def matrix(R: Array) -> Matrix:
     """A matrix out of its array, which leaves the compiler sure that nothing changes it."""
-    return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
+    x = R[0, 0], R[0, 1], R[0, 2]
+    y = R[1, 0], R[1, 1], R[1, 2]
+    return x + y + (R[2, 0], R[2, 1], R[2, 2])
 
 
 @compiled

@@ -10,6 +10,9 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.kernels import LINK
 
+Held = Mapping[str, float] | Mapping[int, float]
+"""Positions of joints that do not move, by name or number, a hinge [rad] or a slide [m]."""
+
 
 @dataclass(frozen=True)
 class Tree:
@@ -27,13 +30,7 @@ class Tree:
     R: Array
 
     @classmethod
-    def of(
-        cls,
-        model: mujoco.MjModel,
-        joints: Sequence[str],
-        held: Mapping[str, float] | Mapping[int, float],
-        root: int = 0,
-    ) -> Self:
+    def of(cls, model: mujoco.MjModel, joints: Sequence[str], held: Held, root: int = 0) -> Self:
         """Of a model whose other joints are held.
 
         Args:
@@ -48,9 +45,8 @@ class Tree:
         mujoco.mj_kinematics(model, data)  # all that moves is where it is drawn
         moving = sorted(model.joint(name).id for name in joints)
         carrier = _carriers(model, moving)
-        R_wl = np.stack(
-            [data.xmat[root].reshape(3, 3), *(_frame_about(data.xaxis[j]) for j in moving)]
-        )
+        frames = [_frame_about(data.xaxis[j]) for j in moving]
+        R_wl = np.stack([data.xmat[root].reshape(3, 3), *frames])
         p_wl = np.stack([data.xpos[root], *(data.xanchor[j] for j in moving)])
         R_lw = R_wl[carrier].transpose(0, 2, 1)
         links = _jointed(model, joints, moving, carrier)
@@ -80,12 +76,13 @@ def _carriers(model: mujoco.MjModel, moving: Sequence[int]) -> list[int]:
     last = {int(model.jnt_bodyid[j]): i for i, j in enumerate(moving, start=1)}
     carrier = [0]
     for body in range(1, model.nbody):
-        carrier.append(last[body] if body in last else carrier[model.body_parentid[body]])
+        of_parent = carrier[int(model.body_parentid[body])]
+        carrier.append(last.get(body, of_parent))
     return carrier
 
 
 def _jointed(
-    model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]
+    model: Any, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]
 ) -> Any:
     """Links that know their parents and their joints, without frames and masses."""
     links = np.zeros(1 + len(moving), LINK)
@@ -100,14 +97,14 @@ def _jointed(
 
 
 def _add(
-    link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0
+    link: Any, mass: float, com: Array, inertia: Array | float = 0.0, share: float = 1.0
 ) -> None:
     """Give a link a further mass, with its own inertia, and a share of its weight."""
     link["mass"] += mass
     link["mass_moment"] += mass * com
     link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))
-    link["weight"] += weight_share * mass
-    link["weight_moment"] += weight_share * mass * com
+    link["weight"] += share * mass
+    link["weight_moment"] += share * mass * com
 
 
 def _frame_about(axis: Array) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from elastic_env.rendering.picture import CAMERA, ModelPicture, Rgba, set_stage
+from elastic_env.rendering.picture import CAMERA, Picture, Rgba, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.robots.deviations import (
     HEIGHT,
@@ -27,7 +27,7 @@ _ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
 _LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", REFERENCE_WORD_RGBA))
 
 
-class TestbedPicture(ModelPicture):
+class TestbedPicture(Picture):
     """The testbed of Fig. 4: housing, rotor pointer, pendulum, and a translucent reference."""
 
     __test__ = False

@@ -17,7 +17,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.rendering.picture import ModelPicture
+from elastic_env.rendering.picture import Picture
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
@@ -135,7 +135,7 @@ def enlarge_posture(
     return Posture(pelvis[chosen], R[chosen], true.ankles, true.feet_R), float(factors[chosen])
 
 
-class WalkerPicture(ModelPicture):
+class WalkerPicture(Picture):
     """The walker with its plan, the ZMP and its reference.
 
     Args:
