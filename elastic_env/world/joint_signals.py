@@ -1,0 +1,40 @@
+"""Signals of every robot of elastic joints: its action, and what it observes of its joints."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from elastic_env.core.signals import Kind, Mirrored, SignalGroup, SignalTable
+
+ACTION_BOUND_RAD = 0.3
+"""Largest command offset [rad]."""
+
+_OBSERVED: Mapping[str, tuple[str, str, Kind]] = {
+    "encoder_angle": ("rad", "motor encoder, θ in whole counts", "measured"),
+    "encoder_rate": ("rad/s", "its change over the last control period", "measured"),
+    "reference_angle": ("rad", "q_ref at the end of the coming control period", "reference"),
+    "reference_rate": ("rad/s", "its rate", "reference"),
+    "reference_acceleration": ("rad/s²", "its acceleration", "reference"),
+    "last_command": ("rad", "θ_cmd of the last control period", "command"),
+}
+JOINT_COLUMNS = tuple(_OBSERVED)
+"""Groups of an observation that have a column for every joint."""
+
+
+def action_table(joints: Sequence[str]) -> SignalTable:
+    """The action: an offset for every joint."""
+    parts = dict.fromkeys(joints)
+    group = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", parts, "command")
+    ends = {"low": -ACTION_BOUND_RAD, "high": ACTION_BOUND_RAD}
+    return SignalTable(tuple(replace(own, **ends) for own in group.signals))
+
+
+def joint_groups(joints: Mapping[str, Mirrored | None]) -> dict[str, SignalGroup]:
+    """The groups `JOINT_COLUMNS` by name.
+
+    Args:
+        joints: In order, and what an angle of theirs is in the mirror.
+    """
+    return {
+        name: SignalGroup.of(name, unit, meaning, joints, kind)
+        for name, (unit, meaning, kind) in _OBSERVED.items()
+    }
