@@ -109,6 +109,7 @@ def helpers_killed(known: set[int], report: Callable[[int], None]) -> str:
     return "fine"
 
 
+@pytest.mark.slow
 def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path: Path) -> None:
     """Catches a call that fails, with an error of its connection, where a helper of the program
     is killed."""
@@ -267,7 +268,8 @@ policies: [uncompensated, input, dynamic]
 """
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EROFS, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
 def test_a_disk_that_takes_no_more_keeps_the_cells_before(
     code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,7 +10,7 @@ import pytest
 from elastic_env import JointRobot
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.rigid.tree.end_effector import EndEffector
+from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
 from tests.three_joints import ARM, rigid_arm
 from tests.trees import ORDER, TREE
 from train.commands.cli import main
@@ -66,6 +66,20 @@ def test_its_jacobian_is_that_of_mujoco(name: str) -> None:
         mujoco.mj_jac(model, data, jacp, jacr, expected_p, tool.body)
         np.testing.assert_allclose(moved, jacp[:, dofs], atol=1e-12)
         np.testing.assert_allclose(turned, jacr[:, dofs], atol=1e-12)
+
+
+def test_the_outermost_body_is_one_that_a_joint_moves() -> None:
+    """Catches a camera on a mast, further from the base than the hand that moves."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="hand"><joint name="one"/><geom size=".1"/></body>
+        <body name="mast"><body name="pan"><body name="camera"/></body></body></worldbody></mujoco>"""
+    )
+    assert outermost_body(model) == "hand"
+    mast = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="mast"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ConfigurationError, match="no body of the model"):
+        outermost_body(mast)
 
 
 def test_its_errors_are_those_of_mujoco() -> None:

@@ -254,7 +254,11 @@ def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "code", "said"), [("> /dev/full", 3, "No space left on device"), (">&-", 0, "")]
+    ("where", "code", "said"),
+    [
+        ("> /dev/full", 3, "No space left on device"),
+        pytest.param(">&-", 0, "", marks=pytest.mark.slow),
+    ],
 )
 def test_output_that_cannot_be_written_is_one_sentence(where: str, code: int, said: str) -> None:
     """Catches a traceback and "worse" where a log's disk is full, and a program that needs a
@@ -316,6 +320,7 @@ def limited(size: int) -> Callable[[], None]:
     return limit
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_grow_is_one_sentence(tmp_path: Path) -> None:
     """Catches a traceback wherever a comparison writes, and a code that says "worse"."""
     (tmp_path / "cells.yaml").write_text(COMPARISON.replace(', "mine.py:raises"', ""))
@@ -328,7 +333,11 @@ def test_a_file_that_cannot_grow_is_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")]
+    ("video", "said"),
+    [
+        pytest.param("x.gif", "File too large", marks=pytest.mark.slow),
+        ("x.mp4", "x.mp4 is not whole, 0 of"),
+    ],
 )
 def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_path: Path) -> None:
     """Catches an encoder that says nothing, and a writer that prints what it raises a second

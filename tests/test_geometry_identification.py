@@ -160,7 +160,13 @@ def made_up(
     return GeometryProblem(arm, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("options", [{"geometry": "dh"}, {"geometry": "full", "lateral": True}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"geometry": "dh"},
+        pytest.param({"geometry": "full", "lateral": True}, marks=pytest.mark.slow),
+    ],
+)
 def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, object]) -> None:
     """Of 95 % in at least 90 %: catches a wrong covariance, and a noise that is not estimated."""
     held = []

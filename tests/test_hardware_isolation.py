@@ -47,7 +47,7 @@ def plant(folder: Path) -> Path:
     return said
 
 
-@pytest.mark.parametrize("path", [None, f".{os.pathsep}"])
+@pytest.mark.parametrize("path", [pytest.param(None, marks=pytest.mark.slow), f".{os.pathsep}"])
 def test_nothing_of_the_working_directory_runs_in_a_child(
     path: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -470,6 +470,7 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
         _ = OnHardware(port="p", mounting=tmp_path).arguments
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "words"),
     [

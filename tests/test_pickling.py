@@ -60,7 +60,7 @@ def test_a_copy_in_the_midst_of_an_episode_goes_on_bit_for_bit(
     for _ in range(60):
         env.step(generator.uniform(-0.01, 0.01, env.action_space.shape).astype(np.float32))
     twin = COPIES[how](env)
-    for _ in range(500):
+    for _ in range(150):
         action = generator.uniform(-0.01, 0.01, env.action_space.shape).astype(np.float32)
         *mine, info = env.step(action)
         *same, other = twin.step(action)

@@ -1,6 +1,8 @@
 """Reference trajectories: derivatives against finite differences, bounds over many seeds, the
 paper's positions."""
 
+import tracemalloc
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.motion.arm_references import Poses
 from elastic_env.motion.references import (
     REFERENCES,
     Hold,
@@ -19,7 +22,7 @@ from elastic_env.motion.references import (
     Steps,
     make_reference,
 )
-from elastic_env.motion.trajectory import STAND_S, Plan, quintic
+from elastic_env.motion.trajectory import STAND_S, Motion, Plan, PlanTable, quintic
 
 PERIOD_S = 0.004
 ALL = {
@@ -357,3 +360,24 @@ def test_all_kinds_are_in_the_union() -> None:
     members = Reference.__origin__.__args__  # type: ignore[attr-defined]
     assert set(members) == set(REFERENCES.values())
     assert all(kind.model_fields["kind"].default == name for name, kind in REFERENCES.items())
+
+
+def test_motions_of_many_worlds_that_fill_the_memory_are_refused() -> None:
+    """Catches gigabytes of plans, one for each world, where one sentence is due."""
+    motion = Motion(partial(Multisine(duration_s=3600.0).about, np.zeros(6)), is_random=True)
+    assert len(PlanTable(motion, 0.05, 2).motion) == 2
+    with pytest.raises(ConfigurationError, match=r"64 motions of .* MB, at most 250 MB; take a"):
+        PlanTable(motion, 0.05, 64)
+
+
+def test_long_references_of_poses_need_memory_for_their_steps_alone() -> None:
+    """Catches a table of all steps by all poses, which grows with the square of the poses."""
+    poses = Poses(positions=900, move_s=0.5, settle_s=0.2, measure_s=0.1)
+    visits = np.random.default_rng(0).uniform(-1.0, 1.0, (901, 2))
+    tracemalloc.start()
+    plan = poses.through(visits, 0.01)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 40 * plan.q.nbytes
+    assert plan.rest.max() == 899
+    np.testing.assert_allclose(plan.q[plan.rest >= 0], visits[1:][plan.rest[plan.rest >= 0]])

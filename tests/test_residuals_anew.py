@@ -96,6 +96,7 @@ def test_an_unknown_residual_is_refused_before_hours_of_training() -> None:
         main(("testbed", "walker_3s_postur"))
 
 
+@pytest.mark.slow
 def test_the_program_speaks_and_ends_as_elastic_does() -> None:
     """Catches escapes of a terminal in what it says, and a closed pipe that is no exit code."""
     command = [sys.executable, "-m", "tests.residuals_anew"]

@@ -17,6 +17,8 @@ import elastic_env  # noqa: F401  registers the environment
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
+from elastic_env.robots.robot.joints import home_of_joints
+from elastic_env.world.robot_model import joint_ranges
 from tests.played import metrics_of
 from tests.trees import TREE
 from train.commands.cli import main
@@ -69,6 +71,19 @@ def test_held_joints_are_where_the_keyframe_has_them() -> None:
             np.testing.assert_allclose(
                 of_part.joint(name).qfrc_bias, data.joint(name).qfrc_bias, atol=1e-11
             )
+
+
+def test_a_limit_that_no_joint_reaches_is_none() -> None:
+    """Catches a home pose of 10¹¹ rad, a tenth of the range from the end of it."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><geom size=".1"/><joint name="one" range="-2 2e12"/>
+        <body pos="1 0 0"><geom size=".1"/><joint name="other" range="-2 2" axis="0 1 0"/></body>
+        </body></worldbody><compiler angle="radian"/></mujoco>"""
+    )
+    lowest, highest = joint_ranges(model, ["one", "other"])
+    assert lowest.tolist() == [-2.0, -2.0]
+    assert highest.tolist() == [np.inf, 2.0]
+    assert home_of_joints(model, ["one", "other"]).tolist() == [0.0, 0.0]
 
 
 def test_what_is_not_given_comes_from_the_model() -> None:

@@ -807,6 +807,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out == f"elastic-env {metadata.version('elastic-env')}\n"
 
 
+@pytest.mark.slow
 def test_output_that_nobody_reads_ends_as_by_sigpipe() -> None:
     """Catches a closed pipe that ends with 1, which is bench's "worse": rich ends the program so
     by itself."""
@@ -1066,7 +1067,8 @@ sys.meta_path.insert(0, Finder())
 
 
 @pytest.mark.parametrize(
-    ("how", "import_s", "wait_s"), [(signal.SIGINT, 2.0, 1.0), (signal.SIGKILL, 0.0, 2.0)]
+    ("how", "import_s", "wait_s"),
+    [(signal.SIGINT, 2.0, 1.0), pytest.param(signal.SIGKILL, 0.0, 2.0, marks=pytest.mark.slow)],
 )
 def test_a_comparison_that_ends_takes_its_workers_with_it(
     tmp_path: Path, how: signal.Signals, import_s: float, wait_s: float

@@ -565,15 +565,19 @@ def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> Non
     assert not trained & scored
 
 
+@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_train_command_trains_every_seed_and_resumes(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    jobs: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     """Catches a seed left out, seeds that differ side by side, policies without a player, a
     resume that begins anew."""
     monkeypatch.chdir(tmp_path)
     given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
     Path("c.yaml").write_text(yaml.safe_dump(given))
-    main(["train", "c.yaml", "--jobs", "2"])
+    main(["train", "c.yaml", "--jobs", jobs])
     Training(TrainConfig(**given), 4, tmp_path / "alone").run()
     for name, tensor in weights(tmp_path / "alone" / "last").items():
         np.testing.assert_array_equal(
@@ -590,17 +594,9 @@ def test_train_command_trains_every_seed_and_resumes(
     main(["train", "--resume", "runs/mine"])
     assert "runs/mine is complete" in capsys.readouterr().out
     assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
-    main(
-        [
-            "evaluate",
-            "--policy",
-            "residual:runs/mine/seed_3/last",
-            "--reference",
-            "sine",
-            "--output",
-            "e",
-        ]
-    )
+    policy = "residual:runs/mine/seed_3/last"
+    short = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
+    main(["evaluate", "--policy", policy, "--reference", short, "--output", "e"])
     with Path("e/episodes.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["link_error_rms_rad"]) > 0.0

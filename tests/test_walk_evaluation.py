@@ -54,7 +54,11 @@ TWO_STEPS = {"step_period": [0.3, 0.5, 0.3], "num_steps": 2}
 COMMAND_SHORT = "{step_period: [0.3, 0.5, 0.3], num_steps: 1}"
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
-COMPARISONS = [path for path in CONFIGS if path not in TRAININGS and path.stem != "bench"]
+COMPARISONS = [
+    pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith("map_"))
+    for path in CONFIGS
+    if path not in TRAININGS and path.stem != "bench"
+]
 HIP_ROLL = 1
 """Executors of the hip roll joint in a leg of six."""
 
@@ -499,7 +503,7 @@ def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
         assert ResidualVectorWrapper(env, config.base, **config.settings.model_dump()).num_envs == 2
 
 
-@pytest.mark.parametrize("path", COMPARISONS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", COMPARISONS)
 def test_configurations_that_come_with_it_are_valid(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

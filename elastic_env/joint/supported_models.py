@@ -382,7 +382,8 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         mujoco.mj_fullM(model, data, full)
         links = full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs])
         scale = np.sqrt(np.maximum(np.diag(links), np.finfo(np.float64).tiny))
-        scaled = links / np.outer(scale, scale)
+        with np.errstate(over="ignore"):
+            scaled = links / np.outer(scale, scale)
         if not np.isfinite(scaled).all():
             raise ConfigurationError(
                 "the masses and inertias of the model are too large; see their units"

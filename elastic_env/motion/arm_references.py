@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, require_known
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion import references
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import AnyReference, RepeatableReference
@@ -86,15 +86,14 @@ class _Drawn(RepeatableReference):
     seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    def _moved(self, visits: Array, since: Array) -> tuple[Array, Array, Array]:
-        """Motion between poses, (T, n) each, by the times since each began, (T, moves) [s]."""
-        blend, blend_dot, blend_ddot = quintic(since / self.move_s)
-        steps = np.diff(visits, axis=0)
-        return (
-            visits[0] + blend @ steps,
-            blend_dot @ steps / self.move_s,
-            blend_ddot @ steps / self.move_s**2,
-        )
+    def _moved(self, visits: Array, t: Array, period_s: float) -> tuple[Array, Array, Array]:
+        """Motion between poses, (T, n) each: one move at the beginning of each period."""
+        number = _numbers(t, period_s, self.positions)
+        share = (t - STAND_S - period_s * number) / self.move_s
+        blend, blend_dot, blend_ddot = (x[:, None] for x in quintic(share))
+        step = np.diff(visits, axis=0)[number]
+        q_dot = blend_dot * step / self.move_s
+        return visits[number] + blend * step, q_dot, blend_ddot * step / self.move_s**2
 
 
 class Poses(_Drawn):
@@ -116,11 +115,12 @@ class Poses(_Drawn):
         """A plan of all joints, (T, n), from the first pose through the others."""
         period = self.move_s + self.settle_s + self.measure_s
         t = control_times(STAND_S + self.positions * period, period_s)
-        since = t[:, None] - STAND_S - period * np.arange(self.positions)
+        number = _numbers(t, period, self.positions)
+        since = t - STAND_S - period * number
         settled = self.move_s + self.settle_s
-        at_rest = (since > settled + 1e-9) & (since <= settled + self.measure_s + 1e-9)
-        rest = np.where(at_rest.any(axis=1), at_rest.argmax(axis=1), -1)
-        return Plan(*self._moved(visits, since), rest >= 0, rest)
+        is_at_rest = (since > settled + 1e-9) & (since <= period + 1e-9)
+        rest = np.where(is_at_rest, number, -1)
+        return Plan(*self._moved(visits, t, period), is_at_rest, rest)
 
 
 class Moves(_Drawn):
@@ -133,8 +133,7 @@ class Moves(_Drawn):
     def through(self, visits: Array, period_s: float) -> Plan:
         """A plan of all joints, (T, n), from the first pose through the others."""
         t = control_times(STAND_S + self.positions * self.move_s, period_s)
-        since = t[:, None] - STAND_S - self.move_s * np.arange(self.positions)
-        return _scored(t, *self._moved(visits, since))
+        return _scored(t, *self._moved(visits, t, self.move_s))
 
 
 class _Path(RepeatableReference):
@@ -145,10 +144,9 @@ class _Path(RepeatableReference):
     repeats: int = quantity("1", 1, ge=1, le=100)
     """Number of ways there and back, or of turns [1]."""
 
-    def _along(
-        self, workspace: Workspace, place: Any, t: Array, s: Array, s_dot: Array, s_ddot: Array
-    ) -> Plan:
-        """Plan of joints whose tool moves by `place(s)` from its start, for a phase over time."""
+    def _along(self, workspace: Workspace, place: Any, t: Array, *phase: Array) -> Plan:
+        """Plan of joints whose tool moves by `place(s)` from its start, for s and its rates."""
+        s, s_dot, s_ddot = phase
         tool = workspace.end_effector
         if tool is None:
             raise ConfigurationError(
@@ -311,6 +309,12 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
             f" ±{_LARGEST_RAD:g} rad"
         )
     return list(names[1:]), rows
+
+
+def _numbers(t: Array, period_s: float, count: int) -> IntArray:
+    """Which of the moves each time belongs to, (T,): one begins at the end of the one before."""
+    past = np.ceil((t - STAND_S - 1e-9) / period_s) - 1.0
+    return past.clip(0, count - 1).astype(np.int64)
 
 
 def _scored(t: Array, q: Array, q_dot: Array, q_ddot: Array) -> Plan:

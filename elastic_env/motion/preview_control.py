@@ -106,7 +106,8 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
     steps, dimensions = zmp_ref.shape
     reach = len(gains.preview)
     held = np.repeat(zmp_ref[-1:], reach + 1, axis=0)
-    coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)  # coming[k] = r_{k+1} − r_k
+    # coming[k] = r_{k+1} − r_k
+    coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)
     state = np.zeros((3, dimensions))
     state[0] = start
     last = state

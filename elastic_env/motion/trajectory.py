@@ -110,6 +110,10 @@ class Motion:
     is_random: bool = False
 
 
+LARGEST_TABLE = 250_000_000
+"""Memory of the plans of all worlds [B]: 64 worlds of six joints for 100 s take a tenth."""
+
+
 class PlanTable:
     """Plans of all worlds as tables, one row per control step; one that repeats is held once.
 
@@ -117,6 +121,9 @@ class PlanTable:
         motion: Of all joints.
         control_period_s: Time between commands [s].
         num_worlds: How many.
+
+    Raises:
+        ConfigurationError: No step is scored, or the tables would take more than `LARGEST_TABLE`.
 
     Attributes:
         motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3,
@@ -136,8 +143,16 @@ class PlanTable:
                 f" period of {control_period_s} s; lengthen it"
             )
         plans = num_worlds if motion.is_random else 1
+        one = _stacked(probe)
+        size = plans * one.nbytes
+        if size > LARGEST_TABLE:
+            raise ConfigurationError(
+                f"{plans} motions of {self.num_steps} control steps take {size / 1e6:.0f} MB,"
+                f" at most {LARGEST_TABLE / 1e6:.0f} MB; take a shorter motion, fewer worlds or"
+                " episodes, or one motion for all by `seed`"
+            )
         self.plan_of_world = np.arange(num_worlds) % plans
-        self.motion = np.tile(_stacked(probe), (plans, 1, 1, 1))
+        self.motion = np.tile(one, (plans, 1, 1, 1))
         self.scored = probe.scored
         self.rest = probe.rest
 

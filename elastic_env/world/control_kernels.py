@@ -308,7 +308,8 @@ def sense_links(qpos: Array, qvel: Array, step: Any, links: Any, control: Any) -
         for i in range(len(step.at)):
             error = step.joints[world, i].truth.q_ref - step.joints[world, i].truth.q
             total += error * error
-        weights = links.constants[0].weights  # of penalties that grow without saturating
+        # of penalties that grow without saturating
+        weights = links.constants[0].weights
         scores.link_error = weights.link_error * -math.sqrt(total / len(step.at))
         scores.command_rate = weights.command_rate * -truth.command_rate
         scores.divergence = weights.divergence * (-1.0 if diverged[world] else -0.0)
@@ -750,7 +751,9 @@ def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: floa
 @compiled
 def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, float]:
     """Cross product of (x, y, z) with another vector."""
-    return y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0]
+    a = y * other[2] - z * other[1]
+    b = z * other[0] - x * other[2]
+    return a, b, x * other[1] - y * other[0]
 
 
 @within_compiled

@@ -21,7 +21,8 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
-from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
+from elastic_env.core.signals import Array, BoolArray, SignalGroup, SignalTable
+from elastic_env.world.joint_signals import Mirrors
 from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
 
@@ -58,12 +59,12 @@ class Sensor:
     unit: str
     meaning: str
     truth: Callable[[SensorInputs], Array]
-    axes: Mapping[str, Mirrored] | None = None
+    axes: Mirrors | None = None
     noise: float = 0.0
     offset: float = 0.0
     is_encoder: bool = False
 
-    def group(self, name: str, joints: Mapping[str, Mirrored | None]) -> SignalGroup:
+    def group(self, name: str, joints: Mirrors) -> SignalGroup:
         """Its columns, of a robot with these joints and what their angles are in the mirror."""
         parts = self.axes or joints
         return SignalGroup.of(name, self.unit, self.meaning, parts, "measured")
@@ -124,7 +125,7 @@ class FurtherSensors:
     def __init__(
         self,
         names: Sequence[str],
-        joints: Mapping[str, Mirrored | None],
+        joints: Mirrors,
         scenarios: Sequence[Scenario],
         counts_per_turn: int | None,
     ) -> None:

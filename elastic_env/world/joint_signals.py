@@ -2,8 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 from elastic_env.core.signals import Kind, Mirrored, SignalGroup, SignalTable
+
+Mirrors: TypeAlias = Mapping[str, Mirrored | None]
+"""Joints in order, and what an angle of each is in the mirror."""
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
@@ -28,12 +32,8 @@ def action_table(joints: Sequence[str]) -> SignalTable:
     return SignalTable(tuple(replace(own, **ends) for own in group.signals))
 
 
-def joint_groups(joints: Mapping[str, Mirrored | None]) -> dict[str, SignalGroup]:
-    """The groups `JOINT_COLUMNS` by name.
-
-    Args:
-        joints: In order, and what an angle of theirs is in the mirror.
-    """
+def joint_groups(joints: Mirrors) -> dict[str, SignalGroup]:
+    """The groups `JOINT_COLUMNS` by name."""
     return {
         name: SignalGroup.of(name, unit, meaning, joints, kind)
         for name, (unit, meaning, kind) in _OBSERVED.items()

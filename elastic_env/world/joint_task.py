@@ -184,6 +184,8 @@ class JointTask(Task):
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
         metrics = METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL
+        if plant.end_effector is not None:
+            metrics = metrics + METRICS_OF_TOOL
         require_stable(stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
@@ -195,7 +197,7 @@ class JointTask(Task):
             sensors=[name for name in config.sensors if name != LINK_IMU_SENSOR],
             joints=dict.fromkeys(joints),
             scenarios=[scenario] * num_worlds,
-            metrics=metrics if plant.end_effector is None else metrics + METRICS_OF_TOOL,
+            metrics=metrics,
             kinds=[(counts, False), (counts, True)],
         )
         self._plant = plant

@@ -74,7 +74,8 @@ class RestWatch:
         ended = (rest >= 0) & is_last
         self._window = np.where(ended, -1, rest)
         if ended.any():
-            self._judge(joints["q_ref"][ended], (self._most - self._least)[:, ended], rest[ended])
+            moved = (self._most - self._least)[:, ended]
+            self._judge(joints["q_ref"][ended], moved, rest[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
         """Warn of windows that end.

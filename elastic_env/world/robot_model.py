@@ -20,6 +20,7 @@ from elastic_env.rigid.biped import Biped
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Key of K in an identification file."""
+_UNLIMITED_RAD = 200.0 * np.pi
 
 
 def _of_joints(parameter: str) -> Any:
@@ -152,10 +153,14 @@ def with_stiffness(
 
 
 def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, Array]:
-    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit."""
+    """Lowest and highest angle of every joint, (n,) each [rad]; infinite without a limit.
+
+    A limit of more than a hundred turns, as exporters write it for a joint without one, is none.
+    """
     at = [model.joint(name).id for name in joints]
-    limited = model.jnt_limited[at].astype(bool)[:, None]
-    lowest, highest = np.where(limited, model.jnt_range[at], [-np.inf, np.inf]).T
+    limits = model.jnt_range[at]
+    limited = model.jnt_limited[at].astype(bool)[:, None] & (np.abs(limits) < _UNLIMITED_RAD)
+    lowest, highest = np.where(limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
 
@@ -177,7 +182,8 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
         try:
-            if any(isinstance(item, str | bool) for item in value):  # NumPy would convert them
+            # NumPy would convert them
+            if any(isinstance(item, str | bool) for item in value):
                 raise TypeError
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):

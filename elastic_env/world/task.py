@@ -7,7 +7,7 @@ blocks of records, from which signals and metrics are made when they are needed.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,12 +20,13 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
 from elastic_env.core.robot_ranges import DrawnRobot
-from elastic_env.core.signals import Array, BoolArray, Mirrored, Signal, Signals, SignalTable
+from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.further_sensors import ACCELEROMETER, FurtherSensors, SensorInputs
-from elastic_env.world.joint_signals import JOINT_COLUMNS, action_table
+from elastic_env.world import further_sensors as further
+from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.joint_signals import JOINT_COLUMNS, Mirrors, action_table
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
 from elastic_env.world.robot_model import RobotModel
@@ -107,7 +108,7 @@ class Task(ABC):
         motion: Motion,
         table: Sequence[Signal],
         sensors: Sequence[str],
-        joints: Mapping[str, Mirrored | None],
+        joints: Mirrors,
         scenarios: Sequence[Scenario],
         metrics: Sequence[Metric],
         kinds: Sequence[tuple[int | None, bool]],
@@ -170,7 +171,8 @@ class Task(ABC):
         self.simulation = own
         self._is_scalar = is_scalar
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
-        if simulation is not None:  # scoring many takes 2 ms, half a control period of hardware
+        # scoring many takes 2 ms, half a control period of hardware
+        if simulation is not None:
             self._steps_at_once = _FEWEST_STEPS
         compile_now(self._rehearse)
 
@@ -391,8 +393,8 @@ class Task(ABC):
         """The truth that further sensors need; the specific force lags one physics step behind."""
         truth = self._joints[self._row]["truth"]
         force = np.full((self.num_worlds, 3), np.nan)
-        if ACCELEROMETER in self.config.sensors:
-            begin = int(self.model.sensor(ACCELEROMETER).adr[0])
+        if further.ACCELEROMETER in self.config.sensors:
+            begin = int(self.model.sensor(further.ACCELEROMETER).adr[0])
             force = self.simulation.bind("sensordata")[:, begin : begin + 3].copy()
         return SensorInputs(truth["q"].copy(), spring_torque(truth), force)
 
@@ -454,7 +456,8 @@ class Task(ABC):
             kind = given.dtype
             return ActionError(f"an action must be real numbers, {bounds}, got an array of {kind}")
         if given.shape != shape:
-            first = int(self._is_scalar)  # a scalar environment adds the axis of worlds itself
+            # a scalar environment adds the axis of worlds itself
+            first = int(self._is_scalar)
             needed = f"shape {shape[first:]} [rad], {bounds}"
             return ActionError(f"an action must have {needed}; got shape {given.shape[first:]}")
         world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]

@@ -94,15 +94,19 @@ class EndEffector:
 
 
 def outermost_body(model: mujoco.MjModel) -> str:
-    """The named body that has the most bodies between it and the base; the last of several.
+    """The named body with the most bodies between it and the base; the last of several.
+
+    A body that no joint moves is none.
 
     Raises:
-        ConfigurationError: No body has a name.
+        ConfigurationError: No body that a joint moves has a name.
     """
     depth = np.zeros(model.nbody, dtype=np.int64)
+    moves = model.body_jntnum > 0
     for body in range(1, model.nbody):
         depth[body] = depth[model.body_parentid[body]] + 1
-    named = [body for body in range(1, model.nbody) if model.body(body).name]
+        moves[body] |= moves[model.body_parentid[body]]
+    named = [body for body in np.flatnonzero(moves) if model.body(body).name]
     if not named:
         raise ConfigurationError(
             "no body of the model has a name; give one to the body that is the end effector"

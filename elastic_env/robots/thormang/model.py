@@ -104,7 +104,8 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0  # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    spec.option.impratio = 10.0
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
     for row in read_rows("legs.csv"):
@@ -132,7 +133,8 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
-    floor = spec.worldbody.add_body(name="floor")  # a body of its own, so that it can be tilted
+    # a body of its own, so that it can be tilted
+    floor = spec.worldbody.add_body(name="floor")
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor.add_geom(name="floor", type=plane, size=[0.0, 0.0, 0.05])
     return spec
@@ -156,7 +158,8 @@ def elastic_spec(
     spec.option.timestep = timestep_s
     for side in SIDES:
         for name in ("FORCE", "TORQUE"):
-            sensor = spec.add_sensor(name=f"{side}_{name.lower()}", objname=f"{side}_ft")
+            sensor = spec.add_sensor(name=f"{side}_{name.lower()}")
+            sensor.objname = f"{side}_ft"
             sensor.type = getattr(mujoco.mjtSensor, f"mjSENS_{name}")
             sensor.objtype = mujoco.mjtObj.mjOBJ_SITE
     return spec

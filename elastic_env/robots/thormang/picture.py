@@ -111,7 +111,8 @@ def enlarge_posture(
     factors = np.linspace(largest, 1.0, _NUM_FACTORS)
     origin = planned.pelvis + shares(np.asarray(share)) @ (true.ankles - planned.ankles)
     pelvis = origin + factors[:, None] * (true.pelvis - origin)
-    from scipy.spatial.transform import Rotation  # takes a quarter of a second, and few draw
+    # takes a quarter of a second, and few draw
+    from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_matrix(true.R).as_rotvec()
     R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix()
@@ -177,8 +178,9 @@ class WalkerPicture(ModelPicture):
         roll = f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad"
         pitch = f"pitch {1e3 * now['pelvis_pitch']:+6.1f} mrad"
         factor = f"tilt and shift of the pelvis drawn x {self._factor:.2g}"
-        parts = ([f"t = {now['time_s']:6.2f} s", _phase(now), *failures], [roll, pitch, zmp])
-        return ["     ".join(line) for line in (*parts, [factor, "feet and ZMP to scale"])]
+        first = [f"t = {now['time_s']:6.2f} s", _phase(now), *failures]
+        lines = (first, [roll, pitch, zmp], [factor, "feet and ZMP to scale"])
+        return ["     ".join(line) for line in lines]
 
     def _place(self, prefix: str, posture: Posture, robot: Biped) -> None:
         """Bring one of the two robots into a posture."""

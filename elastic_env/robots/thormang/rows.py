@@ -23,7 +23,8 @@ TRUTH = record_type(
     ("pitch", REAL),
     ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
     ("ankles", REAL, (2, 3)),  # positions [m]
-    ("wrench", REAL, _FEET_WRENCH),  # of the feet on the legs, in the frames of the feet [N], [N·m]
+    # of the feet on the legs, in the frames of the feet [N], [N·m]
+    ("wrench", REAL, _FEET_WRENCH),
     ("force", REAL, 2),  # vertical force of the ground on the feet [N]
     ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
     # step of the first touch in the second half of the swing, -1 before it

@@ -18,6 +18,7 @@ JOINTS: Mapping[str, Mirrored] = {
 
 _ALONG: Mapping[str, Mirrored] = {"x": "same", "y": "opposite", "z": "same"}
 _ABOUT: Mapping[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
+_TURNS: Mapping[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
 _WHERE = "in the frame of the foot, at the ankle"
 _of = SignalGroup.of
 _of_joints = joint_groups(JOINTS)
@@ -33,9 +34,11 @@ _wrenches = tuple(
     for what, unit, axes in (("force", "N", _ALONG), ("moment", "N·m", _ABOUT))
     for axis, mirrored in axes.items()
 )
+_TIME = "end of the coming control period, from the start of the walk plan"
+_SWING = "progress of the swing, 0 before lift-off, 1 after touch-down"
 _CLOCK: Mapping[str, tuple[str, str, Mirrored]] = {
-    "time": ("s", "end of the coming control period, from the start of the walk plan", "same"),
-    "swing": ("1", "progress of the swing, 0 before lift-off, 1 after touch-down", "same"),
+    "time": ("s", _TIME, "same"),
+    "swing": ("1", _SWING, "same"),
     "support": ("1", "support foot of the step, 0 left, 1 right", "complement"),
 }
 _clock = tuple(
@@ -50,7 +53,7 @@ _zmp = "reference of the ZMP along {part}"
 GROUPS = (
     _of_joints["encoder_angle"],
     _of_joints["encoder_rate"],
-    _of("imu_attitude", "rad", _attitude, {"roll": "opposite", "pitch": "same"}, "measured"),
+    _of("imu_attitude", "rad", _attitude, _TURNS, "measured"),
     _of("imu_rate", "rad/s", _rate, _ABOUT, "measured"),
     SignalGroup("wrench", _wrenches, shape=(2, 2, 3)),
     _of_joints["reference_angle"],

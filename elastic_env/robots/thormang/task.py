@@ -136,7 +136,8 @@ class _Kind:
     @property
     def fits(self) -> list[tuple[bool, bool]]:
         """Pairs (measurements are delayed, IMU is inertial) that robots of the bank have."""
-        return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
+        pairs = [(robot.is_delayed, robot.is_inertial) for robot in self.bank]
+        return list(dict.fromkeys(pairs))
 
 
 class WalkTask(Task):
@@ -297,8 +298,8 @@ class WalkTask(Task):
     @property
     def _walker(self) -> tuple[Any, ...]:
         """`kernels.Walker`."""
-        constants = self._walk_constants
-        return constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
+        fixed = (self._walk_constants, self._plan_rows)
+        return (*fixed, self._bias, self._inertial, self._walk_columns)
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         truth = worlds["truth"]
@@ -459,4 +460,5 @@ def highest(values: Array) -> Array:
 
 def rms(values: Array) -> Array:
     """Root of the mean square over the last axis of (n, m)."""
-    return kernels.rms_of_rows(np.array(values, order="C"))  # of one kind, for which it is compiled
+    # of one kind, for which it is compiled
+    return kernels.rms_of_rows(np.array(values, order="C"))
