@@ -2,6 +2,7 @@
 paper's positions."""
 
 import tracemalloc
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from elastic_env.core.signals import Array
 from elastic_env.motion.arm_references import Poses
 from elastic_env.motion.references import (
     REFERENCES,
-    AboutHome,
     Hold,
     Multisine,
     Reference,
@@ -22,7 +22,7 @@ from elastic_env.motion.references import (
     Steps,
     make_reference,
 )
-from elastic_env.motion.trajectory import STAND_S, Plan, PlanTable, quintic
+from elastic_env.motion.trajectory import STAND_S, Motion, Plan, PlanTable, quintic
 
 PERIOD_S = 0.004
 ALL = {
@@ -364,7 +364,7 @@ def test_all_kinds_are_in_the_union() -> None:
 
 def test_motions_of_many_worlds_that_fill_the_memory_are_refused() -> None:
     """Catches gigabytes of plans, one for each world, where one sentence is due."""
-    motion = AboutHome(Multisine(duration_s=3600.0), np.zeros(6))
+    motion = Motion(partial(Multisine(duration_s=3600.0).about, np.zeros(6)), is_random=True)
     assert len(PlanTable(motion, 0.05, 2).motion) == 2
     with pytest.raises(ConfigurationError, match=r"64 motions of .* MB, at most 250 MB; take a"):
         PlanTable(motion, 0.05, 64)

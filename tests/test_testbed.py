@@ -21,7 +21,7 @@ from elastic_env.joint.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
 from elastic_env.joint.elasticity import Servo
 from elastic_env.motion.references import Hold, Sine
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.robots.testbed import task as testbed
+from elastic_env.robots.testbed import environment as testbed
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import make as make_testbed
 from elastic_env.robots.testbed.environment import make_vector as make_testbed_vector
@@ -940,7 +940,7 @@ def test_a_wrong_configuration_names_parameter_unit_and_bound(
     """Catches errors of nested models that lose the name, the unit or the choices on their way
     up."""
     with pytest.raises(ConfigurationError, match=message):
-        testbed.TestbedTask(TestbedConfig(**values), 1)
+        testbed.JointTask(TestbedConfig(**values), 1)
 
 
 def test_stiffness_can_come_from_an_identification(tmp_path: Path) -> None:

@@ -12,14 +12,7 @@ from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    ValidationError,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
@@ -78,15 +71,13 @@ def _with_strict_numbers(schema: Any) -> Any:
         key: part if key in of_values else _with_strict_numbers(part)
         for key, part in schema.items()
     }
-    convert = {
-        "float": plain_numbers,
-        "int": _whole,
-        "list": plain_numbers,
-        "tuple": plain_numbers,
-    }.get(own.get("type"))
-    if own.get("type") in ("float", "int"):
+    kind = own.get("type")
+    if kind in ("float", "int"):
         own["strict"] = True
-    return own if convert is None else no_info_before_validator_function(convert, own)
+    if kind not in ("float", "int", "list", "tuple"):
+        return own
+    convert = _whole if kind == "int" else plain_numbers
+    return no_info_before_validator_function(convert, own)
 
 
 def _whole(value: Any) -> Any:
@@ -127,7 +118,7 @@ class Model(BaseModel):
                 field.description = "\n\n".join(lines)
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> CoreSchema:
         """Pydantic's schema with strict numbers."""
         return _with_strict_numbers(handler(source))
 

@@ -130,8 +130,7 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             choices = choices_listed(path[-1], model.model_fields)
             return Problem(path, "unknown", choices)
         case "missing":
-            description = field.description if field is not None else None
-            meaning = f": {description}" if description else ""
+            meaning = f": {field.description}" if field and field.description else ""
             return Problem(path, "missing", f"{_unit(field)}{meaning}")
         case "value_error":
             return Problem(path, "rule", str(problem["ctx"]["error"]))
@@ -139,14 +138,12 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
     context = problem.get("ctx", {})
+    requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
+    if kind := _REQUIREMENTS.get(problem["type"]):
+        entries = "entry" if 1 in context.values() else "entries"
+        requirement = kind.format(entries=entries, **context)
     if bounds := _bounds(field):
         requirement = f"be {bounds}"
-    elif kind := _REQUIREMENTS.get(problem["type"]):
-        requirement = kind.format(
-            entries="entry" if 1 in context.values() else "entries", **context
-        )
-    else:
-        requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
     meaning = meaning_of(field) if field is not None else ""
     text = f"must {requirement}{_unit(field)}, got {given}"
     return Problem(path, "must", f"{text} ({meaning})" if meaning else text)

@@ -6,8 +6,8 @@ import math
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ _CURE = "use commas, and points in numbers"
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Numbers under names.
 
     Attributes:
@@ -55,9 +54,8 @@ def read_table(file: Path, *, what: str, row: str, most_rows: int, example: str)
     try:
         text = read_bounded(file, LARGEST_BYTES).decode("utf-8-sig")
         if max(map(len, io.StringIO(text)), default=0) > _LONGEST_LINE:
-            raise ConfigurationError(
-                f"{shorten(file)} must have lines of at most {_LONGEST_LINE} characters; is it CSV?"
-            )
+            bound = f"lines of at most {_LONGEST_LINE} characters"
+            raise ConfigurationError(f"{shorten(file)} must have {bound}; is it CSV?")
         return _parse(file, text, row, most_rows, example)
     except ConfigurationError:
         raise
@@ -81,9 +79,8 @@ def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Tab
     filled = (cells for cells in lines if any(cell.strip() for cell in cells))
     header = next(filled, None)
     if header is None:
-        raise ConfigurationError(
-            f"{shorten(file)} is empty; its first line must name columns such as {example}"
-        )
+        needed = f"its first line must name columns such as {example}"
+        raise ConfigurationError(f"{shorten(file)} is empty; {needed}")
     names = _names(file, header)
     values = array("d")
     count = 0
@@ -92,10 +89,9 @@ def _parse(file: Path, text: str, row: str, most_rows: int, example: str) -> Tab
             break
         values.extend(_numbers(shorten(file), f"{row} {count}", names, cells))
     if not 0 < count <= most_rows:
-        more = f"more than {most_rows}" if count else "0"
-        raise ConfigurationError(
-            f"{shorten(file)} must have 1 to {most_rows} {row}s, a line each, it has {more}"
-        )
+        has = f"more than {most_rows}" if count else "0"
+        needed = f"1 to {most_rows} {row}s, a line each"
+        raise ConfigurationError(f"{shorten(file)} must have {needed}, it has {has}")
     rows = np.array(values, dtype=np.float64)
     return Table(names, rows.reshape(count, len(names)))
 
@@ -107,23 +103,19 @@ def _names(file: Path, header: list[str]) -> tuple[str, ...]:
         ConfigurationError: They are not separated by commas, too many, or not each once.
     """
     names = tuple(cell.strip() for cell in header)
-    if len(names) == 1 and (called := _separators(header)):
-        raise ConfigurationError(
-            f"the columns of {shorten(file)} are separated by {called}; {_CURE}"
-        )
-    if len(names) > MOST_COLUMNS:
-        raise ConfigurationError(
-            f"{shorten(file)} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
-        )
-    if "" in names:
-        raise ConfigurationError(
-            f"column {names.index('') + 1} of {shorten(file)} has no name; give it one"
-        )
+    table = shorten(file)
     name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise ConfigurationError(
-            f"{shorten(file)} has the column {quote(name)[1:-1]} twice; keep one of them"
-        )
+    problem = None
+    if len(names) == 1 and (called := _separators(header)):
+        problem = f"the columns of {table} are separated by {called}; {_CURE}"
+    elif len(names) > MOST_COLUMNS:
+        problem = f"{table} must have at most {MOST_COLUMNS} columns, it has {len(names)}"
+    elif "" in names:
+        problem = f"column {names.index('') + 1} of {table} has no name; give it one"
+    elif count > 1:
+        problem = f"{table} has the column {quote(name)[1:-1]} twice; keep one of them"
+    if problem is not None:
+        raise ConfigurationError(problem)
     return names
 
 

@@ -18,22 +18,19 @@ def parse_json(text: str) -> Any:
             number that is not finite or too long, or text with zero bytes.
     """
     if len(text) > LARGEST_JSON:
-        raise ValueError(f"it must have at most {LARGEST_JSON} characters, got {len(text)}")
+        bound = f"at most {LARGEST_JSON} characters"
+        raise ValueError(f"it must have {bound}, got {len(text)}")
+    numbers = {"parse_int": _whole, "parse_float": _real, "parse_constant": _real}
     try:
-        content = json.loads(
-            text,
-            parse_int=_whole,
-            parse_float=_real,
-            parse_constant=_real,
-            object_pairs_hook=_mapping,
-        )
+        content = json.loads(text, object_pairs_hook=_mapping, **numbers)
     except RecursionError:
         raise _TOO_DEEP from None
     _require_plain(content, 0)
     return content
 
 
-_TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NESTING} deep")
+_BOUND = f"at most {DEEPEST_NESTING} deep"
+_TOO_DEEP = ValueError(f"mappings and lists must be nested {_BOUND}")
 
 
 def _whole(text: str) -> int:

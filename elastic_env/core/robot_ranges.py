@@ -88,18 +88,13 @@ class RobotRanges(Model):
     def on_fixed_base(self) -> Self:
         """The same without what only a walker has: load and push on the torso, floor, its IMU."""
         of_walkers = ("load_", "slope_rad", "push_n", "inertial_share")
-        return self.replace(
-            **{
-                name: field.default
-                for name, field in type(self).model_fields.items()
-                if name.startswith(of_walkers)
-            }
-        )
+        fields = type(self).model_fields
+        left_out = [name for name in fields if name.startswith(of_walkers)]
+        return self.replace(**{name: fields[name].default for name in left_out})
 
     def intervals(self) -> Iterator[tuple[str, Interval]]:
         """Quantities with an interval, by name."""
-        for name in type(self).model_fields:
-            value = getattr(self, name)
+        for name, value in self:
             if isinstance(value, tuple):
                 yield name, value
 
@@ -136,9 +131,10 @@ class DrawnRobot:
     def record(self) -> dict[str, float]:
         """The robot in figures, by name with unit, for the records of episodes."""
         roll, pitch = self.mounting_rad
+        homing_rad = np.sqrt(np.mean(np.square(self.homing_rad)))
         of_several = {
             "stiffness": {"stiffness": np.mean(self.stiffness)},
-            "homing_rad": {"homing_rms_rad": np.sqrt(np.mean(np.square(self.homing_rad)))},
+            "homing_rad": {"homing_rms_rad": homing_rad},
             "mounting_rad": {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch},
         }
         return {
@@ -183,16 +179,8 @@ def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -
     return points
 
 
-_OF_ONE = (
-    "damping",
-    "friction",
-    "backlash_rad",
-    "load_kg",
-    "load_x_m",
-    "load_y_m",
-    "load_z_m",
-    "slope_rad",
-)
+_LOAD = ("load_kg", "load_x_m", "load_y_m", "load_z_m")
+_OF_ONE = ("damping", "friction", "backlash_rad", *_LOAD, "slope_rad")
 """Quantities of which a robot has one value, under the name of their range."""
 
 
@@ -202,10 +190,10 @@ def _draw(
     """Robots of one set of ranges."""
     width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2}
     names = [*RobotRanges.model_fields, "slope_direction"]
-    unit = {
-        name: latin_hypercube(number, width.get(name, 1), np.random.default_rng([*seed, index]))
-        for index, name in enumerate(names)
-    }
+    unit: dict[str, Array] = {}
+    for index, name in enumerate(names):
+        generator = np.random.default_rng([*seed, index])
+        unit[name] = latin_hypercube(number, width.get(name, 1), generator)
     # not low + u (high - low), which may end beyond high by rounding
     drawn = {
         name: np.clip(low + unit[name] * (high - low), low, high)

@@ -1,6 +1,6 @@
 """Named arrays that know their units: the columns of observations and actions."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, TypeAlias
 
@@ -52,14 +52,11 @@ class SignalGroup:
         name: Of the field. Its columns are called `name.part`, a single one has the name alone.
         signals: Its columns.
         shape: Of the field.
-        noise: Standard deviation of each column in a scenario, one number or all; None for what no
-            sensor shows.
     """
 
     name: str
     signals: tuple[Signal, ...]
     shape: tuple[int, ...]
-    noise: Callable[[Any], Parameter] | None = None
 
     @classmethod
     def of(
@@ -69,7 +66,6 @@ class SignalGroup:
         meaning: str,
         parts: Mapping[str, Mirrored | None],
         kind: Kind,
-        **further: Any,
     ) -> Self:
         """A group of one unit.
 
@@ -79,19 +75,13 @@ class SignalGroup:
             meaning: Of a column, which may name its {part}.
             parts: Names of the columns, and what each is in the mirror.
             kind: See `Signal`.
-            **further: Other attributes.
         """
+        names = [f"{name}.{part}" for part in parts] if len(parts) > 1 else [name]
         signals = tuple(
-            Signal(
-                f"{name}.{part}" if len(parts) > 1 else name,
-                unit,
-                meaning.format(part=part),
-                kind=kind,
-                mirrored=mirrored,
-            )
-            for part, mirrored in parts.items()
+            Signal(own, unit, meaning.format(part=part), kind=kind, mirrored=mirrored)
+            for own, (part, mirrored) in zip(names, parts.items(), strict=True)
         )
-        return cls(name, signals, **{"shape": (len(signals),), **further})
+        return cls(name, signals, (len(signals),))
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,8 @@ class _Loader(Composer, yaml.CSafeLoader):
         _require_plain(event)
         self._depth += 1
         if self._depth > DEEPEST_NESTING:
-            problem = f"mappings and lists must be nested at most {DEEPEST_NESTING} deep"
-            raise _refusal(event, problem)
+            bound = f"at most {DEEPEST_NESTING} deep"
+            raise _refusal(event, f"mappings and lists must be nested {bound}")
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.MappingNode):
@@ -67,10 +67,8 @@ class _Loader(Composer, yaml.CSafeLoader):
         size = 1 + sum(self._sizes[id(part)] for part in _parts(node))
         self._sizes[id(node)] = size
         if size > MOST_VALUES:
-            raise _refusal(
-                event,
-                f"it must hold at most {MOST_VALUES} values, aliases counted in full",
-            )
+            bound = f"at most {MOST_VALUES} values"
+            raise _refusal(event, f"it must hold {bound}, aliases counted in full")
         return node
 
     def construct_number(self, node: Any) -> int | float:
@@ -84,9 +82,8 @@ class _Loader(Composer, yaml.CSafeLoader):
                 return self.construct_yaml_int(node)
             return self.construct_yaml_float(node)
         except ValueError:
-            raise _refusal(
-                node, f"{text!r} is no number; put text that looks like one in quotes"
-            ) from None
+            cure = "put text that looks like one in quotes"
+            raise _refusal(node, f"{text!r} is no number; {cure}") from None
 
 
 _Loader.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
@@ -167,13 +164,8 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
     """
     # None: flow style for what holds no mapping or list
     flow = None if isinstance(value, dict | list) else False
-    text = yaml.dump(
-        {name: value},
-        Dumper=_Dumper,
-        allow_unicode=True,
-        default_flow_style=flow,
-        width=_NO_FOLDING,
-    )
+    style: dict[str, Any] = {"default_flow_style": flow, "width": _NO_FOLDING}
+    text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, **style)
     printed = "".join(char if char.isprintable() else " " for char in comment)
     return f"{text.rstrip()}  # {printed}"
 
@@ -181,12 +173,11 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
 def _require_plain(event: Any) -> None:
     """Refuse tags, and text that no file can hold."""
     if event.tag not in (None, "!", f"{_TAG}str"):
-        raise _refusal(
-            event,
-            f"the tag {event.tag.replace(_TAG, '!!')[:100]!r} has no meaning here; leave it out",
-        )
+        tag = event.tag.replace(_TAG, "!!")[:100]
+        raise _refusal(event, f"the tag {tag!r} has no meaning here; leave it out")
     if isinstance(event, yaml.ScalarEvent) and NO_TEXT.search(event.value):
-        raise _refusal(event, "text must hold neither zero bytes nor halves of characters")
+        problem = "text must hold neither zero bytes nor halves of characters"
+        raise _refusal(event, problem)
 
 
 def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
@@ -198,11 +189,9 @@ def _require_names(loader: _Loader, node: yaml.MappingNode) -> None:
         if key.tag not in (f"{_TAG}str", f"{_TAG}value"):
             is_scalar = isinstance(key, yaml.ScalarNode)
             what = repr(loader.construct_object(key)) if is_scalar else f"a {key.id}"
-            raise _refusal(
-                key,
-                f"the name of a parameter must be text, got {what}; put it in quotes if it is"
-                " meant",
-            )
+            cure = "put it in quotes if it is meant"
+            problem = f"the name of a parameter must be text, got {what}; {cure}"
+            raise _refusal(key, problem)
         if key.value in seen:
             twice = f"the key {key.value[:100]!r} stands twice in one mapping"
             raise _refusal(key, f"{twice}; keep one of them")

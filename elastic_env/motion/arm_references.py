@@ -17,19 +17,10 @@ from elastic_env.core.config import LARGEST_SEED, Locator, quantity
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.motion import references
 from elastic_env.motion.inverse_kinematics import joint_path
-from elastic_env.motion.references import (
-    REFERENCES,
-    AboutHome,
-    Hold,
-    Multisine,
-    RepeatableReference,
-    Sine,
-    Steps,
-    by_kind,
-    make_reference,
-)
-from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
+from elastic_env.motion.references import AnyReference, RepeatableReference
+from elastic_env.motion.trajectory import STAND_S, Motion, Plan, control_times, quintic
 from elastic_env.rigid.tree.end_effector import EndEffector
 
 _TRIES = 1000
@@ -69,14 +60,14 @@ class Workspace:
         Raises:
             ConfigurationError: The servos are too weak for almost all poses.
         """
-        width = np.where(
-            np.isfinite(self.highest - self.lowest), _MARGIN * (self.highest - self.lowest), 0.0
-        )
+        extent = self.highest - self.lowest
+        width = np.where(np.isfinite(extent), _MARGIN * extent, 0.0)
         low = np.maximum(self.lowest + width, self.home - _HALF_TURN)
         high = np.minimum(self.highest - width, self.home + _HALF_TURN)
-        found = np.empty((0, len(self.home)))
+        n = len(self.home)
+        found = np.empty((0, n))
         for _ in range(_TRIES):
-            drawn = generator.uniform(low, np.maximum(high, low), (count, len(self.home)))
+            drawn = generator.uniform(low, np.maximum(high, low), (count, n))
             found = np.concatenate([found, drawn[self.holds(drawn)]])[:count]
             if len(found) == count:
                 return found
@@ -95,10 +86,14 @@ class _Drawn(RepeatableReference):
     seed: int | None = quantity("1", 0, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    def visits(self, workspace: Workspace, generator: np.random.Generator) -> Array:
-        """Home and the poses, (positions + 1, n) [rad]."""
-        poses = workspace.poses(self.own(generator), self.positions)
-        return np.concatenate([workspace.home[None], poses])
+    def _moved(self, visits: Array, t: Array, period_s: float) -> tuple[Array, Array, Array]:
+        """Motion between poses, (T, n) each: one move at the beginning of each period."""
+        number = _numbers(t, period_s, self.positions)
+        share = (t - STAND_S - period_s * number) / self.move_s
+        blend, blend_dot, blend_ddot = (x[:, None] for x in quintic(share))
+        step = np.diff(visits, axis=0)[number]
+        q_dot = blend_dot * step / self.move_s
+        return visits[number] + blend * step, q_dot, blend_ddot * step / self.move_s**2
 
 
 class Poses(_Drawn):
@@ -116,15 +111,16 @@ class Poses(_Drawn):
     measure_s: float = quantity("s", 0.25, gt=0, le=600)
     """Time of the measurement [s]."""
 
-    def through(self, visits: Array, control_period_s: float) -> Plan:
+    def through(self, visits: Array, period_s: float) -> Plan:
         """A plan of all joints, (T, n), from the first pose through the others."""
         period = self.move_s + self.settle_s + self.measure_s
-        t = control_times(STAND_S + self.positions * period, control_period_s)
+        t = control_times(STAND_S + self.positions * period, period_s)
         number = _numbers(t, period, self.positions)
         since = t - STAND_S - period * number
-        is_at_rest = (since > self.move_s + self.settle_s + 1e-9) & (since <= period + 1e-9)
+        settled = self.move_s + self.settle_s
+        is_at_rest = (since > settled + 1e-9) & (since <= period + 1e-9)
         rest = np.where(is_at_rest, number, -1)
-        return Plan(*_moved(visits, t, period, self.move_s), is_at_rest, rest)
+        return Plan(*self._moved(visits, t, period), is_at_rest, rest)
 
 
 class Moves(_Drawn):
@@ -134,10 +130,10 @@ class Moves(_Drawn):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the poses; None draws new ones per episode [1]."""
 
-    def through(self, visits: Array, control_period_s: float) -> Plan:
+    def through(self, visits: Array, period_s: float) -> Plan:
         """A plan of all joints, (T, n), from the first pose through the others."""
-        t = control_times(STAND_S + self.positions * self.move_s, control_period_s)
-        return _scored(t, *_moved(visits, t, self.move_s, self.move_s))
+        t = control_times(STAND_S + self.positions * self.move_s, period_s)
+        return _scored(t, *self._moved(visits, t, self.move_s))
 
 
 class _Path(RepeatableReference):
@@ -148,10 +144,8 @@ class _Path(RepeatableReference):
     repeats: int = quantity("1", 1, ge=1, le=100)
     """Number of ways there and back, or of turns [1]."""
 
-    def _along(
-        self, workspace: Workspace, place: Any, phase: tuple[Array, ...], control_period_s: float
-    ) -> Plan:
-        """Plan of joints whose tool moves by `place(s)` from its start, for a phase over time."""
+    def _along(self, workspace: Workspace, place: Any, t: Array, *phase: Array) -> Plan:
+        """Plan of joints whose tool moves by `place(s)` from its start, for s and its rates."""
         s, s_dot, s_ddot = phase
         tool = workspace.end_effector
         if tool is None:
@@ -162,11 +156,9 @@ class _Path(RepeatableReference):
         path = joint_path(tool, workspace.home, place, float(s.max()))
         q = path(s)
         slope = path(s, 1)
-        curve = path(s, 2)
-        t = np.arange(len(s)) * control_period_s
-        return _scored(
-            t, q, slope * s_dot[:, None], slope * s_ddot[:, None] + curve * s_dot[:, None] ** 2
-        )
+        rate = s_dot[:, None]
+        q_ddot = slope * s_ddot[:, None] + path(s, 2) * rate**2
+        return _scored(t, q, slope * rate, q_ddot)
 
 
 class Line(_Path):
@@ -181,16 +173,20 @@ class Line(_Path):
     by: tuple[float, float, float] = (0.0, 0.0, -0.1)
     """Way from home, in the axes of the base [m]."""
 
-    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
+    def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
-        t = control_times(STAND_S + 2 * self.repeats * self.duration_s, control_period_s)
-        since = (t[:, None] - STAND_S) / self.duration_s - np.arange(2 * self.repeats)
-        ways = np.stack(quintic(since)) * np.where(np.arange(2 * self.repeats) % 2, -1.0, 1.0)
-        s, s_dot, s_ddot = ways.sum(axis=-1)
-        phase = (np.clip(s, 0.0, 1.0), s_dot / self.duration_s, s_ddot / self.duration_s**2)
-        return self._along(
-            workspace, lambda way: way[..., None] * np.array(self.by), phase, control_period_s
-        )
+        way_s = self.duration_s
+        ways = np.arange(2 * self.repeats)
+        t = control_times(STAND_S + 2 * self.repeats * way_s, period_s)
+        since = (t[:, None] - STAND_S) / way_s - ways
+        phases = np.stack(quintic(since)) * np.where(ways % 2, -1.0, 1.0)
+        s, s_dot, s_ddot = phases.sum(axis=-1)
+        s = np.clip(s, 0.0, 1.0)
+
+        def place(way: Array) -> Array:
+            return way[..., None] * np.array(self.by)
+
+        return self._along(workspace, place, t, s, s_dot / way_s, s_ddot / way_s**2)
 
 
 class Circle(_Path):
@@ -205,30 +201,28 @@ class Circle(_Path):
     normal: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Axis of the circle in the axes of the base; its length does not matter."""
 
-    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
+    def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
-        axis = np.array(self.normal)
-        if not np.linalg.norm(axis) > 0.0:
-            raise ConfigurationError("normal of a circle must have a length > 0, such as [0, 1, 0]")
-        axis = axis / np.linalg.norm(axis)
+        length = np.linalg.norm(self.normal)
+        if not length > 0.0:
+            needed = "must have a length > 0, such as [0, 1, 0]"
+            raise ConfigurationError(f"normal of a circle {needed}")
+        axis = np.array(self.normal) / length
         down = np.cross(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]), axis)
         across = np.cross(axis, down)
-        total = self.repeats * self.duration_s
-        t = control_times(STAND_S + total, control_period_s)
+        n = self.repeats
+        total = n * self.duration_s
+        t = control_times(STAND_S + total, period_s)
         s, s_dot, s_ddot = quintic((t - STAND_S) / total)
         down = self.radius * down / np.linalg.norm(down)
         across = self.radius * across / np.linalg.norm(across)
 
         def place(turns: Array) -> Array:
-            angle: Array = 2.0 * np.pi * turns[..., None]
-            return np.asarray(
-                (np.cos(angle) - 1.0) * down + np.sin(angle) * across, dtype=np.float64
-            )
+            angle: Any = 2.0 * np.pi * turns[..., None]
+            return (np.cos(angle) - 1.0) * down + np.sin(angle) * across
 
-        n = self.repeats
-        return self._along(
-            workspace, place, (n * s, n * s_dot / total, n * s_ddot / total**2), control_period_s
-        )
+        rate = n * s_dot / total
+        return self._along(workspace, place, t, n * s, rate, n * s_ddot / total**2)
 
 
 class Csv(RepeatableReference):
@@ -242,61 +236,47 @@ class Csv(RepeatableReference):
     file: Locator
     """Path of the file."""
 
-    def joint_plan(self, workspace: Workspace, control_period_s: float) -> Plan:
+    def joint_plan(self, workspace: Workspace, period_s: float) -> Plan:
         """A plan of all joints, (T, n)."""
         names, rows = _table(Path(self.file), workspace.joints)
         times = rows[:, 0] - rows[0, 0]
         angles = np.tile(workspace.home, (len(rows), 1))
         angles[:, [workspace.joints.index(name) for name in names]] = rows[:, 1:]
         path = CubicSpline(times, angles, bc_type="clamped")
-        t = control_times(STAND_S + float(times[-1]), control_period_s)
+        t = control_times(STAND_S + float(times[-1]), period_s)
         since = np.clip(t - STAND_S, 0.0, times[-1])
         moving = ((t > STAND_S) & (t < STAND_S + times[-1]))[:, None]
-        return _scored(
-            t,
-            path(since),
-            np.where(moving, path(since, 1), 0.0),
-            np.where(moving, path(since, 2), 0.0),
-        )
+        q_dot = np.where(moving, path(since, 1), 0.0)
+        return _scored(t, path(since), q_dot, np.where(moving, path(since, 2), 0.0))
 
 
 OfArm: TypeAlias = Poses | Moves | Line | Circle | Csv
-ArmReference = Annotated[Hold | Sine | Multisine | Steps | OfArm, Field(discriminator="kind")]
-AnyArmReference: TypeAlias = Hold | Sine | Multisine | Steps | OfArm
+AnyArmReference: TypeAlias = AnyReference | OfArm
+ArmReference = Annotated[AnyArmReference, Field(discriminator="kind")]
 
-ARM_REFERENCES = {**REFERENCES, **by_kind(OfArm)}
-
-
-make_arm_reference = partial(make_reference, kinds=ARM_REFERENCES)
+make_arm_reference = partial(
+    references.make_reference, kinds=references.REFERENCES | references.by_kind(OfArm)
+)
 """A reference of a robot of several joints; arguments as of `make_reference`."""
 
 
-@dataclass(frozen=True)
-class ArmMotion:
-    """A reference as the joints of a robot follow it.
+def motion_of(reference: AnyArmReference, workspace: Workspace) -> Motion:
+    """A reference as the joints of a robot follow it."""
+    return Motion(partial(_plan, reference, workspace), reference.is_random)
 
-    Attributes:
-        reference: It.
-        workspace: What it has to know of the robot.
-    """
 
-    reference: AnyArmReference
-    workspace: Workspace
-
-    @property
-    def is_random(self) -> bool:
-        """True where every episode has a plan of its own."""
-        return self.reference.is_random
-
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """A plan of all joints, (T, n); of a random reference each joint has a plan of its own."""
-        reference = self.reference
-        if isinstance(reference, Poses | Moves):
-            visits = reference.visits(self.workspace, generator)
-            return reference.through(visits, control_period_s)
-        if isinstance(reference, OfArm):
-            return reference.joint_plan(self.workspace, control_period_s)
-        return AboutHome(reference, self.workspace.home).plan(generator, control_period_s)
+def _plan(
+    reference: AnyArmReference,
+    workspace: Workspace,
+    generator: np.random.Generator,
+    period_s: float,
+) -> Plan:
+    if isinstance(reference, Poses | Moves):
+        poses = workspace.poses(reference.own(generator), reference.positions)
+        return reference.through(np.vstack([workspace.home, poses]), period_s)
+    if isinstance(reference, OfArm):
+        return reference.joint_plan(workspace, period_s)
+    return reference.about(workspace.home, generator, period_s)
 
 
 def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
@@ -305,11 +285,11 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     Raises:
         ConfigurationError: It cannot be read, or a column or value is not what it has to be.
     """
-    table = read_table(
-        file, what="file of angles", row="row", most_rows=_MOST_ROWS, example="time_s, then joints"
+    example = "time_s, then joints"
+    names, rows = read_table(
+        file, what="file of angles", row="row", most_rows=_MOST_ROWS, example=example
     )
-    names = table.names
-    rows = table.values
+    t = rows[:, 0]
     if names[0] != "time_s":
         raise ConfigurationError(
             f"the first column of {file} must be time_s, got {quote(names[0])}"
@@ -319,11 +299,11 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
         raise ConfigurationError(
             f"{file} must have two rows or more, and a column of angles or more beside time_s"
         )
-    if (np.diff(rows[:, 0]) <= 0.0).any() or rows[-1, 0] - rows[0, 0] > _LONGEST_S:
+    if (np.diff(t) <= 0.0).any() or t[-1] - t[0] > _LONGEST_S:
         raise ConfigurationError(
             f"time_s of {file} must increase from row to row, over at most {_LONGEST_S:g} s"
         )
-    if np.diff(rows[:, 0]).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
+    if np.diff(t).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
         raise ConfigurationError(
             f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within"
             f" ±{_LARGEST_RAD:g} rad"
@@ -335,20 +315,6 @@ def _numbers(t: Array, period_s: float, count: int) -> IntArray:
     """Which of the moves each time belongs to, (T,): one begins at the end of the one before."""
     past = np.ceil((t - STAND_S - 1e-9) / period_s) - 1.0
     return past.clip(0, count - 1).astype(np.int64)
-
-
-def _moved(visits: Array, t: Array, period_s: float, move_s: float) -> tuple[Array, Array, Array]:
-    """Motion between poses, (T, n) each: one move at the beginning of each period."""
-    steps = np.diff(visits, axis=0)
-    number = _numbers(t, period_s, len(steps))
-    share = (t - STAND_S - period_s * number) / move_s
-    blend, blend_dot, blend_ddot = (x[:, None] for x in quintic(share))
-    step = steps[number]
-    return (
-        visits[number] + blend * step,
-        blend_dot * step / move_s,
-        blend_ddot * step / move_s**2,
-    )
 
 
 def _scored(t: Array, q: Array, q_dot: Array, q_ddot: Array) -> Plan:

@@ -6,7 +6,7 @@ stands.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import model_validator
@@ -35,6 +35,7 @@ LONGEST_WALK_S = 600.0
 """Longest walk that is planned, with standing [s]: its tables hold every control step."""
 
 _DURATIONS = ("double_support_s", "single_support_s", "last_double_support_s")
+_Shift: TypeAlias = tuple[float, float, Array, Array]
 _RAMP_SHIFT_S = 0.1
 _RAMP_INWARD_M = 0.02
 
@@ -187,7 +188,8 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
     zmp = np.repeat(middle[None], len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, supports, middle):
         progress = (timing.time - begin) / duration
-        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
+        is_smooth = gait.transfer == "smooth"
+        blend = minimum_jerk(progress) if is_smooth else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
 
@@ -199,9 +201,9 @@ def support_points(gait: Gait, feet: Array) -> Array:
     return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
-def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, float, Array, Array]]:
+def _shifts(gait: Gait, supports: Array, middle: Array) -> list[_Shift]:
     """Moves of the ZMP: begin [s], duration [s], from and to [m]."""
-    shifts = []
+    shifts: list[_Shift] = []
     last = middle
     begin = STAND_S
     for step in range(gait.num_steps):
@@ -210,10 +212,8 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
         end = begin + gait.step_period_s
         support = supports[step % 2]
         if gait.transfer == "ramp":
-            shifts += [
-                (lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middle, support),
-                (touch_down, _RAMP_SHIFT_S, support, middle),
-            ]
+            shifts.append((lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middle, support))
+            shifts.append((touch_down, _RAMP_SHIFT_S, support, middle))
         else:
             left = begin if step == 0 else begin - gait.last_double_support_s
             shifts.append((left, lift_off - left, last, support))
@@ -227,12 +227,11 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
     steps = duration_s / control_period_s
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        nearest = sorted(
-            {max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))}
-        )
+        counts = {max(int(steps), 1), max(int(np.ceil(steps)), 1)}
+        nearest = [f"{count * control_period_s:.10g} s" for count in sorted(counts)]
         raise ConfigurationError(
             f"{name} must be a multiple of the control period of {control_period_s} s, got"
             f" {duration_s} s; the nearest {'is' if len(nearest) == 1 else 'are'}"
-            f" {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
+            f" {' and '.join(nearest)}"
         )
     return round(steps)

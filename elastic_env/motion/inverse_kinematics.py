@@ -55,8 +55,10 @@ def _solved(tool: EndEffector, q: Array, wanted: Array, R_wanted: Array) -> Arra
     keeps = len(q) >= _FOR_ORIENTATION
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)
-        turn = Rotation.from_matrix(R_wanted @ R.T).as_rotvec() if keeps else np.zeros(0)
-        error = np.concatenate([wanted - position, turn])
+        error = wanted - position
+        if keeps:
+            turn = Rotation.from_matrix(R_wanted @ R.T).as_rotvec()
+            error = np.concatenate([error, turn])
         if np.abs(error).max() < _ENOUGH:
             return q
         moved, turned = tool.jacobian(q)

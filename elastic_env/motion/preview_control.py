@@ -99,15 +99,15 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
         ElasticError: Shapes that do not fit.
     """
     if zmp_ref.ndim != 2 or start.shape != zmp_ref.shape[1:]:
-        raise ElasticError(
-            f"zmp_ref must be (T, d) and start (d,), got {zmp_ref.shape} and {start.shape}"
-        )
+        given = f"{zmp_ref.shape} and {start.shape}"
+        raise ElasticError(f"zmp_ref must be (T, d) and start (d,), got {given}")
     A, b, c = cart_table(config)
     gains = preview_gains(config)
     steps, dimensions = zmp_ref.shape
     reach = len(gains.preview)
     held = np.repeat(zmp_ref[-1:], reach + 1, axis=0)
-    coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)  # coming[k] = r_{k+1} − r_k
+    # coming[k] = r_{k+1} − r_k
+    coming = np.diff(np.concatenate([zmp_ref, held]), axis=0)
     state = np.zeros((3, dimensions))
     state[0] = start
     last = state
@@ -125,4 +125,5 @@ def follow_zmp(config: PreviewConfig, zmp_ref: Array, start: Array) -> ComMotion
         )
         last = state
         state = A @ state + b[:, None] * jerk
-    return ComMotion(states[:, 0], states[:, 1], states[:, 2], np.einsum("i,kid->kd", c, states))
+    zmp = np.einsum("i,kid->kd", c, states)
+    return ComMotion(states[:, 0], states[:, 1], states[:, 2], zmp)

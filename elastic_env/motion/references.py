@@ -6,7 +6,6 @@ and moves by quintic (minimum-jerk) polynomials, which start and end without acc
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 
 import numpy as np
@@ -69,6 +68,20 @@ class _JointReference(RepeatableReference):
         """Bounds over all its plans."""
         raise NotImplementedError
 
+    def about(self, home: Array, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan of joints that all follow it about their home, (n,) [rad].
+
+        Of a random one each joint has a plan of its own.
+        """
+        first = self.plan(generator, control_period_s)
+        plans = [first] * len(home)
+        if self.is_random:
+            plans[1:] = [self.plan(generator, control_period_s) for _ in plans[1:]]
+        q = np.stack([plan.q for plan in plans], axis=-1)
+        q_dot = np.stack([plan.q_dot for plan in plans], axis=-1)
+        q_ddot = np.stack([plan.q_ddot for plan in plans], axis=-1)
+        return Plan(q + home, q_dot, q_ddot, first.scored, first.rest)
+
 
 class Hold(_JointReference):
     """The paper's static positions, evenly spaced in gravity torque.
@@ -106,19 +119,18 @@ class Hold(_JointReference):
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
         if self.upper <= self.lower:
-            raise ValueError(
-                f"upper must exceed lower, got lower {self.lower} and upper {self.upper}"
-            )
+            given = f"lower {self.lower} and upper {self.upper}"
+            raise ValueError(f"upper must exceed lower, got {given}")
         return self
 
     @model_validator(mode="after")
     def _ends_in_time(self) -> Self:
         angles = self.angles
         way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
-        moves = max(
-            QUINTIC_PEAK_RATE * way / self.rate, (2 * self.positions + 1) * self.shortest_move_s
-        )
-        _require_short(STAND_S + moves + 2 * self.positions * (self.settle_s + self.measure_s))
+        quickest_s = (2 * self.positions + 1) * self.shortest_move_s
+        moves_s = max(QUINTIC_PEAK_RATE * way / self.rate, quickest_s)
+        rest_s = self.settle_s + self.measure_s
+        _require_short(STAND_S + moves_s + 2 * self.positions * rest_s)
         return self
 
     @property
@@ -163,8 +175,9 @@ class Hold(_JointReference):
             moves.append((now, duration, targets[number]))
             now = now + duration
             if number != self.positions:  # there it turns round
-                windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
-                now = windows[-1][1]
+                begin = now + self.settle_s
+                now = begin + self.measure_s
+                windows.append((begin, now))
         t = control_times(now, control_period_s)
         q, q_dot, q_ddot = quintic_moves(t, start, moves)
         rest = np.full(len(t), -1)
@@ -189,25 +202,22 @@ class _Oscillation(_JointReference):
         w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
         w_dot = w_dot / self.onset_s
         w_ddot = w_ddot / self.onset_s**2
-        return Plan(
-            q=self.middle + w * x,
-            q_dot=w_dot * x + w * x_dot,
-            q_ddot=w_ddot * x + 2.0 * w_dot * x_dot + w * x_ddot,
-            scored=t > STAND_S + self.onset_s,
-            rest=np.full(len(t), -1),
-        )
+        q_dot = w_dot * x + w * x_dot
+        q_ddot = w_ddot * x + 2.0 * w_dot * x_dot + w * x_ddot
+        q = self.middle + w * x
+        scored = t > STAND_S + self.onset_s
+        return Plan(q, q_dot, q_ddot, scored, np.full(len(t), -1))
 
     def _extent(self, rate: float, acceleration: float) -> Extent:
         """Bounds with the envelope, whatever the phase of the oscillation when it grows."""
         w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
         w_dot = w_dot / self.onset_s
         w_ddot = np.abs(w_ddot) / self.onset_s**2
-        return Extent(
-            self.middle - self.amplitude,
-            self.middle + self.amplitude,
-            q_dot=float((w_dot * self.amplitude + w * rate).max()),
-            q_ddot=float((w_ddot * self.amplitude + 2.0 * w_dot * rate + w * acceleration).max()),
-        )
+        reach = self.amplitude
+        q_dot = w_dot * reach + w * rate
+        q_ddot = w_ddot * reach + 2.0 * w_dot * rate + w * acceleration
+        ends = (self.middle - reach, self.middle + reach)
+        return Extent(*ends, float(q_dot.max()), float(q_ddot.max()))
 
     def _time_base(self, control_period_s: float) -> Array:
         return control_times(STAND_S + self.onset_s + self.duration_s, control_period_s)
@@ -231,7 +241,8 @@ class Sine(_Oscillation):
         omega = 2.0 * np.pi * self.frequency_hz
         phase = omega * (t - STAND_S)
         x = self.amplitude * np.sin(phase)
-        return self._enveloped(t, x, self.amplitude * omega * np.cos(phase), -(omega**2) * x)
+        x_dot = self.amplitude * omega * np.cos(phase)
+        return self._enveloped(t, x, x_dot, -(omega**2) * x)
 
 
 class Multisine(_Oscillation):
@@ -255,9 +266,8 @@ class Multisine(_Oscillation):
     @model_validator(mode="after")
     def _frequencies_are_ordered(self) -> Self:
         if self.highest_hz <= self.lowest_hz:
-            raise ValueError(
-                f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz"
-            )
+            given = f"{self.lowest_hz} to {self.highest_hz} Hz"
+            raise ValueError(f"highest_hz must exceed lowest_hz, got {given}")
         return self
 
     @model_validator(mode="after")
@@ -271,12 +281,14 @@ class Multisine(_Oscillation):
 
     @property
     def _omega(self) -> Array:
-        return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
+        hertz = np.linspace(self.lowest_hz, self.highest_hz, self.components)
+        return 2.0 * np.pi * hertz
 
     @override
     def extent(self) -> Extent:
         share = self.amplitude / self.components
-        return self._extent(share * float(self._omega.sum()), share * float((self._omega**2).sum()))
+        omega = self._omega
+        return self._extent(share * float(omega.sum()), share * float((omega**2).sum()))
 
     @override
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
@@ -316,16 +328,14 @@ class Steps(_JointReference):
     @override
     def extent(self) -> Extent:
         span = 2.0 * self.amplitude
-        return Extent(
-            self.middle - self.amplitude,
-            self.middle + self.amplitude,
-            q_dot=QUINTIC_PEAK_RATE * span / self.move_s,
-            q_ddot=QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
-        )
+        ends = (self.middle - self.amplitude, self.middle + self.amplitude)
+        q_ddot = QUINTIC_PEAK_ACCELERATION * span / self.move_s**2
+        return Extent(*ends, QUINTIC_PEAK_RATE * span / self.move_s, q_ddot)
 
     @override
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        offsets = self.own(generator).uniform(-self.amplitude, self.amplitude, self.moves)
+        reach = self.amplitude
+        offsets = self.own(generator).uniform(-reach, reach, self.moves)
         period = self.move_s + self.rest_s
         moves = [
             (STAND_S + i * period, self.move_s, float(self.middle + x))
@@ -346,37 +356,6 @@ def by_kind(union: Any) -> dict[str, Any]:
 
 
 REFERENCES = by_kind(AnyReference)
-
-
-@dataclass(frozen=True)
-class AboutHome:
-    """A reference that every joint follows about its home.
-
-    Of a random one each joint has a plan of its own.
-
-    Attributes:
-        reference: It.
-        home: Of the joints, (n,) [rad].
-    """
-
-    reference: AnyReference
-    home: Array
-
-    @property
-    def is_random(self) -> bool:
-        """True where every episode has a plan of its own."""
-        return self.reference.is_random
-
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """A plan of all joints, (T, n)."""
-        first = self.reference.plan(generator, control_period_s)
-        plans = [first] * len(self.home)
-        if self.is_random:
-            plans[1:] = [self.reference.plan(generator, control_period_s) for _ in plans[1:]]
-        q, q_dot, q_ddot = (
-            np.stack([getattr(p, x) for p in plans], axis=-1) for x in ("q", "q_dot", "q_ddot")
-        )
-        return Plan(q + self.home, q_dot, q_ddot, first.scored, first.rest)
 
 
 def make_reference(reference: Any, kinds: Mapping[str, Any] = REFERENCES) -> Any:

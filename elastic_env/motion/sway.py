@@ -10,9 +10,9 @@ import numpy as np
 from scipy import linalg
 
 from elastic_env.core.signals import Array
+from elastic_env.rigid import leg_kinematics as legs
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.floating_body import FloatingBody
-from elastic_env.rigid.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
 _STEP = 1e-4  # of the finite differences [m], [rad]
@@ -39,7 +39,8 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
         angles = _angles(biped, pelvis, x)
         com = biped.chains.center_of_mass(angles)
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
-        return 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1) + biped.weight * height
+        of_springs = 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1)
+        return of_springs + biped.weight * height
 
     unit = _STEP * np.eye(_DOF)
     pairs = unit[:, None] + unit[None]
@@ -47,15 +48,17 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
     ends = np.concatenate([pairs, mixed, -mixed, -pairs]).reshape(-1, _DOF)
     V = potential(ends).reshape(4, _DOF, _DOF)
     hessian = (V[0] - V[1] - V[2] + V[3]) / (4.0 * _STEP**2)
-    slopes = (_angles(biped, pelvis, unit) - _angles(biped, pelvis, -unit)).T / (2.0 * _STEP)
-    motion = np.vstack([np.eye(_DOF), slopes])
-    mass = motion.T @ FloatingBody(biped.rigid, biped.joint_names).mass_matrix(q) @ motion
+    change = _angles(biped, pelvis, unit) - _angles(biped, pelvis, -unit)
+    motion = np.vstack([np.eye(_DOF), change.T / (2.0 * _STEP)])
+    body = FloatingBody(biped.rigid, biped.joint_names)
+    mass = motion.T @ body.mass_matrix(q) @ motion
     eigenvalues = linalg.eigh(hessian, mass, eigvals_only=True)
     return np.sqrt(np.where(eigenvalues > 0.0, eigenvalues, np.nan))
 
 
 def _rotations(x: Array) -> Array:
-    return rotation_z(x[:, 5]) @ rotation_y(x[:, 4]) @ rotation_x(x[:, 3])
+    turned = legs.rotation_z(x[:, 5]) @ legs.rotation_y(x[:, 4])
+    return turned @ legs.rotation_x(x[:, 3])
 
 
 def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
@@ -64,4 +67,4 @@ def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
     ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
     turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
-    return leg_angles(biped.leg, relative, turned).reshape(len(x), -1)
+    return legs.leg_angles(biped.leg, relative, turned).reshape(len(x), -1)

@@ -1,7 +1,7 @@
 """Plans: sampled trajectories, their building blocks, and tables of them for many worlds."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -65,11 +65,8 @@ def quintic(s: Array) -> tuple[Array, Array, Array]:
     """`minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
     blend = minimum_jerk(s)
     s = np.clip(s, 0.0, 1.0)
-    return (
-        blend,
-        30.0 * s**2 * (1.0 - s) ** 2,
-        60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
-    )
+    rate = 30.0 * s**2 * (1.0 - s) ** 2
+    return blend, rate, 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
 
 
 def quintic_moves(
@@ -99,17 +96,18 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
 
-class Planned(Protocol):
-    """A reference, which makes plans of one length."""
+@dataclass(frozen=True)
+class Motion:
+    """A reference as all joints of a robot follow it, whose plans have one length.
 
-    @property
-    def is_random(self) -> bool:
-        """True where every episode has a plan of its own."""
-        ...
+    Attributes:
+        plan: Makes a plan of all joints, (T, n), from a generator and the control period [s].
+        is_random: True where every episode has a plan of its own; else no plan depends on the
+            generator.
+    """
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
-        """A plan, which depends on the generator only if the reference is random."""
-        ...
+    plan: Callable[[np.random.Generator, float], Plan]
+    is_random: bool = False
 
 
 LARGEST_TABLE = 250_000_000
@@ -120,7 +118,7 @@ class PlanTable:
     """Plans of all worlds as tables, one row per control step; one that repeats is held once.
 
     Args:
-        reference: Makes plans of all joints, (T, n).
+        motion: Of all joints.
         control_period_s: Time between commands [s].
         num_worlds: How many.
 
@@ -134,36 +132,34 @@ class PlanTable:
         scored, rest: As in a `Plan`, the same for all, (T,).
     """
 
-    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
-        self._reference = reference
+    def __init__(self, motion: Motion, control_period_s: float, num_worlds: int) -> None:
+        self._motion = motion
         self._period = control_period_s
-        probe = self._reference.plan(np.random.default_rng(0), self._period)
+        probe = motion.plan(np.random.default_rng(0), control_period_s)
         self.num_steps = probe.num_steps
         if not probe.scored.any():
             raise ConfigurationError(
                 "the reference has no scored control step: its scored time is below the control"
                 f" period of {control_period_s} s; lengthen it"
             )
-        self._is_shared = not reference.is_random
-        self.plan_of_world = (
-            np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
-        )
-        plans = 1 if self._is_shared else num_worlds
-        motion = _stacked(probe)
-        if plans * motion.nbytes > LARGEST_TABLE:
+        plans = num_worlds if motion.is_random else 1
+        one = _stacked(probe)
+        size = plans * one.nbytes
+        if size > LARGEST_TABLE:
             raise ConfigurationError(
-                f"{plans} motions of {self.num_steps} control steps take"
-                f" {plans * motion.nbytes / 1e6:.0f} MB, at most {LARGEST_TABLE / 1e6:.0f} MB;"
-                " take a shorter motion, fewer worlds or episodes, or one motion for all by `seed`"
+                f"{plans} motions of {self.num_steps} control steps take {size / 1e6:.0f} MB,"
+                f" at most {LARGEST_TABLE / 1e6:.0f} MB; take a shorter motion, fewer worlds or"
+                " episodes, or one motion for all by `seed`"
             )
-        self.motion = np.tile(motion, (plans, 1, 1, 1))
+        self.plan_of_world = np.arange(num_worlds) % plans
+        self.motion = np.tile(one, (plans, 1, 1, 1))
         self.scored = probe.scored
         self.rest = probe.rest
 
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """A new plan for one world."""
-        if not self._is_shared:
-            self.motion[world] = _stacked(self._reference.plan(generator, self._period))
+        if self._motion.is_random:
+            self.motion[world] = _stacked(self._motion.plan(generator, self._period))
 
 
 def _stacked(plan: Plan) -> Array:

@@ -12,7 +12,8 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import Servo
-from elastic_env.motion.gait import RIGHT, Gait, Timing, step_timing, support_points, zmp_reference
+from elastic_env.motion import gait as gaits
+from elastic_env.motion.gait import RIGHT, Gait, Timing
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
@@ -87,19 +88,20 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         ConfigurationError: Durations that do not fit the control period.
         ElasticError: A foot out of reach.
     """
-    timing = step_timing(gait, control_period_s)
+    timing = gaits.step_timing(gait, control_period_s)
     ankles = _ankle_paths(gait, timing, biped)
-    zmp = zmp_reference(gait, timing, biped.footholds)
+    zmp = gaits.zmp_reference(gait, timing, biped.footholds)
     standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
     preview = PreviewConfig(
         com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity
     )
     motion = follow_zmp(preview, zmp, zmp[0])
-    pelvis = _pelvis_under(motion.com, np.tile(standing, (len(zmp), 1)), biped, ankles, timing.time)
+    start = np.tile(standing, (len(zmp), 1))
+    pelvis = _pelvis_under(motion.com, start, biped, ankles, timing.time)
     q = _angles(biped, pelvis, ankles, timing.time)
     dynamics = _dynamics(biped, pelvis, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
-    share = load_share(zmp, support_points(gait, biped.footholds))
+    share = load_share(zmp, gaits.support_points(gait, biped.footholds))
     torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
         gait=gait,
@@ -181,8 +183,10 @@ def _ankle_paths(gait: Gait, timing: Timing, biped: Biped) -> Array:
 def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Array, float]:
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
-    pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
-    com = pelvis + biped.chains.center_of_mass(_angles(biped, pelvis, ankles[None], np.zeros(1)))
+    begin = np.zeros(1)
+    pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], begin)
+    q = _angles(biped, pelvis, ankles[None], begin)
+    com = pelvis + biped.chains.center_of_mass(q)
     return pelvis[0], float(com[0, 2])
 
 
@@ -213,11 +217,8 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
         x, y, z = from_hip[row, leg]
         vertical = "lift_m" if z > 0.0 else "hip_height_m"
         # what would bring the foot into reach if its part of the distance were gone
-        helps = [
-            n
-            for n, left in ((vertical, np.hypot(x, y)), ("hip_half_spacing", np.hypot(x, z)))
-            if left < reach
-        ]
+        left = {vertical: np.hypot(x, y), "hip_half_spacing": np.hypot(x, z)}
+        helps = [name for name, rest in left.items() if rest < reach]
         excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
         decimals = max(4, -int(np.floor(np.log10(excess))))
         raise ConfigurationError(
@@ -250,7 +251,8 @@ def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynami
     x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
     y = (moment[:, 0] + height * force[:, 1]) / force[:, 2]
     about_zmp = moment[:, 2] - (x * force[:, 1] - y * force[:, 0])
-    return _Dynamics(force, np.stack([x, y], axis=-1) + pelvis[:, :2], about_zmp, torque)
+    zmp = np.stack([x, y], axis=-1) + pelvis[:, :2]
+    return _Dynamics(force, zmp, about_zmp, torque)
 
 
 def _joint_torque(
@@ -265,5 +267,6 @@ def _joint_torque(
     moments[..., 2] = weights * dynamics.moment[:, None]
     arms = points - ankles
     # soles and pelvis are level: the feet's frames are parallel to the world's
-    contact = biped.chains.loads(len(q), wrench=(forces, np.cross(arms, forces) + moments))
+    moments += np.cross(arms, forces)
+    contact = biped.chains.loads(len(q), wrench=(forces, moments))
     return dynamics.torque + biped.chains.torque(contact, q)

@@ -10,7 +10,6 @@ therefore assumed, by the rule of `assumed_joints`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -19,6 +18,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
+from elastic_env.core.config import Model, read_mapping
 from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
@@ -54,108 +54,26 @@ _FARTHEST = np.pi
 """
 
 
-@dataclass(frozen=True)
-class GalleryRobot:
-    """A robot of the gallery.
-
-    Attributes:
-        title: Its name in full.
-        file: Where its model lies, in the package or among Gymnasium's.
-        end_effector: Body that is to be placed.
-        home: Angles that differ from zero in the pose about which it moves, by joint [rad].
-        licence: Licence of its model.
-        tip: Which point of the end effector is to be placed, in its frame [m].
-    """
+class GalleryRobot(Model):
+    """A robot of the gallery."""
 
     title: str
+    """Its name in full."""
     file: str
+    """Where its model lies, in the package or among Gymnasium's."""
     end_effector: str
-    home: Mapping[str, float] = field(default_factory=dict)
+    """Body that is to be placed."""
+    home: dict[str, float] = {}
+    """Angles that differ from zero in the pose about which it moves, by joint [rad]."""
     licence: str = "BSD"
+    """Licence of its model."""
     tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Which point of the end effector is to be placed, in its frame [m]."""
 
 
-_UR_HOME = {"shoulder_lift_joint": -0.9, "elbow_joint": 1.1, "wrist_1_joint": -0.4}
 GALLERY: Mapping[str, GalleryRobot] = {
-    "panda": GalleryRobot(
-        "Franka Panda",
-        "panda_description/urdf/panda.urdf",
-        "panda_hand_tcp",
-        {"panda_joint2": 0.3, "panda_joint4": -1.6, "panda_joint6": 1.9},
-        "Apache-2.0",
-    ),
-    "ur3": GalleryRobot(
-        "Universal Robots UR3", "ur_description/urdf/ur3_robot.urdf", "tool0", _UR_HOME
-    ),
-    "ur5": GalleryRobot(
-        "Universal Robots UR5", "ur_description/urdf/ur5_robot.urdf", "tool0", _UR_HOME
-    ),
-    "ur10": GalleryRobot(
-        "Universal Robots UR10", "ur_description/urdf/ur10_robot.urdf", "tool0", _UR_HOME
-    ),
-    "kinova": GalleryRobot(
-        "Kinova Jaco 2, 6 joints",
-        "kinova_description/robots/kinova.urdf",
-        "j2s6s200_end_effector",
-        {
-            "j2s6s200_joint_1": 1.6,
-            "j2s6s200_joint_2": 2.4,
-            "j2s6s200_joint_3": 1.2,
-            "j2s6s200_joint_5": 2.0,
-        },
-    ),
-    "xarm7": GalleryRobot(
-        "UFACTORY xArm 7",
-        "xarm_description/urdf/xarm7.urdf",
-        "link_eef",
-        {"joint2": 0.4, "joint4": 1.2, "joint6": 0.9},
-        "BSD-3-Clause",
-    ),
-    "so100": GalleryRobot(
-        "SO-100",
-        "so_arm_description/urdf/so100.urdf",
-        "gripper",
-        {"shoulder_lift": 1.9, "elbow_flex": -1.4, "wrist_flex": 0.3},
-        "Apache-2.0",
-    ),
-    "so101": GalleryRobot(
-        "SO-101",
-        "so_arm_description/urdf/so101.urdf",
-        "gripper_frame_link",
-        {"shoulder_lift": 0.2, "elbow_flex": -0.4},
-        "Apache-2.0",
-    ),
-    "talos_arm": GalleryRobot(
-        "PAL Talos, left arm",
-        "talos_data/robots/talos_left_arm.urdf",
-        "gripper_left_base_link",
-        {"arm_left_2_joint": 0.7, "arm_left_4_joint": -1.2, "gripper_left_joint": -0.3},
-        "Apache-2.0",
-    ),
-    "baxter": GalleryRobot(
-        "Rethink Baxter, both arms",
-        "baxter_description/urdf/baxter.urdf",
-        "right_gripper",
-        {
-            f"{side}_{joint}": angle
-            for side in ("left", "right")
-            for joint, angle in (("s1", -0.9), ("e1", 1.6))
-        },
-    ),
-    "double_pendulum": GalleryRobot(
-        "Double pendulum",
-        "double_pendulum_description/urdf/double_pendulum.urdf",
-        "link2",
-        {"joint1": 1.2, "joint2": 0.5},
-        tip=(0.0, 0.0, 0.22),
-    ),
-    "pusher": GalleryRobot(
-        "Gymnasium's pusher, with gravity",
-        "gymnasium/pusher_v5.xml",
-        "tips_arm",
-        {"r_shoulder_lift_joint": 0.2, "r_elbow_flex_joint": -0.8, "r_wrist_flex_joint": -0.4},
-        "MIT",
-    ),
+    name: GalleryRobot(**own)
+    for name, own in read_mapping(Path(__file__).with_suffix(".yaml")).items()
 }
 """The robots by name."""
 
@@ -173,7 +91,8 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
     require_known("robot", [name], GALLERY)
     file = Path(GALLERY[name].file)
     if file.parts[0] == "gymnasium":
-        return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / file.name
+        assets = Path(gymnasium.__file__).with_name("envs") / "mujoco" / "assets"
+        return assets / file.name
     path = (folder or _package_folder(name)) / file
     if not path.is_file():
         raise missing_extra(
@@ -209,16 +128,14 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = [0.0, 0.0, -9.81]
-    slides = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]
+    slide = mujoco.mjtJoint.mjJNT_SLIDE
+    slides = [joint for joint in spec.joints if joint.type == slide]
     held = {joint.name for joint in slides}
-    for tie in [
-        tie for tie in spec.equalities if held & {tie.name1, tie.name2}
-    ]:  # a finger that copies the other
-        spec.delete(tie)
-    for joint in slides:
-        spec.delete(joint)
-    for actuator in spec.actuators:  # the servos of the elastic joints take their place
-        spec.delete(actuator)
+    # a finger that copies the other
+    ties = [tie for tie in spec.equalities if held & {tie.name1, tie.name2}]
+    # the servos of the elastic joints take the place of actuators
+    for element in (*ties, *slides, *spec.actuators):
+        spec.delete(element)
     return spec
 
 
@@ -236,9 +153,8 @@ def random_poses(
     """
     ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
-    ends = np.clip(
-        np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST]), -_FARTHEST, _FARTHEST
-    )
+    ranges = np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST])
+    ends = np.clip(ranges, -_FARTHEST, _FARTHEST)
     # of a range that lies beyond a half turn, such as Kinova's 47° to 313°, what is within it
     middle = ends.mean(axis=1)
     half = _INNER * np.ptp(ends, axis=1) / 2.0
@@ -276,24 +192,23 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
     inertia = np.array([_inertia(model, pose) for pose in poses])
     links = np.diagonal(inertia, axis1=1, axis2=2).max(axis=0)
     free = (1.0 / np.diagonal(np.linalg.inv(inertia), axis1=1, axis2=2)).min(axis=0)
-    stiffness = np.maximum(
-        np.maximum(torque, _WEAKEST * torque.max()) / SAG_RAD, _SLOWEST**2 * links
-    )
+    carried = np.maximum(torque, _WEAKEST * torque.max())
+    stiffness = np.maximum(carried / SAG_RAD, _SLOWEST**2 * links)
     digit = 10.0 ** (np.floor(np.log10(stiffness)) - 1.0)
     stiffness = np.round(stiffness / digit) * digit
     rotor = _ROTOR * links + _LIGHTEST * links.max()
     damping = 2.0 * _DAMPING_RATIO * np.sqrt(stiffness / (1.0 / rotor + 1.0 / free))
-    return {
-        name: ElasticJoint(
+    joints: dict[str, ElasticJoint] = {}
+    for j, name in enumerate(names):
+        K = float(stiffness[j])
+        total = float(rotor[j] + links[j])
+        joints[name] = ElasticJoint(
             stiffness=K,
-            damping=D,
-            rotor_inertia=B,
-            servo=_servo(B + M, K, float(torque.max() + 25.0 * (B + M))),
+            damping=float(damping[j]),
+            rotor_inertia=float(rotor[j]),
+            servo=_servo(total, K, float(torque.max() + 25.0 * total)),
         )
-        for name, K, D, B, M in zip(
-            names, *(a.tolist() for a in (stiffness, damping, rotor, links)), strict=True
-        )
-    }
+    return joints
 
 
 def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:

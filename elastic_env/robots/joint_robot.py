@@ -20,38 +20,26 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.friction import passed_torque
 from elastic_env.joint.make_elastic import transform_hinges
-from elastic_env.motion.arm_references import (
-    AnyArmReference,
-    ArmMotion,
-    ArmReference,
-    OfArm,
-    Workspace,
-    make_arm_reference,
-)
+from elastic_env.motion import arm_references
+from elastic_env.motion.arm_references import AnyArmReference, ArmReference, Workspace
 from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, as_model
 from elastic_env.rendering.picture import CAMERA, Picture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
-from elastic_env.robots.deviations import (
-    ENLARGEMENT,
-    HEIGHT,
-    REFERENCE_RGBA,
-    REFERENCE_WORD_RGBA,
-    WIDTH,
-    deviation_caption,
-)
+from elastic_env.robots import deviations
+from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
+from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointPlant, JointTask
-from elastic_env.world.robot_model import RobotModel, joint_ranges, read_stiffness, with_stiffness
+from elastic_env.world.robot_model import RobotModel, joint_ranges
 from elastic_env.world.scenario import Scenario, make_scenario
-from elastic_env.world.task import ACTION_BOUND_RAD
 
 _REFERENCE = "elastic_env_reference_"
 """Prefix of the names of the robot that is the reference."""
@@ -59,17 +47,7 @@ _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
 _POINT = 1e-4
 """Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
-_RIGID_NM_PER_RAD = 1e15
-"""Stiffness of a joint without a spring beside servos that give way."""
-
-
-class JointRobotConfig(JointConfig):
-    """All of the environment of a robot of one's own."""
-
-    reference: ArmReference = Multisine()  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    joints: dict[str, ElasticJoint]
-    """The joints as they are known; the scenario says in what the true ones differ."""
+_FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 
 
 @dataclass(frozen=True)
@@ -103,7 +81,7 @@ class JointRobot:
     @property
     def robot(self) -> Robot:
         """The environment that it is."""
-        return Robot(self.name, self.id, self.configure, self._task, partial(JointPicture, self))
+        return Robot(self.name, self.id, self.configure, JointTask, JointPicture)
 
     def register(self) -> None:
         """Make its id known to Gymnasium."""
@@ -119,7 +97,7 @@ class JointRobot:
         reward: RewardWeights | dict[str, float] | None = None,
         timestep_s: float | None = None,
         action_bound_rad: float = ACTION_BOUND_RAD,
-    ) -> JointRobotConfig:
+    ) -> "JointRobotConfig":
         """The configuration from the arguments of `gymnasium.make`.
 
         Args:
@@ -141,9 +119,11 @@ class JointRobot:
         """
         joints = dict(self.joints)
         if stiffness is not None:
-            joints = with_stiffness(joints, read_stiffness(stiffness))
+            value = robot_model.read_stiffness(stiffness)
+            joints = robot_model.with_stiffness(joints, value)
         return JointRobotConfig(
-            reference=make_arm_reference(reference),
+            robot=self,
+            reference=arm_references.make_arm_reference(reference),
             scenario=make_scenario(scenario, walks=False),
             joints=joints,
             form=form,
@@ -153,59 +133,52 @@ class JointRobot:
             **({} if timestep_s is None else {"timestep_s": timestep_s}),
         )
 
-    def plant(self, config: JointRobotConfig) -> JointPlant:
+    def plant(self, config: "JointRobotConfig") -> JointPlant:
         """The robot as it is built, and as it is known.
 
         Raises:
             ConfigurationError: The reference needs more torque than the servos have, or a sensor
                 has no place.
         """
-        true = RobotModel(
-            self._true_joints(config), self._loaded(config).compile(), config.control_period_s
-        )
-        body = RigidBody(true.rigid, true.joint_names)
-        home = (
-            np.zeros(len(true.joints))
-            if self.home is None
-            else np.array(self.home, dtype=np.float64)
-        )
-        if home.shape != (len(true.joints),):
-            raise ConfigurationError(
-                f"home must have one angle per joint, {len(true.joints)}, got {len(home)}"
-            )
-        tool = (
-            None
-            if self.end_effector is None
-            else EndEffector(true.rigid, true.joint_names, self.end_effector)
-        )
-        motion = ArmMotion(config.reference, _workspace(true, body, home, tool))
-        plan = motion.plan(np.random.default_rng(0), config.control_period_s)
+        period_s = config.control_period_s
+        loaded = self._loaded(config).compile()
+        true = RobotModel(config.true_joints, loaded, period_s)
+        names = true.joint_names
+        n = len(names)
+        body = RigidBody(loaded, names)
+        home = np.zeros(n) if self.home is None else np.array(self.home, dtype=np.float64)
+        if home.shape != (n,):
+            raise ConfigurationError(f"home must have one angle per joint, {n}, got {len(home)}")
+        tool = None
+        if self.end_effector is not None:
+            tool = EndEffector(loaded, names, self.end_effector)
+        motion = arm_references.motion_of(config.reference, _workspace(true, body, home, tool))
+        plan = motion.plan(np.random.default_rng(0), period_s)
         rows = slice(None, None, max(plan.num_steps // 500, 1))
-        q, q_dot, q_ddot = (
-            np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot)
-        )
+        q = np.ascontiguousarray(plan.q[rows])
         _require_in_range(config, true, q)
-        _require_torque(config, true, body, (q, q_dot, q_ddot))
-        assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
+        _require_torque(config, true, body, (q, plan.q_dot[rows], plan.q_ddot[rows]))
+        assumed = RobotModel(config.known_joints, self.rigid().compile(), period_s)
         _warn_of_action_bound(config, assumed, body.gravity_torque(q))
         return JointPlant(
             name=self.name,
             model=self.elastic(config).compile(),
             assumed=assumed,
             true=true,
+            form=config.form,
             static_torque=body.gravity_torque,
+            torque_gradient=body.gravity_gradient,
             motion=motion,
-            rest_angle=partial(_rest_angle, form=config.form, true=true, body=body),
             end_effector=tool,
         )
 
-    def elastic(self, config: JointRobotConfig) -> mujoco.MjSpec:
+    def elastic(self, config: "JointRobotConfig") -> mujoco.MjSpec:
         """The plant: the model with the scenario's load, with elastic joints, and with sensors.
 
         Raises:
             ConfigurationError: A sensor has no place.
         """
-        spec = transform_hinges(self._loaded(config), self._true_joints(config), config.form)
+        spec = transform_hinges(self._loaded(config), config.true_joints, config.form)
         spec.option.timestep = config.timestep_s
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode, not restart the world behind the task's back
@@ -218,10 +191,7 @@ class JointRobot:
             add_accelerometer(spec, self.imu)
         return spec
 
-    def _true_joints(self, config: JointRobotConfig) -> dict[str, ElasticJoint]:
-        return {name: config.as_built(joint) for name, joint in config.joints.items()}
-
-    def _loaded(self, config: JointRobotConfig) -> mujoco.MjSpec:
+    def _loaded(self, config: "JointRobotConfig") -> mujoco.MjSpec:
         """The model with its load scaled, or with the share of a mass at its end effector."""
         spec = self.rigid()
         scale = config.scenario.pendulum_mass_scale
@@ -232,40 +202,58 @@ class JointRobot:
         last = spec.copy().compile().joint(list(self.joints)[-1])
         return _scaled(spec, int(last.bodyid[0]), scale)
 
-    def _task(self, config: JointRobotConfig, num_worlds: int) -> JointTask:
-        return JointTask(config, self.plant(config), num_worlds)
+
+class JointRobotConfig(JointConfig):
+    """All of the environment of a robot of one's own."""
+
+    reference: ArmReference = Multisine()  # pyright: ignore[reportIncompatibleVariableOverride]
+    robot: JointRobot
+    joints: dict[str, ElasticJoint]
+    """The joints as they are known; the scenario says in what the true ones differ."""
+
+    @property
+    def true_joints(self) -> dict[str, ElasticJoint]:
+        """The joints as the plant has them."""
+        return {name: self.as_built(joint) for name, joint in self.joints.items()}
+
+    @property
+    def known_joints(self) -> dict[str, ElasticJoint]:
+        """Joints as a compensator knows them: without friction where the scenario has none."""
+        if self.scenario.friction_scale > 0.0:
+            return self.joints
+        none = dict.fromkeys(_FRICTIONS, 0.0)
+        return {name: one.replace(**none) for name, one in self.joints.items()}
+
+    def plant(self) -> JointPlant:
+        """The robot as it is built, and as it is known."""
+        return self.robot.plant(self)
 
 
 class JointPicture(Picture):
     """The robot with its deviations enlarged, and the reference as a translucent robot.
 
     Args:
-        robot: What is drawn.
         task: Rules of the worlds whose true state is drawn.
     """
 
-    def __init__(self, robot: JointRobot, task: JointTask) -> None:
+    def __init__(self, task: JointTask) -> None:
+        assert isinstance(task.config, JointRobotConfig)
+        robot = task.config.robot
         spec = robot.rigid()
-        set_stage(spec, WIDTH, HEIGHT)
+        set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
         look = spec.copy().compile().stat
         x, y, z = look.center
-        spec.worldbody.add_camera(
-            name=CAMERA,
-            pos=[x, y - 2.4 * look.extent, z + 0.25 * look.extent],
-            xyaxes=[1, 0, 0, 0, 0.1, 1],
-        )
-        spec.worldbody.add_light(
-            pos=[x + look.extent, y - 3.0 * look.extent, z + 3.0 * look.extent],
-            dir=[-0.2, 0.7, -0.7],
-            diffuse=[0.5] * 3,
-            specular=[0.0] * 3,
-            castshadow=False,
-        )
+        eye = [x, y - 2.4 * look.extent, z + 0.25 * look.extent]
+        spec.worldbody.add_camera(name=CAMERA, pos=eye, xyaxes=[1, 0, 0, 0, 0.1, 1])
+        light = spec.worldbody.add_light(dir=[-0.2, 0.7, -0.7], castshadow=False)
+        light.pos = [x + look.extent, y - 3.0 * look.extent, z + 3.0 * look.extent]
+        light.diffuse = [0.5] * 3
+        light.specular = [0.0] * 3
         reference = robot.rigid()
         for geom in reference.geoms:
-            geom.rgba = REFERENCE_RGBA
+            geom.rgba = deviations.REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-        super().__init__(spec, (("translucent: reference", REFERENCE_WORD_RGBA),))
+        super().__init__(spec, (("translucent: reference", deviations.REFERENCE_WORD_RGBA),))
         self._robot = robot
         self._task = task
         self._joints = list(robot.joints)
@@ -277,32 +265,19 @@ class JointPicture(Picture):
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """Reference, motor side and link side of a world."""
-        truth = self._task.truth()
-        q_ref = self._task.sample().joints["truth"]["q_ref"]
-        return Sides(q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
+        joints = self._task.sample().joints["truth"][world]
+        return Sides(*(joints[name].copy() for name in ("q_ref", "theta", "q")))
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
-        q = self._task.truth().q[world]
-        q_ref = self._task.sample().joints["truth"]["q_ref"][world]
-        drawn = q_ref + ENLARGEMENT * (q - q_ref)
+        joints = self._task.sample().joints["truth"][world]
+        q_ref = joints["q_ref"]
+        drawn = q_ref + deviations.ENLARGEMENT * (joints["q"] - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return deviation_caption(now)
-
-
-def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
-    """Joints as a compensator knows them: without friction where the scenario has none."""
-    if config.scenario.friction_scale > 0.0:
-        return config.joints
-    return {
-        name: one.replace(
-            coulomb_friction=0.0, viscous_friction=0.0, load_friction=0.0, static_friction=0.0
-        )
-        for name, one in config.joints.items()
-    }
+        return deviations.deviation_caption(now)
 
 
 def _scaled(spec: mujoco.MjSpec, body: int, scale: float) -> mujoco.MjSpec:
@@ -327,10 +302,10 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
             " an end effector, and give load_kg and the scenario's pendulum_mass_scale - 1 the"
             " same sign"
         )
-    place = np.zeros(3) if site is None else site.pos
-    carrier.add_body(
-        pos=place, mass=mass, ipos=[0.0] * 3, inertia=[_POINT * mass] * 3, explicitinertial=True
-    )
+    load = carrier.add_body(pos=np.zeros(3) if site is None else site.pos, mass=mass)
+    load.ipos = [0.0] * 3
+    load.inertia = [_POINT * mass] * 3
+    load.explicitinertial = True
     return spec
 
 
@@ -350,7 +325,7 @@ def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
 
 
 def _require_torque(
-    config: JointRobotConfig,
+    config: "JointRobotConfig",
     robot: RobotModel,
     body: RigidBody,
     motion: tuple[Array, Array, Array],
@@ -359,14 +334,13 @@ def _require_torque(
 
     `motion` has its angles, rates and accelerations.
     """
-    q, q_dot, q_ddot = motion
-    needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(
-        axis=0
-    )
+    _, q_dot, q_ddot = motion
+    torque = body.inverse_dynamics(*motion) + robot.rotor_inertia * q_ddot
     fastest = np.abs(q_dot).max(axis=0)
-    needed = robot.largest_passed_torque(needed + robot.viscous_friction * fastest)
+    needed = np.abs(torque).max(axis=0) + robot.viscous_friction * fastest
+    needed = robot.largest_passed_torque(needed)
     limits = robot.largest_torque(fastest)
-    if not isinstance(config.reference, OfArm):
+    if not isinstance(config.reference, arm_references.OfArm):
         require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
         weakest = int(np.argmax(needed - limits))
@@ -377,7 +351,7 @@ def _require_torque(
         )
 
 
-def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: Array) -> None:
+def _warn_of_action_bound(config: "JointRobotConfig", known: RobotModel, torque: Array) -> None:
     """Warn where the weight along a reference bends joints by more than an action can take back.
 
     Args:
@@ -402,7 +376,7 @@ def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: A
         )
 
 
-def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> None:
+def _require_in_range(config: "JointRobotConfig", robot: RobotModel, q: Array) -> None:
     """Refuse a reference that presses a joint against its limit."""
     ranges = joint_ranges(robot.rigid, robot.joint_names)
     for name, lowest, highest, own in zip(robot.joint_names, *ranges, q.T, strict=True):
@@ -412,31 +386,3 @@ def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> 
                 f" {own.min():.3f} to {own.max():.3f} rad, and its range is {lowest:.3f} to"
                 f" {highest:.3f} rad; lower the amplitude, or choose another home"
             )
-
-
-def _rest_angle(
-    command: Array,
-    factor: Parameter = 1.0,
-    backlash: Array | None = None,
-    *,
-    form: str,
-    true: RobotModel,
-    body: RigidBody,
-) -> Array:
-    """Link angles at rest without friction.
-
-    A dead band is crossed to the side to which the load pulls.
-    """
-    stiffness = true.rest_stiffness(form, factor)
-    if np.isinf(stiffness).all():
-        return command
-    engaged = (
-        command
-        - np.sign(body.gravity_torque(command))
-        * (true.backlash if backlash is None else backlash)
-        / 2.0
-    )
-    finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
-    return static_link_angle(
-        engaged, finite, body.gravity_torque, body.gravity_gradient, unique=False
-    )

@@ -23,35 +23,45 @@ SECOND_HALF = 2
 """Of a swing; 0 is none."""
 
 
-class Joints(NamedTuple):
-    """Constants of the joints within an episode.
+class Step(NamedTuple):
+    """Joints and worlds in a control step: constants within an episode, and records.
 
     Attributes:
-        at: Where they stand in the physics, (n,).
+        last_joints, joints: Records of the step before, and of the present one, which is filled,
+            (num_worlds, n).
+        last_worlds, worlds: The same of the worlds, (num_worlds,).
+        at: Where the joints stand in the physics, (n,).
         columns: Where they stand in the observation, (1,).
         plans: Angle, rate and acceleration of the reference at every step, (plans, steps, 3, n).
         plan: Which of the plans each world follows, (num_worlds,).
         rules: Records of `RULES`, (kinds,).
         kind: Which of the rules, and of all other constants, hold in each world, (num_worlds,).
+        samples: Standard normal samples ahead, (block, num_worlds).
+        used: How many of each world's are used, (num_worlds,).
     """
 
+    last_joints: Any
+    joints: Any
+    last_worlds: Any
+    worlds: Any
     at: Any
     columns: Any
     plans: Array
     plan: IntArray
     rules: Any
     kind: IntArray
-
-
-class Noise(NamedTuple):
-    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,)."""
-
     samples: Any
     used: IntArray
 
 
-class Commanded(NamedTuple):
-    """Commands of the control step that has gone by.
+@compiled
+def step_of(joints: Any, worlds: Any, row: int, *constants: Any) -> Step:
+    """The step of a row of blocks of joints, (steps, num_worlds, n), and of worlds."""
+    return Step(joints[row - 1], joints[row], worlds[row - 1], worlds[row], *constants)
+
+
+class Control(NamedTuple):
+    """Commands of the control step that has gone by, and arrays that it fills.
 
     Attributes:
         offset: Within their bounds, (num_worlds, n) [rad].
@@ -59,59 +69,29 @@ class Commanded(NamedTuple):
         diverged: Worlds that diverged, to which those too fast are added. They keep truth and
             measurements.
         periods: Control periods that have gone by, more than 1 where hardware has missed some.
-    """
-
-    offset: Array
-    is_clipped: BoolArray
-    diverged: BoolArray
-    periods: float
-
-
-class Steps(NamedTuple):
-    """The control step before, and the present one, which is filled.
-
-    Joints are (num_worlds, n), worlds (num_worlds,).
-    """
-
-    last_joints: Any
-    joints: Any
-    last_worlds: Any
-    worlds: Any
-
-
-class Results(NamedTuple):
-    """Arrays that a step fills beside its records.
-
-    Attributes:
         observed: Observation, (num_worlds, columns).
         reward: (num_worlds,).
         ends: Whether a world diverged, failed in other ways, is terminated, is truncated, (ways,
             num_worlds).
     """
 
+    offset: Array
+    is_clipped: BoolArray
+    diverged: BoolArray
+    periods: float
     observed: Array
     reward: Array
     ends: BoolArray
 
 
 @compiled
-def command(
-    joints: Any,
-    last_joints: Any,
-    last_worlds: Any,
-    action: Array,
-    bound: Array,
-    is_clipped: BoolArray,
-    inputs: Array,
-) -> bool:
+def command(step: Any, action: Array, bound: Array, is_clipped: BoolArray, inputs: Array) -> bool:
     """Servo inputs of the coming control period, q_ref + offset.
 
     Encoders are off by their homing error.
 
     Args:
-        joints: `Joints`.
-        last_joints: Records of the present step, (num_worlds, n).
-        last_worlds: The same of the worlds, (num_worlds,).
+        step: The present `Step`.
         action: Offsets, (num_worlds, n) [rad], which are brought within their bounds.
         bound: Of every joint [rad].
         is_clipped: To be filled: worlds with an action beyond its bounds.
@@ -120,155 +100,127 @@ def command(
     Returns:
         Whether all offsets are finite; if not, no input is written.
     """
-    joints = Joints(*joints)
+    step = step_of(*step)
     for world in range(len(action)):
         for i in range(len(bound)):
             if not np.isfinite(action[world, i]):
                 return False
     for world in range(len(action)):
         is_clipped[world] = False
-        plan = joints.plans[joints.plan[world]]
-        coming = min(last_worlds[world].truth.step + 1, len(plan) - 1)
+        coming = coming_motion(step, world)
         for i in range(len(bound)):
             value = action[world, i]
             offset = min(max(value, -bound[i]), bound[i])
             if offset != value:
                 is_clipped[world] = True
             action[world, i] = offset
-            inputs[world, joints.at[i].servo] = (
-                plan[coming, 0, i] + offset - last_joints[world, i].truth.homing
-            )
+            homing = step.joints[world, i].truth.homing
+            inputs[world, step.at[i].servo] = coming[0, i] + offset - homing
     return True
 
 
 @compiled
-def begin_joints(qpos: Array, qvel: Array, joints: Joints, worlds: BoolArray, steps: Steps) -> None:
-    """Truth and measurements of joints at the start of an episode in some worlds.
-
-    The joints have been at rest.
-    """
-    for world in range(len(worlds)):
-        if worlds[world]:
-            course = steps.worlds[world].truth
-            course.step = 0
-            course.command_rate = 0.0
-            course.clipped = False
-            course.diverged = False
-            rules = joints.rules[joints.kind[world]]
-            plan = joints.plans[joints.plan[world]]
-            for i in range(len(joints.at)):
-                joint = steps.joints[world, i]
-                joint.truth.q_ref = plan[0, 0, i]
-                joint.truth.command = plan[0, 0, i]
-                joint.truth.offset = 0.0
-                joint.truth.command_rate = 0.0
-                read_joint(qpos[world], qvel[world], joints.at[i], joint.truth)
-                show_encoder(joint.truth, rules.count_rad, joint.shown)
-                joint.shown.encoder_before = joint.shown.encoder
+def coming_motion(step: Step, world: int) -> Any:
+    """Angle, rate and acceleration of the reference at the end of the coming period, (3, n)."""
+    plan = step.plans[step.plan[world]]
+    return plan[min(step.worlds[world].truth.step + 1, len(plan) - 1)]
 
 
 @compiled
-def sense_joints(
-    qpos: Array, qvel: Array, joints: Joints, commanded: Commanded, steps: Steps, observed: Array
-) -> None:
+def begin_joints(qpos: Array, qvel: Array, step: Step, world: int) -> None:
+    """Truth and measurements of joints that have been at rest at the start of an episode."""
+    course = step.worlds[world].truth
+    course.step = 0
+    course.command_rate = 0.0
+    course.clipped = False
+    course.diverged = False
+    count_rad = step.rules[step.kind[world]].count_rad
+    plan = step.plans[step.plan[world]]
+    for i in range(len(step.at)):
+        joint = step.joints[world, i]
+        joint.truth.q_ref = plan[0, 0, i]
+        joint.truth.command = plan[0, 0, i]
+        joint.truth.offset = 0.0
+        joint.truth.command_rate = 0.0
+        read_joint(qpos[world], qvel[world], step.at[i], joint, count_rad)
+        joint.shown.encoder_before = joint.shown.encoder
+
+
+@compiled
+def sense_joints(qpos: Array, qvel: Array, step: Step, control: Control) -> None:
     """Joints after the physics of a control step: keep the command, read, measure, observe."""
-    offset = commanded.offset
-    diverged = commanded.diverged
-    n = len(joints.at)
+    offset = control.offset
+    diverged = control.diverged
+    n = len(step.at)
     for world in range(len(offset)):
-        rules = joints.rules[joints.kind[world]]
-        plan = joints.plans[joints.plan[world]]
-        steps.worlds[world] = steps.last_worlds[world]
-        course = steps.worlds[world].truth
+        rules = step.rules[step.kind[world]]
+        plan = step.plans[step.plan[world]]
+        step.worlds[world] = step.last_worlds[world]
+        course = step.worlds[world].truth
         course.step += 1
-        course.clipped = commanded.is_clipped[world]
+        course.clipped = control.is_clipped[world]
         total = 0.0
         for i in range(n):
-            steps.joints[world, i] = steps.last_joints[world, i]
-            truth = steps.joints[world, i].truth
+            step.joints[world, i] = step.last_joints[world, i]
+            truth = step.joints[world, i].truth
             truth.q_ref = plan[min(course.step, len(plan) - 1), 0, i]
             change = offset[world, i] - truth.offset
             truth.offset = offset[world, i]
             truth.command = truth.q_ref + truth.offset
             truth.command_rate = change / rules.control_period_s
             total += change * change
-            fastest = max(
-                abs(qvel[world, joints.at[i].theta_dot]), abs(qvel[world, joints.at[i].q_dot])
-            )
+            motor = abs(qvel[world, step.at[i].theta_dot])
+            fastest = max(motor, abs(qvel[world, step.at[i].q_dot]))
             diverged[world] = diverged[world] or fastest > rules.highest_rad_s
         course.command_rate = math.sqrt(total / n) / rules.control_period_s
         course.diverged = diverged[world]
         if not diverged[world]:
             for i in range(n):
-                joint = steps.joints[world, i]
-                read_joint(qpos[world], qvel[world], joints.at[i], joint.truth)
+                joint = step.joints[world, i]
                 joint.shown.encoder_before = joint.shown.encoder
-                show_encoder(joint.truth, rules.count_rad, joint.shown)
-        visible = steps.last_joints[world] if rules.is_delayed else steps.joints[world]
-        period_s = rules.control_period_s * commanded.periods
-        observe_joints(
-            joints, plan, course.step, steps.joints[world], visible, period_s, observed[world]
-        )
+                read_joint(qpos[world], qvel[world], step.at[i], joint, rules.count_rad)
+        observe_joints(step, world, control.periods, control.observed[world])
 
 
 @compiled
-def show_joints(joints: Any, steps: Any, observed: Array) -> None:
+def show_joints(step: Any, observed: Array) -> None:
     """The joints' columns of observations of the present state."""
-    joints = Joints(*joints)
-    steps = Steps(*steps)
+    step = step_of(*step)
     for world in range(len(observed)):
-        rules = joints.rules[joints.kind[world]]
-        plan = joints.plans[joints.plan[world]]
-        visible = steps.last_joints[world] if rules.is_delayed else steps.joints[world]
-        step = steps.worlds[world].truth.step
-        observe_joints(
-            joints,
-            plan,
-            step,
-            steps.joints[world],
-            visible,
-            rules.control_period_s,
-            observed[world],
-        )
+        observe_joints(step, world, 1.0, observed[world])
 
 
 @compiled
-def read_joint(qpos: Array, qvel: Array, at: Any, truth: Any) -> None:
-    """State of a joint as the physics has it."""
+def read_joint(qpos: Array, qvel: Array, at: Any, joint: Any, count_rad: float) -> None:
+    """State of a joint as the physics has it, and the motor's angle by its encoder."""
+    truth = joint.truth
     truth.theta = qpos[at.theta]
     truth.theta_dot = qvel[at.theta_dot]
     truth.q = qpos[at.q]
     truth.q_dot = qvel[at.q_dot]
-
-
-@compiled
-def show_encoder(truth: Any, count_rad: float, shown: Any) -> None:
-    """The motor's angle by its encoder."""
     angle = truth.theta + truth.homing
-    shown.encoder = in_whole_counts(angle, count_rad) if count_rad > 0.0 else angle
+    joint.shown.encoder = angle
+    if count_rad > 0.0:
+        joint.shown.encoder = in_whole_counts(angle, count_rad)
 
 
 @compiled
-def observe_joints(
-    joints: Joints,
-    plan: Array,
-    step: int,
-    present: Any,
-    visible: Any,
-    period_s: float,
-    observed: Array,
-) -> None:
+def observe_joints(step: Step, world: int, periods: float, observed: Array) -> None:
     """Fill the joints' columns of an observation, the coming reference among them."""
-    columns = joints.columns[0]
-    coming = min(step + 1, len(plan) - 1)
-    for i in range(len(joints.at)):
+    rules = step.rules[step.kind[world]]
+    visible = step.last_joints[world] if rules.is_delayed else step.joints[world]
+    period_s = rules.control_period_s * periods
+    coming = coming_motion(step, world)
+    columns = step.columns[0]
+    for i in range(len(step.at)):
         shown = visible[i].shown
         observed[columns.encoder_angle + i] = shown.encoder
-        observed[columns.encoder_rate + i] = (shown.encoder - shown.encoder_before) / period_s
-        observed[columns.reference_angle + i] = plan[coming, 0, i]
-        observed[columns.reference_rate + i] = plan[coming, 1, i]
-        observed[columns.reference_acceleration + i] = plan[coming, 2, i]
-        observed[columns.last_command + i] = present[i].truth.command
+        change = shown.encoder - shown.encoder_before
+        observed[columns.encoder_rate + i] = change / period_s
+        observed[columns.reference_angle + i] = coming[0, i]
+        observed[columns.reference_rate + i] = coming[1, i]
+        observed[columns.reference_acceleration + i] = coming[2, i]
+        observed[columns.last_command + i] = step.joints[world, i].truth.command
 
 
 # links on a fixed base
@@ -294,112 +246,92 @@ class Links(NamedTuple):
 
 
 @compiled
-def begin_links(
-    qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, worlds: BoolArray, steps: Any
-) -> None:
+def begin_links(qpos: Array, qvel: Array, step: Any, links: Any, worlds: BoolArray) -> None:
     """Truth and measurements of links at the start of an episode in some worlds.
 
     The links have been at rest.
     """
-    joints = Joints(*joints)
+    step = step_of(*step)
     links = Links(*links)
-    noise = Noise(*noise)
-    steps = Steps(*steps)
-    begin_joints(qpos, qvel, joints, worlds, steps)
     for world in range(len(worlds)):
         if worlds[world]:
-            truth = steps.worlds[world].truth
-            shown = steps.worlds[world].shown
+            begin_joints(qpos, qvel, step, world)
+            truth = step.worlds[world].truth
+            shown = step.worlds[world].shown
             truth.scored = links.schedule[0].scored
             truth.rest = links.schedule[0].rest
-            constants = links.constants[0]
-            q = steps.joints[world, 0].truth.q
-            show_link(noise, world, q, links.imu_angle, links.imu_bias[world], constants, shown)
+            show_link(links.imu_angle, links, step, world)
             shown.visible_imu = shown.imu
 
 
 @compiled
-def sense_links(
-    qpos: Array,
-    qvel: Array,
-    joints: Any,
-    links: Any,
-    noise: Any,
-    commanded: Any,
-    steps: Any,
-    results: Any,
-) -> bool:
+def sense_links(qpos: Array, qvel: Array, step: Any, links: Any, control: Any) -> bool:
     """Everything after the physics where the base is fixed: read, measure, end, score, observe.
 
     Args:
         qpos: Positions of all worlds.
         qvel: And speeds.
-        joints: `Joints`.
+        step: `Step`.
         links: `Links`.
-        noise: Of the IMU, `Noise`.
-        commanded: `Commanded`.
-        steps: `Steps`.
-        results: To be filled, `Results`.
+        control: `Control`.
 
     Returns:
         Whether an episode ends.
     """
-    joints = Joints(*joints)
+    step = step_of(*step)
     links = Links(*links)
-    noise = Noise(*noise)
-    commanded = Commanded(*commanded)
-    steps = Steps(*steps)
-    results = Results(*results)
-    sense_joints(qpos, qvel, joints, commanded, steps, results.observed)
-    diverged = commanded.diverged
+    control = Control(*control)
+    sense_joints(qpos, qvel, step, control)
+    diverged = control.diverged
     is_over = False
     for world in range(len(diverged)):
-        kind = joints.kind[world]
-        constants = links.constants[0]
-        truth = steps.worlds[world].truth
-        shown = steps.worlds[world].shown
-        scores = steps.worlds[world].scores
+        truth = step.worlds[world].truth
+        shown = step.worlds[world].shown
+        scores = step.worlds[world].scores
         last = len(links.schedule) - 1
         planned = links.schedule[min(truth.step, last)]
         truth.scored = planned.scored
         truth.rest = planned.rest
         if planned.imu_is_due and not diverged[world]:
-            q = steps.joints[world, 0].truth.q
-            show_link(noise, world, q, links.imu_angle, links.imu_bias[world], constants, shown)
-        is_delayed = joints.rules[kind].is_delayed
-        shown.visible_imu = steps.last_worlds[world].shown.imu if is_delayed else shown.imu
+            show_link(links.imu_angle, links, step, world)
+        is_delayed = step.rules[step.kind[world]].is_delayed
+        shown.visible_imu = shown.imu
+        if is_delayed:
+            shown.visible_imu = step.last_worlds[world].shown.imu
         if links.imu_column >= 0:
-            results.observed[world, links.imu_column] = shown.visible_imu
-        ends = results.ends[:, world]
+            control.observed[world, links.imu_column] = shown.visible_imu
+        ends = control.ends[:, world]
         ends[0] = ends[1] = diverged[world]
         ends[2] = truth.step >= last and not diverged[world]
         is_over = is_over or ends[0] or ends[2]
         total = 0.0
-        for i in range(len(joints.at)):
-            error = steps.joints[world, i].truth.q_ref - steps.joints[world, i].truth.q
+        for i in range(len(step.at)):
+            error = step.joints[world, i].truth.q_ref - step.joints[world, i].truth.q
             total += error * error
-        weights = constants.weights  # of penalties that grow without saturating
-        scores.link_error = weights.link_error * -math.sqrt(total / len(joints.at))
+        # of penalties that grow without saturating
+        weights = links.constants[0].weights
+        scores.link_error = weights.link_error * -math.sqrt(total / len(step.at))
         scores.command_rate = weights.command_rate * -truth.command_rate
         scores.divergence = weights.divergence * (-1.0 if diverged[world] else -0.0)
-        results.reward[world] = scores.link_error + scores.command_rate + scores.divergence
+        reward = scores.link_error + scores.command_rate + scores.divergence
+        control.reward[world] = reward
     return is_over
 
 
 @compiled
-def show_link(
-    noise: Noise, world: int, q: float, imu_angle: Any, imu_bias: float, constants: Any, shown: Any
-) -> None:
+def show_link(imu_angle: Any, links: Links, step: Step, world: int) -> None:
     """The next sample of the IMU on the only link, see `Links`."""
-    drawn = sample_of(noise, world)
+    quality = links.constants[0]
+    drawn = sample_of(step, world)
     if imu_angle is None:
-        angle = q
-        added = constants.imu_noise_rad * drawn.imu
+        angle = step.joints[world, 0].truth.q
+        added = quality.imu_noise_rad * drawn.imu
     else:
         angle = imu_angle[world]
         added = 0.0
-    shown.imu = shown_angle(
-        angle, imu_bias, added, constants.imu_bias_rad, constants.imu_sine_error_rad
+    bias = links.imu_bias[world]
+    step.worlds[world].shown.imu = shown_angle(
+        angle, bias, added, quality.imu_bias_rad, quality.imu_sine_error_rad
     )
 
 
@@ -425,7 +357,7 @@ class Walker(NamedTuple):
         plan: One record per control step.
         bias: Errors of mounting, and of an inertial IMU, (num_worlds,).
         inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an
-            IMU: its filter is then not even compiled.
+            IMU: its filter is then not even compiled. It is therefore an argument of its own.
         columns: Where the observation has what they show, (1,).
     """
 
@@ -437,104 +369,71 @@ class Walker(NamedTuple):
 
 
 @compiled
-def begin_walk(
-    physics: Any, joints: Any, walker: Any, noise: Any, worlds: BoolArray, steps: Any
-) -> None:
+def begin_walk(physics: Any, step: Any, walker: Any, worlds: BoolArray) -> None:
     """Truth and measurements of walkers at the start of an episode in some worlds.
 
     The walkers have been at rest.
     """
     physics = Physics(*physics)
-    joints = Joints(*joints)
+    step = step_of(*step)
     walker = Walker(*walker)
-    noise = Noise(*noise)
-    steps = Steps(*steps)
-    begin_joints(physics.qpos, physics.qvel, joints, worlds, steps)
     for world in range(len(worlds)):
         if worlds[world]:
-            truth = steps.worlds[world].truth
-            shown = steps.worlds[world].shown
-            kind = joints.kind[world]
-            constants = walker.constants[kind]
-            truth.contact_since = -1
-            read_body(physics, constants, world, truth)
-            stand(physics, constants, world, truth)
-            drawn = sample_of(noise, world)
+            begin_joints(physics.qpos, physics.qvel, step, world)
+            step.worlds[world].truth.contact_since = -1
+            read_body(physics, walker, step, world)
+            drawn = sample_of(step, world)
+            settle_imu(walker.inertial, walker, step, world, drawn)
             is_due = walker.plan[0].imu_is_due
-            settle_imu(walker.inertial, walker, kind, world, truth, drawn, shown)
-            measure(walker.inertial, walker, kind, world, truth, drawn, is_due, shown)
+            measure(walker.inertial, walker, step, world, drawn, is_due)
 
 
 @compiled
-def sense_walk(
-    physics: Any, joints: Any, walker: Any, noise: Any, commanded: Any, steps: Any, results: Any
-) -> bool:
+def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
     """Everything after the physics in a walker: read, measure, end, score, observe.
 
     Args:
         physics: State of all worlds, `Physics`.
-        joints: `Joints`.
+        step: `Step`.
         walker: `Walker`.
-        noise: Of the sensors, `Noise`.
-        commanded: `Commanded`.
-        steps: `Steps`.
-        results: To be filled, `Results`.
+        control: `Control`.
 
     Returns:
         Whether an episode ends.
     """
     physics = Physics(*physics)
-    joints = Joints(*joints)
+    step = step_of(*step)
     walker = Walker(*walker)
-    noise = Noise(*noise)
-    commanded = Commanded(*commanded)
-    steps = Steps(*steps)
-    results = Results(*results)
-    sense_joints(physics.qpos, physics.qvel, joints, commanded, steps, results.observed)
-    diverged = commanded.diverged
+    control = Control(*control)
+    sense_joints(physics.qpos, physics.qvel, step, control)
+    diverged = control.diverged
     is_over = False
     for world in range(len(diverged)):
-        kind = joints.kind[world]
-        last = steps.last_worlds[world]
-        constants = walker.constants[kind]
-        rules = constants.rules
-        truth = steps.worlds[world].truth
-        shown = steps.worlds[world].shown
-        scores = steps.worlds[world].scores
+        rules = walker.constants[step.kind[world]]
+        truth = step.worlds[world].truth
         planned = row_of(walker.plan, truth.step)
         if not diverged[world]:
-            read_body(physics, constants, world, truth)
-            stand(physics, constants, world, truth)
-            drawn = sample_of(noise, world)
-            is_due = planned.imu_is_due
-            period_s = joints.rules[kind].control_period_s
-            before = last.truth
-            advance_imu(walker.inertial, walker, kind, world, before, truth, drawn, period_s, shown)
-            measure(walker.inertial, walker, kind, world, truth, drawn, is_due, shown)
+            read_body(physics, walker, step, world)
+            drawn = sample_of(step, world)
+            advance_imu(walker.inertial, walker, step, world, drawn)
+            measure(walker.inertial, walker, step, world, drawn, planned.imu_is_due)
         watch_swing_foot(truth, planned, rules.loaded_n)
+        ends = control.ends[:, world]
         is_last = truth.step >= len(walker.plan) - 1
-        is_over = end(truth, rules, diverged[world], is_last, results.ends[:, world]) or is_over
-        results.reward[world] = score(
-            truth, planned, rules.weights, results.ends[-2, world], scores
-        )
-        visible = last.shown if joints.rules[kind].is_delayed else shown
-        observe_walk(
-            visible, row_of(walker.plan, truth.step + 1), walker.columns[0], results.observed[world]
-        )
+        is_over = end(truth, rules, diverged[world], is_last, ends) or is_over
+        scores = step.worlds[world].scores
+        control.reward[world] = score(truth, planned, rules.weights, ends[2], scores)
+        observe_walk(step, walker, world, control.observed[world])
     return is_over
 
 
 @compiled
-def show_walk(joints: Any, walker: Any, steps: Any, observed: Array) -> None:
+def show_walk(step: Any, walker: Any, observed: Array) -> None:
     """The walker's columns of observations of the present state."""
-    joints = Joints(*joints)
+    step = step_of(*step)
     walker = Walker(*walker)
-    steps = Steps(*steps)
     for world in range(len(observed)):
-        is_delayed = joints.rules[joints.kind[world]].is_delayed
-        visible = steps.last_worlds[world].shown if is_delayed else steps.worlds[world].shown
-        coming = row_of(walker.plan, steps.worlds[world].truth.step + 1)
-        observe_walk(visible, coming, walker.columns[0], observed[world])
+        observe_walk(step, walker, world, observed[world])
 
 
 @compiled
@@ -544,22 +443,25 @@ def row_of(plan: Any, step: int) -> Any:
 
 
 @compiled
-def sample_of(noise: Noise, world: int) -> Any:
+def sample_of(step: Step, world: int) -> Any:
     """The next sample of a world."""
-    used = noise.used[world]
-    noise.used[world] += 1
-    return noise.samples[min(used, len(noise.samples) - 1), world]
+    used = step.used[world]
+    step.used[world] += 1
+    return step.samples[min(used, len(step.samples) - 1), world]
 
 
 @compiled
-def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
-    """State of pelvis and feet as the physics has it.
+def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
+    """State of pelvis and feet as the physics has it, force of the ground, and the ZMP.
 
     MuJoCo's wrench acts on the foot, ours on the leg.
     """
+    constants = walker.constants[step.kind[world]]
+    row = step.worlds[world].truth
     qpos = physics.qpos[world]
     qvel = physics.qvel[world]
-    at = constants.at
+    frames = np.empty((3, 3, 3))  # orientation of both feet and of the pelvis
+    ground = np.empty((2, 2, 3))  # its forces on the feet, and its moments
     row.servo_torque = rms(physics.actuator_force[world])
     for i in range(3):
         row.pelvis[i] = qpos[i]
@@ -568,17 +470,23 @@ def read_body(physics: Physics, constants: Any, world: int, row: Any) -> None:
     for i in range(4):
         row.quaternion[i] = qpos[3 + i]
     for foot in range(2):
+        ankle = constants.ankles[foot]
         for i in range(3):
-            row.ankles[foot, i] = physics.site_xpos[world, at.ankles[foot], i]
+            row.ankles[foot, i] = physics.site_xpos[world, ankle, i]
             row.wrench[foot, 0, i] = -physics.sensordata[world, 6 * foot + i]
             row.wrench[foot, 1, i] = -physics.sensordata[world, 6 * foot + 3 + i]
-    w = row.quaternion[0]
-    x = row.quaternion[1]
-    y = row.quaternion[2]
-    z = row.quaternion[3]
-    up_x = 2.0 * (x * z - w * y)
-    up_y = 2.0 * (y * z + w * x)
-    row.roll, row.pitch, row.tilt = attitude_by(up_x, up_y, 1.0 - 2.0 * (x * x + y * y))
+            for j in range(3):
+                frames[foot, i, j] = physics.site_xmat[world, ankle, 3 * i + j]
+    rotation_of(row.quaternion, frames[2])
+    up = frames[2, 2]
+    row.roll, row.pitch, row.tilt = attitude_by(up[0], up[1], up[2])
+    weight = constants.foot_weight
+    force = ground[0]
+    moment = ground[1]
+    ground_wrench(row.wrench, frames, constants.foot_com, weight, force, moment)
+    moment_point(force, moment, row.ankles, constants.zmp_n, row.zmp)
+    row.force[0] = force[0, 2]
+    row.force[1] = force[1, 2]
 
 
 @compiled
@@ -592,84 +500,58 @@ def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, fl
 
 
 @compiled
-def stand(physics: Physics, constants: Any, world: int, row: Any) -> None:
-    """Force of the ground on the feet, and the ZMP."""
-    foot_R = np.empty((2, 3, 3))
-    force = np.empty((2, 3))
-    moment = np.empty((2, 3))
-    for foot in range(2):
-        for i in range(3):
-            for j in range(3):
-                foot_R[foot, i, j] = physics.site_xmat[world, constants.at.ankles[foot], 3 * i + j]
-    ground_wrench(row.wrench, foot_R, constants.foot_com, constants.foot_weight, force, moment)
-    moment_point(force, moment, row.ankles, constants.rules.zmp_n, row.zmp)
-    row.force[0] = force[0, 2]
-    row.force[1] = force[1, 2]
-
-
-@compiled
 def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
     """Since when the swing foot has been on the ground in the second half of its swing."""
     if planned.half_of_swing == FIRST_HALF:
         row.contact_since = -1
-    if (
-        planned.half_of_swing == SECOND_HALF
-        and row.contact_since < 0
-        and row.force[planned.swing_foot] > loaded_n
-    ):
+    is_landing = planned.half_of_swing == SECOND_HALF and row.contact_since < 0
+    if is_landing and row.force[planned.swing_foot] > loaded_n:
         row.contact_since = row.step
 
 
 @compiled
 def measure(
-    inertial: Any,
-    walker: Walker,
-    kind: int,
-    world: int,
-    row: Any,
-    noise: Any,
-    imu_is_due: bool,
-    shown: Any,
+    inertial: Any, walker: Walker, step: Step, world: int, noise: Any, imu_is_due: bool
 ) -> None:
     """Sample IMU and foot sensors; an IMU that is not due shows its last sample."""
-    bias = walker.bias[world]
-    quality = walker.constants[kind].quality
+    quality = walker.constants[step.kind[world]]
+    sigma = quality.noise
+    row = step.worlds[world].truth
+    shown = step.worlds[world].shown
     for foot in range(2):
-        for i in range(3):
-            force = row.wrench[foot, 0, i]
-            moment = row.wrench[foot, 1, i]
-            shown.wrench[foot, 0, i] = (
-                noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
-            )
-            shown.wrench[foot, 1, i] = (
-                noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
-            )
-    if imu_is_due:
-        if show_inertial(inertial, kind, bias, quality, shown):
-            return
-        for i, angle in enumerate((row.roll, row.pitch)):
-            drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
-            shown.imu_attitude[i] = shown_angle(
-                angle, bias.imu_attitude[i], drawn, quality.imu_bias_rad, quality.imu_sine_error_rad
-            )
-        for i in range(3):
-            shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
+        for part in range(2):
+            for i in range(3):
+                error = noise.wrench[foot, part, i] * sigma.wrench[foot, part, i]
+                shown.wrench[foot, part, i] = error + row.wrench[foot, part, i]
+    if not imu_is_due or show_inertial(inertial, walker, step, world):
+        return
+    bias = walker.bias[world].imu_attitude
+    for i, angle in enumerate((row.roll, row.pitch)):
+        drawn = sigma.imu_attitude[i] * noise.imu_attitude[i]
+        shown.imu_attitude[i] = shown_angle(
+            angle, bias[i], drawn, quality.imu_bias_rad, quality.imu_sine_error_rad
+        )
+    for i in range(3):
+        shown.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
 
 
 @compiled
-def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any) -> bool:
+def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool:
     """Show the state of an inertial IMU, where one is fitted; the result says so.
 
     Errors of the mounting come on top.
     """
     if inertial is None:
         return False
-    if not inertial[kind].is_fitted:
+    if not inertial[step.kind[world]].is_fitted:
         return False
+    quality = walker.constants[step.kind[world]]
+    bias = walker.bias[world].imu_attitude
+    shown = step.worlds[world].shown
     roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
     for i, angle in enumerate((roll, pitch)):
         shown.imu_attitude[i] = shown_angle(
-            angle, bias.imu_attitude[i], 0.0, quality.imu_bias_rad, quality.imu_sine_error_rad
+            angle, bias[i], 0.0, quality.imu_bias_rad, quality.imu_sine_error_rad
         )
     for i in range(3):
         shown.imu_rate[i] = shown.imu_gyro[i]
@@ -677,76 +559,66 @@ def show_inertial(inertial: Any, kind: int, bias: Any, quality: Any, shown: Any)
 
 
 @compiled
-def settle_imu(
-    inertial: Any, walker: Walker, kind: int, world: int, row: Any, noise: Any, shown: Any
-) -> None:
+def settle_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
     """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
     if inertial is None:
         return
-    sensor = inertial[kind]
+    sensor = inertial[step.kind[world]]
     bias = walker.bias[world]
-    quality = walker.constants[kind].quality
+    sigma = walker.constants[step.kind[world]].noise
+    row = step.worlds[world].truth
+    shown = step.worlds[world].shown
     force = np.empty(3)
     if not sensor.is_fitted:
         return
     specific_force(row, row, 1.0, sensor.gravity_m_s2, force)
     for i in range(3):
         force[i] += bias.specific_force[i]
-        shown.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
+        shown.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * sigma.imu_rate[i]
     settled_vertical(shown.imu_up, force, bias.gyro, sensor.time_constant_s)
 
 
 @compiled
-def advance_imu(
-    inertial: Any,
-    walker: Walker,
-    kind: int,
-    world: int,
-    before: Any,
-    row: Any,
-    noise: Any,
-    period_s: float,
-    shown: Any,
-) -> None:
+def advance_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
     """Advance an inertial IMU by a control period.
 
     Its gyroscope measures the mean rate, and its filter turns the vertical.
 
     Args:
-        inertial: That of `walker`, as an argument of its own: Numba then leaves out all of this
-            where it is None.
+        inertial: That of `walker`.
         walker: `Walker`.
-        kind: Which of its constants hold.
+        step: `Step`, whose measurements `imu_gyro` and `imu_up` are brought up to date.
         world: Number of the world.
-        before: Truth at the beginning of the period.
-        row: And at its end.
         noise: Sample of the sensors; that of the attitude is of the accelerometer, across the
             vertical.
-        period_s: Control period [s].
-        shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
     """
     if inertial is None:
         return
-    sensor = inertial[kind]
+    sensor = inertial[step.kind[world]]
     bias = walker.bias[world]
-    quality = walker.constants[kind].quality
+    sigma = walker.constants[step.kind[world]].noise
     if not sensor.is_fitted:
         return
+    gravity = sensor.gravity_m_s2
+    period_s = step.rules[step.kind[world]].control_period_s
+    before = step.last_worlds[world].truth
+    row = step.worlds[world].truth
+    shown = step.worlds[world].shown
     force = np.empty(3)
     turned = np.empty(3)
-    specific_force(before, row, period_s, sensor.gravity_m_s2, force)
+    specific_force(before, row, period_s, gravity, force)
     rotation_between(before.quaternion, row.quaternion, turned)
     # a force to the left is a positive roll, one forward a negative pitch
-    force[0] -= sensor.gravity_m_s2 * quality.noise.imu_attitude[1] * noise.imu_attitude[1]
-    force[1] += sensor.gravity_m_s2 * quality.noise.imu_attitude[0] * noise.imu_attitude[0]
+    force[0] -= gravity * sigma.imu_attitude[1] * noise.imu_attitude[1]
+    force[1] += gravity * sigma.imu_attitude[0] * noise.imu_attitude[0]
     for i in range(3):
         force[i] += bias.specific_force[i]
-        rate = turned[i] / period_s + bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
+        drawn = noise.imu_rate[i] * sigma.imu_rate[i]
+        rate = turned[i] / period_s + bias.gyro[i] + drawn
         shown.imu_gyro[i] = rate
         turned[i] = rate * period_s
-    complementary_filter(
-        shown.imu_up, turned, force, 1.0 - math.exp(-period_s / sensor.time_constant_s)
-    )
+    gain = 1.0 - math.exp(-period_s / sensor.time_constant_s)
+    complementary_filter(shown.imu_up, turned, force, gain)
 
 
 @compiled
@@ -757,16 +629,42 @@ def specific_force(
 
     It is acceleration minus gravity.
     """
-    w = row.quaternion[0]
-    x = row.quaternion[1]
-    y = row.quaternion[2]
-    z = row.quaternion[3]
-    a = (row.pelvis_velocity[0] - before.pelvis_velocity[0]) / period_s
-    b = (row.pelvis_velocity[1] - before.pelvis_velocity[1]) / period_s
-    c = (row.pelvis_velocity[2] - before.pelvis_velocity[2]) / period_s + gravity_m_s2
-    force[0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
-    force[1] = 2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c
-    force[2] = 2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c
+    R = np.empty((3, 3))
+    rotation_of(row.quaternion, R)
+    v = row.pelvis_velocity
+    u = before.pelvis_velocity
+    a = (v[0] - u[0]) / period_s
+    b = (v[1] - u[1]) / period_s
+    c = (v[2] - u[2]) / period_s + gravity_m_s2
+    for i in range(3):
+        force[i] = R[0, i] * a + R[1, i] * b + R[2, i] * c
+
+
+@compiled
+def rotation_of(quaternion: Array, R: Array) -> None:
+    """Rotation matrix of a unit quaternion w, x, y, z: into `R`, (3, 3)."""
+    w = quaternion[0]
+    x = quaternion[1]
+    y = quaternion[2]
+    z = quaternion[3]
+    R[0, 0] = 1 - 2 * (y * y + z * z)
+    R[0, 1] = 2 * (x * y - w * z)
+    R[0, 2] = 2 * (x * z + w * y)
+    R[1, 0] = 2 * (x * y + w * z)
+    R[1, 1] = 1 - 2 * (x * x + z * z)
+    R[1, 2] = 2 * (y * z - w * x)
+    R[2, 0] = 2 * (x * z - w * y)
+    R[2, 1] = 2 * (y * z + w * x)
+    R[2, 2] = 1 - 2 * (x * x + y * y)
+
+
+@compiled
+def rotations_of(quaternions: Array) -> Array:
+    """Rotation matrices of unit quaternions, (n, 4) to (n, 3, 3)."""
+    R = np.empty((len(quaternions), 3, 3))
+    for row in range(len(quaternions)):
+        rotation_of(quaternions[row], R[row])
+    return R
 
 
 @compiled
@@ -853,7 +751,9 @@ def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: floa
 @compiled
 def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, float]:
     """Cross product of (x, y, z) with another vector."""
-    return y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0]
+    a = y * other[2] - z * other[1]
+    b = z * other[0] - x * other[2]
+    return a, b, x * other[1] - y * other[0]
 
 
 @within_compiled
@@ -908,8 +808,12 @@ def zmp_penalty(zmp_deviation: Parameter) -> Any:
 
 
 @compiled
-def observe_walk(shown: Any, coming: Any, columns: Any, observed: Array) -> None:
+def observe_walk(step: Step, walker: Walker, world: int, observed: Array) -> None:
     """Fill the walker's columns of an observation, beside those of its joints."""
+    is_delayed = step.rules[step.kind[world]].is_delayed
+    shown = step.last_worlds[world].shown if is_delayed else step.worlds[world].shown
+    coming = row_of(walker.plan, step.worlds[world].truth.step + 1)
+    columns = walker.columns[0]
     observed[columns.load_share] = coming.share
     for i in range(2):
         observed[columns.imu_attitude + i] = shown.imu_attitude[i]
@@ -918,8 +822,9 @@ def observe_walk(shown: Any, coming: Any, columns: Any, observed: Array) -> None
         observed[columns.imu_rate + i] = shown.imu_rate[i]
         observed[columns.clock + i] = coming.clock[i]
         for foot in range(2):
-            observed[columns.wrench + 6 * foot + i] = shown.wrench[foot, 0, i]
-            observed[columns.wrench + 6 * foot + 3 + i] = shown.wrench[foot, 1, i]
+            for part in range(2):
+                column = columns.wrench + 6 * foot + 3 * part + i
+                observed[column] = shown.wrench[foot, part, i]
 
 
 @compiled

@@ -17,8 +17,8 @@ from elastic_env.world.scenario import Scenario
 
 def spring_ids(model: mujoco.MjModel, joints: Sequence[str], form: str) -> IntArray:
     """The springs of joints among the tendons of a model, (n,); none in the form "rigid"."""
-    names = joints if form == "tendon" else []
-    return np.array([model.tendon(spring_name(joint)).id for joint in names], dtype=np.int64)
+    names = [spring_name(joint) for joint in joints if form == "tendon"]
+    return np.array([model.tendon(name).id for name in names], dtype=np.int64)
 
 
 def set_joints(
@@ -38,9 +38,10 @@ def set_joints(
         robot: As it was drawn.
     """
     if len(springs):
-        ends = model.tendon_lengthspring[springs] + robot.backlash_rad * np.array([-0.5, 0.5])
-        field("tendon_lengthspring")[springs] = ends
-        field("tendon_stiffness")[springs] = model.tendon_stiffness[springs] * robot.stiffness
+        ends = robot.backlash_rad * np.array([-0.5, 0.5])
+        K = model.tendon_stiffness[springs] * robot.stiffness
+        field("tendon_lengthspring")[springs] = model.tendon_lengthspring[springs] + ends
+        field("tendon_stiffness")[springs] = K
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
     for name in ("dof_frictionloss", "dof_damping"):
         field(name)[links] = getattr(model, name)[links] * robot.friction
@@ -68,11 +69,12 @@ def require_passing(robot: RobotModel, scenario: Scenario) -> None:
 
 def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
     """A plant with the stiffest springs and strongest dampers that a scenario draws."""
-    stiffness = [1.0 + scenario.stiffness_spread] + [
-        own.stiffness[1] * own.joint_stiffness[1] for own in scenario.ranges
-    ]
-    damping = [1.0] + [own.damping[1] for own in scenario.ranges]
+    stiffest = 1.0 + scenario.stiffness_spread
+    strongest = 1.0
+    for own in scenario.ranges:
+        stiffest = max(stiffest, own.stiffness[1] * own.joint_stiffness[1])
+        strongest = max(strongest, own.damping[1])
     plant = copy.copy(model)
-    plant.tendon_stiffness[:] *= max(stiffness)
-    plant.tendon_damping[:] *= max(damping)
+    plant.tendon_stiffness[:] *= stiffest
+    plant.tendon_damping[:] *= strongest
     return plant

@@ -24,6 +24,11 @@ from elastic_env.world.task import Task, Transition
 Observation: TypeAlias = npt.NDArray[Any]
 Action: TypeAlias = npt.NDArray[Any]
 
+Seeds: TypeAlias = int | list[int | None] | None
+"""The first of a row of seeds, one for each world, or none."""
+Flags: TypeAlias = npt.NDArray[Any]
+Info: TypeAlias = dict[str, Any]
+
 RENDER_MODES = ("rgb_array", "human")
 
 
@@ -70,7 +75,7 @@ class _Faces:
             self._picture = self._make_picture()
         return self._picture
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Info:
         """Everything but window and renderer, which are made again when they are needed."""
         return {**vars(self), "_picture": None}
 
@@ -109,27 +114,25 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         self.task = task
         task.attach(simulation, num_threads=1, is_scalar=True)
         self._make_picture = picture
-        self._steps_per_frame = max(
-            round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1
-        )
+        frame_s = 1.0 / self.metadata["render_fps"]
+        self._steps_per_frame = max(round(frame_s / task.config.control_period_s), 1)
         self._steps = 0
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[Observation, Info]:
         """Begin an episode.
 
         With options["robot_seed"] = s it has the robot, and the motion, that `reset(seed=s)` draws.
         """
         super().reset(seed=seed, options=options)
-        self.task.restart(
-            np.ones(1, dtype=np.bool_), _episodes([self.np_random], _robot_seeds(options, 1))
-        )
+        episodes = _episodes([self.np_random], _robot_seeds(options, 1))
+        self.task.restart(np.ones(1, dtype=np.bool_), episodes)
         self._steps = 0
         self._render_human()
         return self.task.observe()[0], _first(self.task.signals())
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         """One control period under a command offset [rad]."""
         result = self.task.step(np.asarray(action)[None])
         self._steps += 1
@@ -144,7 +147,9 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
     def render(self) -> Any:
         """The present picture, (height, width, 3) uint8; None unless the mode is "rgb_array"."""
-        return self.picture.rgb(self.task.signals()) if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array":
+            return None
+        return self.picture.rgb(self.task.signals())
 
     def close(self) -> None:
         """Close the window, free the renderer, let hardware go."""
@@ -182,28 +187,27 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         picture: Callable[[], Picture] | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
+            what = "render mode of a vector environment"
+            raise unknown_name(what, render_mode, ["rgb_array"])
         self.render_mode = render_mode
         self._make_picture = picture
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
-            raise unknown_name(
-                "autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]
-            ) from None
-        self.num_envs = task.num_worlds
+            modes = [mode.value for mode in AutoresetMode]
+            raise unknown_name("autoreset mode", autoreset_mode, modes) from None
+        n = task.num_worlds
+        self.num_envs = n
         self.single_observation_space = task.observation_table.space(np.float64)
         self.single_action_space = task.action_table.space(np.float32)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, n)
+        self.action_space = batch_space(self.single_action_space, n)
         self.task = task
         task.attach(simulation, num_threads)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: Seeds = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode in every world, or in those of options["reset_mask"].
 
         With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)`
@@ -219,13 +223,12 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._begin(mask, robots)
         return self.task.observe(), self.task.signals()
 
-    def step(
-        self, actions: Action
-    ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
+    def step(self, actions: Action) -> tuple[Observation, Flags, Flags, Flags, Info]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
         restarting = self._done
         given = np.asarray(actions)
-        some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
+        is_next = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        some_restart = is_next and bool(restarting.any())
         if some_restart and given.shape == self.action_space.shape:
             given = np.where(restarting[:, None], 0.0, given)
         result = self.task.step(given)
@@ -238,11 +241,11 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 observation, info = self._restarted_after(result)
             else:
-                info = _with_mask(info, done)
+                info["_episode_metrics"] = done.copy()
         return observation, result.reward, result.terminated, result.truncated, info
 
     @property
-    def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def metadata(self) -> Info:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Metadata for Gymnasium's wrappers."""
         return {
             **ElasticEnv.metadata,
@@ -262,7 +265,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._let_go()
 
     def _begin(self, worlds: BoolArray, robots: Sequence[int | None] | None = None) -> None:
-        self.task.restart(worlds, _episodes(self._generators, robots or [None] * self.num_envs))
+        robots = robots or [None] * self.num_envs
+        self.task.restart(worlds, _episodes(self._generators, robots))
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
@@ -274,32 +278,29 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         truncated = result.truncated & ~worlds
         if not (terminated | truncated).any():  # what ended had ended before
             info = _without_metrics(info)
-        return Transition(
-            self.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info
-        )
+        reward = np.where(worlds, 0.0, result.reward)
+        return Transition(self.task.observe(), reward, terminated, truncated, info)
 
-    def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
+    def _restarted_after(self, result: Transition) -> tuple[Array, Info]:
         """SAME_STEP: the worlds that end begin anew at once.
 
         Their last observation and info are kept.
         """
-        final = final_of(result.observation, _with_mask(result.info, result.done), result.done)
-        self._begin(result.done)
-        info = _without_metrics(_restarted_info(result.info, result.done, self.task.signals()))
-        return self.task.observe(), info | final
+        done = result.done
+        result.info["_episode_metrics"] = done.copy()
+        final = final_of(result.observation, result.info, done)
+        self._begin(done)
+        info = _restarted_info(result.info, done, self.task.signals())
+        return self.task.observe(), _without_metrics(info) | final
 
 
-def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
+def final_of(observation: Array, info: Info, done: BoolArray) -> Info:
     """Last observation and info of worlds that end, as Gymnasium's SAME_STEP keeps them."""
     last = np.full(len(done), None, dtype=object)
     for world in np.flatnonzero(done):
         last[world] = observation[world].copy()
-    return {
-        "final_obs": last,
-        "_final_obs": done.copy(),
-        "final_info": info,
-        "_final_info": done.copy(),
-    }
+    marks = {"_final_obs": done.copy(), "_final_info": done.copy()}
+    return {"final_obs": last, "final_info": info, **marks}
 
 
 def _episodes(
@@ -312,7 +313,7 @@ def _episodes(
     ]
 
 
-def _robot_seeds(options: dict[str, Any] | None, num_envs: int) -> list[int | None]:
+def _robot_seeds(options: Info | None, num_envs: int) -> list[int | None]:
     return _seeds((options or {}).get("robot_seed"), num_envs, "options['robot_seed']")
 
 
@@ -332,7 +333,7 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
     return [None if one is None else int(one) for one in seed]
 
 
-def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
+def reset_mask(options: Info | None, num_envs: int) -> BoolArray:
     """Worlds that a reset begins anew: those of options["reset_mask"], or all.
 
     Raises:
@@ -348,33 +349,22 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
     return given
 
 
-def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> dict[str, Any]:
+def _restarted_info(info: Info, worlds: BoolArray, fresh: Signals) -> Info:
     """The info of a step in which some worlds begin anew: theirs is that of the reset."""
-    changed = info | {key: np.where(worlds, value, info[key]) for key, value in fresh.items()}
-    changed["reward_terms"] = {
-        key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()
-    }
-    changed["termination"] = np.where(worlds, "", info["termination"])
-    changed["clipped"] = np.where(worlds, 0.0, info["clipped"])
-    return changed
+    terms = info["reward_terms"]
+    new = {**fresh, "termination": "", "clipped": 0.0}
+    changed = {key: np.where(worlds, value, info[key]) for key, value in new.items()}
+    reset_terms = {key: np.where(worlds, 0.0, term) for key, term in terms.items()}
+    return info | changed | {"reward_terms": reset_terms}
 
 
-def _without_metrics(info: dict[str, Any]) -> dict[str, Any]:
+def _without_metrics(info: Info) -> Info:
     """The info of a step in which no episode has ended."""
-    return {
-        key: value
-        for key, value in info.items()
-        if key not in ("episode_metrics", "_episode_metrics")
-    }
+    of_the_end = ("episode_metrics", "_episode_metrics")
+    return {key: value for key, value in info.items() if key not in of_the_end}
 
 
-def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
-    """Episode metrics with Gymnasium's mark of the worlds that have them."""
-    info["_episode_metrics"] = done.copy()
-    return info
-
-
-def _first(info: dict[str, Any]) -> dict[str, Any]:
+def _first(info: Info) -> Info:
     """The info of the only world, with Python scalars."""
     return {
         key: _first(value) if isinstance(value, dict) else value[0].item()

@@ -15,14 +15,14 @@ calib), at half the control rate of 250 Hz. That of the torque sensor is an assu
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
-from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
+from elastic_env.core.signals import Array, BoolArray, SignalGroup, SignalTable
+from elastic_env.world.joint_signals import Mirrors
 from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
 
@@ -59,19 +59,23 @@ class Sensor:
     unit: str
     meaning: str
     truth: Callable[[SensorInputs], Array]
-    axes: Mapping[str, Mirrored] | None = None
+    axes: Mirrors | None = None
     noise: float = 0.0
     offset: float = 0.0
     is_encoder: bool = False
 
-    def group(self, name: str, joints: Mapping[str, Mirrored | None]) -> SignalGroup:
+    def group(self, name: str, joints: Mirrors) -> SignalGroup:
         """Its columns, of a robot with these joints and what their angles are in the mirror."""
-        return SignalGroup.of(name, self.unit, self.meaning, self.axes or joints, "measured")
+        parts = self.axes or joints
+        return SignalGroup.of(name, self.unit, self.meaning, parts, "measured")
 
 
 SENSORS: Mapping[str, Sensor] = {
     "link_encoder": Sensor(
-        "rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True
+        "rad",
+        "encoder on the link, q in whole counts",
+        lambda truth: truth.q,
+        is_encoder=True,
     ),
     "joint_torque": Sensor(
         "N·m",
@@ -103,14 +107,6 @@ def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
     )
 
 
-def specific_force(model: mujoco.MjModel, sensordata: Array | None, num_worlds: int) -> Array:
-    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]; nan without these."""
-    if sensordata is None:
-        return np.full((num_worlds, 3), np.nan)
-    begin = int(model.sensor(ACCELEROMETER).adr[0])
-    return sensordata[:, begin : begin + 3].copy()
-
-
 class FurtherSensors:
     """Further sensors of all worlds.
 
@@ -129,24 +125,24 @@ class FurtherSensors:
     def __init__(
         self,
         names: Sequence[str],
-        joints: Mapping[str, Mirrored | None],
+        joints: Mirrors,
         scenarios: Sequence[Scenario],
         counts_per_turn: int | None,
     ) -> None:
         require_known("sensor", names, SENSORS)
         self._sensors = {name: SENSORS[name] for name in names}
-        num_worlds = len(scenarios)
-        self._homing_rad = [scenario.homing_width_rad for scenario in scenarios]
-        self._scale = np.array([[scenario.sensor_noise] for scenario in scenarios])
-        counts = [counts_per_turn if scenario.encoder_counts else None for scenario in scenarios]
-        self._count_rad = np.array([[angle_of_count(own)] for own in counts])
+        n = len(scenarios)
+        count_rad = angle_of_count(counts_per_turn)
+        self._homing_rad = [own.homing_width_rad for own in scenarios]
+        self._scale = np.array([[own.sensor_noise] for own in scenarios])
+        self._count_rad = count_rad * np.array([[own.encoder_counts] for own in scenarios])
         groups = [sensor.group(name, joints) for name, sensor in self._sensors.items()]
         self.signals = SignalTable.of(groups).signals
         """Their columns of the observation, in order."""
-        kind: Any = np.dtype([(group.name, np.float64, group.shape) for group in groups])
-        self._noise = NoiseStream(num_worlds, kind) if names else None
-        self._offset = {group.name: np.zeros((num_worlds, *group.shape)) for group in groups}
-        self._now = self._before = np.zeros((num_worlds, len(self.signals)))
+        fields = [(group.name, np.float64, group.shape) for group in groups]
+        self._noise = NoiseStream(n, np.dtype(fields)) if names else None  # pyright: ignore[reportArgumentType]
+        self._offset = {group.name: np.zeros((n, *group.shape)) for group in groups}
+        self._now = self._before = np.zeros((n, len(self.signals)))
 
     def restart(
         self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs
@@ -156,13 +152,11 @@ class FurtherSensors:
             return
         for world in np.flatnonzero(worlds).tolist():
             for name, sensor in self._sensors.items():
-                offset = self._offset[name]
-                width = (
-                    self._homing_rad[world]
-                    if sensor.is_encoder
-                    else self._scale[world] * sensor.offset
-                )
-                offset[world] = width * random[world].robot.uniform(-1.0, 1.0, offset.shape[1])
+                offset = self._offset[name][world]
+                width = self._homing_rad[world]
+                if not sensor.is_encoder:
+                    width = self._scale[world] * sensor.offset
+                offset[:] = width * random[world].robot.uniform(-1.0, 1.0, len(offset))
             self._noise.restart(world, random[world].noise())
         self.measure(worlds, truth)
         self._before = np.where(worlds[:, None], self._now, self._before)

@@ -35,7 +35,8 @@ class FootSensors:
     def of_biped(cls, biped: Biped) -> "FootSensors":
         """The force-torque sensors at the ankles of a biped."""
         model = biped.rigid
-        return cls(model.body_mass[biped.feet], model.body_ipos[biped.feet], model.opt.gravity)
+        feet = biped.feet
+        return cls(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
 
     def ground_wrench(self, sensors: Array, foot_R: Array) -> tuple[Array, Array]:
         """Force and moment of the ground on each foot, about its ankle, in the world.
@@ -93,7 +94,6 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
 def _rows(values: Array, shape: tuple[int, ...], axes: int) -> Array:
     """Values of a shape with one row per robot: all but the last axes in one."""
     if values.shape != shape:
-        values = np.broadcast_to(
-            values, shape
-        )  # which cannot be written to: to Numba that is another type
+        # which cannot be written to: to Numba that is another type
+        values = np.broadcast_to(values, shape)
     return np.require(values, requirements=["C", "W"]).reshape(-1, *shape[-axes:])

@@ -1,6 +1,6 @@
 """Parameters of a task of elastic joints, whatever the robot."""
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,8 +10,9 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
-from elastic_env.world.scenario import WALKER_FIELDS, Scenario, make_scenario, scenario_names
-from elastic_env.world.task import ACTION_BOUND_RAD
+from elastic_env.world import scenario as scenarios
+from elastic_env.world.joint_signals import ACTION_BOUND_RAD
+from elastic_env.world.scenario import Scenario, make_scenario
 
 
 class RewardWeights(Model):
@@ -25,10 +26,9 @@ class RewardWeights(Model):
     """Once, where the simulation diverges [1]."""
 
 
-class JointConfig(Model):
-    """Parameters of all tasks of elastic joints."""
+class TaskConfig(Model):
+    """Parameters of all tasks."""
 
-    reference: Reference = Hold()
     scenario: Scenario = make_scenario("nominal")
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
@@ -36,6 +36,12 @@ class JointConfig(Model):
     """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
+
+
+class JointConfig(TaskConfig):
+    """Parameters of all tasks of elastic joints on a fixed base."""
+
+    reference: Reference = Hold()
     timestep_s: float = quantity("s", 5e-4, gt=0)
     """Physics step [s]."""
     reward: RewardWeights = RewardWeights()
@@ -44,13 +50,21 @@ class JointConfig(Model):
 
     @model_validator(mode="after")
     def _scenario_acts(self) -> Self:
-        acting = [name for name in WALKER_FIELDS if getattr(self.scenario, name)]
+        acting = [name for name in scenarios.WALKER_FIELDS if getattr(self.scenario, name)]
         if acting:
             raise ValueError(
                 f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"
-                f" knows; here choose from: {', '.join(scenario_names(walks=False))}"
+                f" knows; here choose from: {', '.join(scenarios.scenario_names(walks=False))}"
             )
         return self
+
+    def plant(self) -> Any:
+        """The robot as it is built, and as it is known: `elastic_env.world.joint_task.JointPlant`.
+
+        Raises:
+            ConfigurationError: Its servos are too weak for the reference, or a sensor has no place.
+        """
+        raise NotImplementedError
 
     def as_built(self, joint: ElasticJoint) -> ElasticJoint:
         """A known joint as the plant of the scenario has it.

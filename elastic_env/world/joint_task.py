@@ -13,31 +13,33 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import draw_robot
-from elastic_env.core.signals import Array, BoolArray, Signal, Signals
+from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
+from elastic_env.joint.elasticity import static_link_angle
 from elastic_env.joint.time_step import require_stable
-from elastic_env.motion.trajectory import Planned, PlanTable
+from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
+from elastic_env.world import rows as records
 from elastic_env.world.drawn_robot import (
     require_passing,
     set_joints,
     spring_ids,
     stiffest_plant,
 )
-from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
-from elastic_env.world.metrics import Metric
+from elastic_env.world.joint_signals import joint_groups
+from elastic_env.world.metrics import Metric, metrics_of
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
-from elastic_env.world.rows import COURSE, REAL, WHOLE, Records, Sample, one, record_type
+from elastic_env.world.rows import Records, Sample, one
 from elastic_env.world.sensors import PendulumImu, is_due
-from elastic_env.world.task import Task, joint_groups, joint_rules, spring_torque
+from elastic_env.world.task import Task, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
@@ -45,29 +47,19 @@ LINK_IMU_SENSOR = "link_imu"
 the scenario's IMU.
 """
 
-_SCORES = record_type(("link_error", REAL), ("command_rate", REAL), ("divergence", REAL))
-_TRUTH = record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))  # as in a `Plan`
-_SHOWN = record_type(
-    ("imu", REAL), ("visible_imu", REAL)
-)  # link angle now, and as old as the scenario has it [rad]
-_CONSTANTS = record_type(
-    ("weights", _SCORES),
-    ("imu_noise_rad", REAL),
-    ("imu_bias_rad", REAL),
-    ("imu_sine_error_rad", REAL),
-)
-_SCHEDULE = record_type(("scored", np.bool_), ("rest", WHOLE), ("imu_is_due", np.bool_))
+_RIGID_NM_PER_RAD = 1e15
+"""Stiffness of a joint without a spring beside servos that give way."""
 
 _OF_EVERY_STEP = (
-    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
-    Metric("joint_torque_peak_nm", "joint_torque", "peak", over="all"),
+    *metrics_of("command_rate", "rad_s", "rms", "peak", over="all"),
+    *metrics_of("joint_torque", "nm", "peak", over="all"),
     Metric("clipped_share", "clipped", "mean", over="all"),
 )
 METRICS_OF_ONE = (
-    *(Metric(f"link_error_{s}_rad", "link_error", s) for s in ("rms", "peak", "min", "max")),
-    *(Metric(f"link_error_imu_{s}_rad", "link_error_imu", s) for s in ("rms", "min", "max")),
-    *(Metric(f"deflection_{s}_rad", "deflection", s) for s in ("rms", "peak")),
-    *(Metric(f"servo_error_{s}_rad", "servo_error", s) for s in ("rms", "peak")),
+    *metrics_of("link_error", "rad", "rms", "peak", "min", "max"),
+    *metrics_of("link_error_imu", "rad", "rms", "min", "max"),
+    *metrics_of("deflection", "rad", "rms", "peak"),
+    *metrics_of("servo_error", "rad", "rms", "peak"),
     *_OF_EVERY_STEP,
 )
 METRICS_OF_SEVERAL = (
@@ -75,13 +67,13 @@ METRICS_OF_SEVERAL = (
     Metric("link_error_peak_rad", "link_error_largest", "peak"),
     Metric("link_error_min_rad", "link_error_lowest", "min"),
     Metric("link_error_max_rad", "link_error_highest", "max"),
-    Metric("deflection_rms_rad", "deflection", "rms"),
-    Metric("servo_error_rms_rad", "servo_error", "rms"),
+    *metrics_of("deflection", "rad", "rms"),
+    *metrics_of("servo_error", "rad", "rms"),
     *_OF_EVERY_STEP,
 )
-METRICS_OF_END_EFFECTOR = (
-    *(Metric(f"end_effector_error_{s}_m", "end_effector_error", s) for s in ("rms", "peak")),
-    *(Metric(f"end_effector_tilt_{s}_rad", "end_effector_tilt", s) for s in ("rms", "peak")),
+METRICS_OF_TOOL = (
+    *metrics_of("end_effector_error", "m", "rms", "peak"),
+    *metrics_of("end_effector_tilt", "rad", "rms", "peak"),
 )
 
 
@@ -93,10 +85,9 @@ class JointPlant:
         name: Of the robot.
         model: Compiled, with elastic joints.
         assumed, true: What a compensator may know, and what is; without a table of observations.
+        form: "rigid" for a robot without springs.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad],
-            and if they differ from the true ones the springs' factors, (..., n) [1], and the dead
-            bands, (..., n) [rad].
+        torque_gradient: ∂τ_g/∂q, from (..., n) to (..., n, n) [N·m/rad].
         motion: The reference as all joints follow it.
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a
             link that hangs at q = 0 [m]; None where there is no such IMU.
@@ -107,9 +98,10 @@ class JointPlant:
     model: mujoco.MjModel
     assumed: RobotModel
     true: RobotModel
+    form: str
     static_torque: Callable[[Array], Array]
-    rest_angle: Callable[..., Array]
-    motion: Planned
+    torque_gradient: Callable[[Array], Array]
+    motion: Motion
     imu_arm_m: float | None = None
     end_effector: EndEffector | None = None
 
@@ -117,6 +109,35 @@ class JointPlant:
     def joint_names(self) -> list[str]:
         """Names of the joints, in order."""
         return self.true.joint_names
+
+    def rest_angle(
+        self, command: Array, factor: Parameter = 1.0, backlash: Array | None = None
+    ) -> Array:
+        """Link angles at rest without friction.
+
+        A dead band is crossed to the side to which the load pulls; a link that hangs at q = 0 hangs
+        there within it.
+
+        Args:
+            command: Of the servos, (..., n) [rad].
+            factor: On K, one number or (..., n) [1].
+            backlash: Dead bands, (..., n) [rad]; None for those of the true joints.
+
+        Returns:
+            (..., n) [rad].
+        """
+        stiffness = self.true.rest_stiffness(self.form, factor)
+        if np.isinf(stiffness).all():
+            return command
+        band = self.true.backlash if backlash is None else backlash
+        half = np.sign(self.static_torque(command)) * band / 2.0
+        engaged = command - half
+        if self.imu_arm_m is not None:
+            engaged = np.where(np.abs(command) > np.abs(half), engaged, 0.0)
+        finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
+        return static_link_angle(
+            engaged, finite, self.static_torque, self.torque_gradient, unique=False
+        )
 
 
 @dataclass(frozen=True)
@@ -144,76 +165,62 @@ class JointTask(Task):
     """Rules of a robot of elastic joints on a fixed base.
 
     Args:
-        config: Reference, scenario, sensors, rewards, periods.
-        plant: What moves.
+        config: Reference, scenario, sensors, rewards, periods, and the plant that they make.
         num_worlds: How many.
-        observe_imu: Whether the IMU of the only link is observed, if no sensor of the configuration
-            asks for it.
 
     Raises:
         ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
     """
 
     config: JointConfig
-    world_type = record_type(("truth", _TRUTH), ("shown", _SHOWN), ("scores", _SCORES))
-    noise_type = record_type(("imu", REAL))
+    world_type = records.LINK_WORLD
+    noise_type = records.record_type(("imu", records.REAL))
 
-    def __init__(
-        self, config: JointConfig, plant: JointPlant, num_worlds: int, observe_imu: bool = False
-    ) -> None:
+    def __init__(self, config: JointConfig, num_worlds: int) -> None:
+        plant: JointPlant = config.plant()
         joints = plant.joint_names
-        observe_imu = observe_imu or LINK_IMU_SENSOR in config.sensors
+        observe_imu = LINK_IMU_SENSOR in config.sensors
         if observe_imu and len(joints) > 1:
             raise ConfigurationError(
                 f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has"
                 f" {len(joints)}; choose link_encoder to observe the links of several"
             )
         scenario = config.scenario
-        scenarios = [scenario] * num_worlds
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
-        reference = PlanTable(plant.motion, period_s, num_worlds)
         require_passing(plant.true, scenario)
+        metrics = METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL
+        if plant.end_effector is not None:
+            metrics = metrics + METRICS_OF_TOOL
         require_stable(stiffest_plant(plant.model, scenario), period_s)
         super().__init__(
             config=config,
             name=plant.name,
             model=plant.model,
             assumed=plant.assumed,
-            reference=reference,
+            motion=plant.motion,
             table=_observed(joints, observe_imu),
-            sensors=FurtherSensors(
-                names=[sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR],
-                joints=dict.fromkeys(joints),
-                scenarios=scenarios,
-                counts_per_turn=plant.true.encoder_counts_per_turn,
-            ),
-            scenarios=scenarios,
-            metrics=(
-                *(METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL),
-                *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
-            ),
-            rules=joint_rules(period_s, [(counts, False), (counts, True)]),
+            sensors=[name for name in config.sensors if name != LINK_IMU_SENSOR],
+            joints=dict.fromkeys(joints),
+            scenarios=[scenario] * num_worlds,
+            metrics=metrics,
+            kinds=[(counts, False), (counts, True)],
             action_bound_rad=config.action_bound_rad,
         )
         self._plant = plant
         self._joint_names = joints
         self._true_model = plant.true.observed_by(self.observation_table)
-        self._rest_watch = RestWatch(
-            plant.static_torque,
-            plant.true.rest_stiffness(config.form),
-            joints,
-            plant.true.servo_lag,
-        )
+        stiffness = plant.true.rest_stiffness(config.form)
+        lag_s = plant.true.servo_lag
+        self._rest_watch = RestWatch(plant.static_torque, stiffness, joints, lag_s)
         self._imu = _inertial_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)
-        self._imu_column = self.observation_table.group(LINK_IMU.name).start if observe_imu else -1
-        self._schedule = _schedule(reference, scenario.imu.rate_hz, period_s)
+        columns = self.observation_table.names
+        self._imu_column = columns.index(LINK_IMU.name) if observe_imu else -1
+        self._schedule = _schedule(self._reference, scenario.imu.rate_hz, period_s)
         self._link_constants = one(
-            _CONSTANTS,
-            weights=one(
-                _SCORES, **{name: getattr(config.reward, name) for name in _SCORES.names or ()}
-            ),
+            records.LINK_CONSTANTS,
+            weights=one(records.LINK_SCORES, **dict(config.reward)),
             imu_noise_rad=scenario.imu.noise_rad,
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
@@ -229,17 +236,11 @@ class JointTask(Task):
         """Score further steps, and look whether the joints rest in windows at rest."""
         if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
             for row in range(self._unscored, self._row + 1):
-                joints = self._joints[row]["truth"]
                 worlds = self._worlds[row]["truth"]
-                coming = self._reference.rest[np.minimum(worlds["step"] + 1, self.num_steps)]
-                is_last = (coming != worlds["rest"]) | (worlds["step"] >= self.num_steps)
-                self._rest_watch.see(
-                    rest=worlds["rest"],
-                    is_last=is_last,
-                    q_ref=joints["q_ref"],
-                    q=joints["q"],
-                    offset=joints["offset"],
-                )
+                step = worlds["step"]
+                coming = self._reference.rest[np.minimum(step + 1, self.num_steps)]
+                is_last = (coming != worlds["rest"]) | (step >= self.num_steps)
+                self._rest_watch.see(worlds["rest"], is_last, self._joints[row]["truth"])
         super().score()
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
@@ -248,10 +249,9 @@ class JointTask(Task):
 
     def truth(self) -> JointTruth:
         """State without noise, and the true parameters."""
-        inputs = self._sensor_inputs()
         state = self._joints[self._row]["truth"]
         return JointTruth(
-            **vars(inputs),
+            **vars(self._sensor_inputs()),
             theta=state["theta"].copy(),
             theta_dot=state["theta_dot"].copy(),
             q_dot=state["q_dot"].copy(),
@@ -275,7 +275,8 @@ class JointTask(Task):
             factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
         robot = scenario.make_robot(factor, homing, mounting_rad=(float(mounting), 0.0))
         if scenario.ranges:
-            robot = draw_robot([ranges.on_fixed_base() for ranges in scenario.ranges], n, generator)
+            ranges = [own.on_fixed_base() for own in scenario.ranges]
+            robot = draw_robot(ranges, n, generator)
         self._take_robot(world, robot, self._true_model)
         self._imu_bias[world] = robot.mounting_rad[0]
         self._kind[world] = int(robot.is_delayed)
@@ -284,72 +285,63 @@ class JointTask(Task):
         """The servos hold q_ref, the springs are already deflected."""
         simulation = self.simulation
         at = self._at
+        scenario = self.config.scenario
+        model = self._true_model
         truth = self._joints[self._row]["truth"][worlds]
-        robots = {world: self._robots[world] for world in np.flatnonzero(worlds).tolist()}
-        if self.config.scenario.ranges or self.config.scenario.stiffness_spread > 0.0:
-            for world, robot in robots.items():
+        begun = np.flatnonzero(worlds).tolist()
+        if scenario.ranges or scenario.stiffness_spread > 0.0:
+            for world in begun:
 
                 def field(name: str, world: int = world) -> Array:
                     return simulation.vary(name)[world]
 
-                set_joints(field, self.model, self._springs, at["q_dot"], robot)
+                links = at["q_dot"]
+                robot = self._robots[world]
+                set_joints(field, self.model, self._springs, links, robot)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
-        factor = np.array([robot.stiffness for robot in robots.values()])
+        factor = np.array([self._robots[world].stiffness for world in begun])
         q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
-        simulation.qpos[np.ix_(worlds, at["theta"])] = (
-            command - self._true_model.servo_compliance * torque
-        )
+        theta = command - model.servo_compliance * torque
+        simulation.qpos[np.ix_(worlds, at["theta"])] = theta
         simulation.qpos[np.ix_(worlds, at["q"])] = q
         simulation.ctrl[np.ix_(worlds, at["servo"])] = command
-        for column, servo in enumerate(self._true_model.servos):
+        for column, servo in enumerate(model.servos):
             if servo.integral_gain > 0.0:
                 integrator = self.model.actuator_actadr[at["servo"][column]]
-                simulation.act[worlds, integrator] = torque[:, column] / servo.integral_gain
+                held = torque[:, column] / servo.integral_gain
+                simulation.act[worlds, integrator] = held
         if self._has_sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
-        simulation = self.simulation
-        joints = self._constants
+        qpos = self.simulation.qpos
         if self._imu is not None:
-            self._imu.settle(worlds, simulation.qpos[:, self._at["q"][0]])
-        noise = self._noise.ready()
-        kernels.begin_links(
-            simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps()
-        )
+            self._imu.settle(worlds, qpos[:, self._at["q"][0]])
+        kernels.begin_links(qpos, self.simulation.qvel, self._step, self._links, worlds)
 
-    @override
-    def _sense_worlds(
-        self,
-        joints: tuple[Any, ...],
-        noise: tuple[Any, ...],
-        commanded: tuple[Any, ...],
-        steps: tuple[Any, ...],
-        results: tuple[Any, ...],
-    ) -> bool:
+    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
         qpos = self.simulation.qpos
         qvel = self.simulation.qvel
         if self._imu is not None:
-            too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
-            self._imu.advance(
-                ~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]]
-            )
-        return kernels.sense_links(
-            qpos, qvel, joints, self._links, noise, commanded, steps, results
-        )
+            diverged = control[2] | (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
+            q_dot = qvel[:, self._at["q_dot"][0]]
+            self._imu.advance(~diverged, qpos[:, self._at["q"][0]], q_dot)
+        return kernels.sense_links(qpos, qvel, self._step, self._links, control)
 
     def _show_worlds(self, observed: Array) -> None:
         if self._imu_column >= 0:
-            observed[:, self._imu_column] = self._worlds[self._row]["shown"]["visible_imu"]
+            shown = self._worlds[self._row]["shown"]
+            observed[:, self._imu_column] = shown["visible_imu"]
 
     @property
     def _links(self) -> tuple[Any, ...]:
         """`kernels.Links`."""
         angle = None if self._imu is None else self._imu.angle
-        return self._schedule, self._link_constants, self._imu_bias, self._imu_column, angle
+        constants = self._link_constants
+        return self._schedule, constants, self._imu_bias, self._imu_column, angle
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         q_ref = joints["q_ref"]
@@ -366,18 +358,16 @@ class JointTask(Task):
         if len(self._joint_names) == 1:
             imu = worlds["shown"]["visible_imu"]
             shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
-            shown |= {"link_angle_imu": imu.copy(), "link_error_imu": q_ref[:, 0] - imu}
+            shown["link_angle_imu"] = imu.copy()
+            shown["link_error_imu"] = q_ref[:, 0] - imu
         else:
             shown = self._signals_of_several(of_joints)
         if self._plant.end_effector is not None:
             distance, tilt = self._plant.end_effector.errors(q_ref, q)
             shown |= {"end_effector_error": distance, "end_effector_tilt": tilt}
         truth = worlds["truth"]
-        return {
-            "time_s": truth["step"] * self.config.control_period_s,
-            **shown,
-            "rest": truth["rest"].copy(),
-        }
+        time_s = truth["step"] * self.config.control_period_s
+        return {"time_s": time_s, **shown, "rest": truth["rest"].copy()}
 
     def _signals_of_several(self, of_joints: dict[str, Array]) -> Signals:
         """Signals of every joint, and what they come to together."""
@@ -388,9 +378,10 @@ class JointTask(Task):
         }
         error = of_joints["link_error"]
         summed = ("link_error", "deflection", "servo_error", "command_rate")
+        squared = {name: np.square(of_joints[name]) for name in summed}
         return {
             **each,
-            **{name: np.sqrt(np.square(of_joints[name]).mean(axis=1)) for name in summed},
+            **{name: np.sqrt(own.mean(axis=1)) for name, own in squared.items()},
             "link_error_lowest": error.min(axis=1),
             "link_error_highest": error.max(axis=1),
             "link_error_largest": np.abs(error).max(axis=1),
@@ -400,15 +391,14 @@ class JointTask(Task):
 
 def _observed(joints: Sequence[str], observe_imu: bool) -> list[Signal]:
     """The standard columns."""
-    groups = joint_groups(dict.fromkeys(joints))
-    return [signal for group in groups for signal in group.signals] + (
-        [LINK_IMU] if observe_imu else []
-    )
+    groups = joint_groups(dict.fromkeys(joints)).values()
+    standard = [signal for group in groups for signal in group.signals]
+    return [*standard, LINK_IMU] if observe_imu else standard
 
 
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
-    """Records of `_SCHEDULE`, one per step."""
-    rows = np.zeros(reference.num_steps + 1, _SCHEDULE)
+    """Records of `SCHEDULE`, one per step."""
+    rows = np.zeros(reference.num_steps + 1, records.SCHEDULE)
     rows["scored"] = reference.scored
     rows["rest"] = reference.rest
     rows["imu_is_due"] = is_due(np.arange(len(rows)), imu_rate_hz, period_s)
@@ -431,4 +421,5 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
             " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    return PendulumImu(sensor, plant.imu_arm_m, gravity, config.control_period_s, num_worlds)
+    period_s = config.control_period_s
+    return PendulumImu(sensor, plant.imu_arm_m, gravity, period_s, num_worlds)

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, Signals
+
+Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "count"]
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,15 @@ class Metric:
 
     name: str
     signal: str
-    statistic: Literal["rms", "peak", "min", "max", "mean", "count"]
+    statistic: Statistic
     over: str = "scored"
+
+
+def metrics_of(
+    signal: str, unit: str, *statistics: Statistic, over: str = "scored"
+) -> tuple[Metric, ...]:
+    """Statistics of a signal, each named `signal_statistic_unit`."""
+    return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
 
 
 _FOLDS: dict[str, tuple[Callable[[Array], Array], np.ufunc, float]] = {
@@ -65,12 +74,12 @@ class RunningStatistic:
         """The statistic of every row, (num_rows, num_worlds); nan without a sample."""
         if self._name == "count":
             return self._total.copy()
-        value = (
-            self._total / np.maximum(self._count, 1)
-            if self._name in ("rms", "mean")
-            else self._total
-        )
-        return np.where(self._count > 0, np.sqrt(value) if self._name == "rms" else value, np.nan)
+        value = self._total
+        if self._name in ("rms", "mean"):
+            value = value / np.maximum(self._count, 1)
+        if self._name == "rms":
+            value = np.sqrt(value)
+        return np.where(self._count > 0, value, np.nan)
 
 
 class EpisodeMetrics:
@@ -78,31 +87,28 @@ class EpisodeMetrics:
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._names = [metric.name for metric in metrics]
-        by_statistic = {name: [m for m in metrics if m.statistic == name] for name in _FOLDS}
-        self._metrics = {name: own for name, own in by_statistic.items() if own}
-        self._statistics = {
-            name: RunningStatistic(name, len(m), num_worlds) for name, m in self._metrics.items()
-        }
+        self._folded = [
+            (RunningStatistic(name, len(own), num_worlds), own)
+            for name in _FOLDS
+            if (own := [metric for metric in metrics if metric.statistic == name])
+        ]
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""
-        for statistic in self._statistics.values():
+        for statistic, _ in self._folded:
             statistic.restart(worlds)
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
         """Take signals and masks by name, (num_steps, num_worlds) or (num_worlds,) each."""
-        for name, metrics in self._metrics.items():
-            values = np.array(
-                [np.atleast_2d(signals[metric.signal]) for metric in metrics], dtype=np.float64
-            )
-            sampled = np.array([np.atleast_2d(masks[metric.over]) for metric in metrics])
-            self._statistics[name].update(values, sampled)
+        for statistic, metrics in self._folded:
+            values = [np.atleast_2d(signals[metric.signal]) for metric in metrics]
+            sampled = [np.atleast_2d(masks[metric.over]) for metric in metrics]
+            statistic.update(np.array(values, dtype=np.float64), np.array(sampled))
 
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
-        rows = {
-            metric.name: row
-            for name, metrics in self._metrics.items()
-            for metric, row in zip(metrics, self._statistics[name].values(), strict=True)
-        }
+        rows: dict[str, Array] = {}
+        for statistic, metrics in self._folded:
+            names = [metric.name for metric in metrics]
+            rows |= zip(names, statistic.values(), strict=True)
         return {name: rows[name] for name in self._names}

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.world.rows import Records
 
 _SHARE = 0.004
 """Motion within a window that is worth a word, over the sag.
@@ -54,19 +55,15 @@ class RestWatch:
         if self._window.shape == worlds.shape:
             self._window[worlds] = -1
 
-    def see(
-        self, rest: IntArray, is_last: BoolArray, q_ref: Array, q: Array, offset: Array
-    ) -> None:
+    def see(self, rest: IntArray, is_last: BoolArray, joints: Records) -> None:
         """Look at a control step.
 
         Args:
             rest: Number of the window at rest, −1 elsewhere, (num_worlds,).
             is_last: Whether the window ends with this step, (num_worlds,).
-            q_ref: References, (num_worlds, n) [rad].
-            q: Link angles, likewise.
-            offset: Command offsets, likewise.
+            joints: Truth of the joints, (num_worlds, n).
         """
-        now = np.stack([q, offset])
+        now = np.stack([joints["q"], joints["offset"]])
         if self._window.shape != rest.shape:
             self._window = np.full(rest.shape, -1)
             self._least = now.copy()
@@ -77,7 +74,8 @@ class RestWatch:
         ended = (rest >= 0) & is_last
         self._window = np.where(ended, -1, rest)
         if ended.any():
-            self._judge(q_ref[ended], (self._most - self._least)[:, ended], rest[ended])
+            moved = (self._most - self._least)[:, ended]
+            self._judge(joints["q_ref"][ended], moved, rest[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
         """Warn of windows that end.
@@ -86,7 +84,8 @@ class RestWatch:
         """
         sag = np.abs(self._static_torque(q_ref) / self._stiffness).max(axis=-1)
         links, commands = moved.max(axis=-1)
-        restless = (links > np.maximum(_SHARE * sag, _SMALLEST_RAD)) & (commands < links / 2.0)
+        least = np.maximum(_SHARE * sag, _SMALLEST_RAD)
+        restless = (links > least) & (commands < links / 2.0)
         if not restless.any():
             return
         self.is_said = True

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -24,6 +25,16 @@ STIFFNESS_KEY = "stiffness_nm_per_rad"
 _UNLIMITED_RAD = 200.0 * np.pi
 
 
+def _of_joints(parameter: str) -> Any:
+    """A property of a robot: a parameter of all its joints, (n,)."""
+
+    def values(robot: "RobotModel") -> Array:
+        joints = robot.joints.values()
+        return np.array([getattr(joint, parameter) for joint in joints], dtype=np.float64)
+
+    return property(values)
+
+
 @dataclass(frozen=True)
 class RobotModel:
     """A compiled rigid model and an `ElasticJoint` for each of its elastic hinges, in order.
@@ -43,50 +54,24 @@ class RobotModel:
         """Names of the hinges, in order."""
         return list(self.joints)
 
-    @property
-    def stiffness(self) -> Array:
-        """K, (n,) [N·m/rad]."""
-        return self._values("stiffness")
-
-    @property
-    def damping(self) -> Array:
-        """D, (n,) [N·m·s/rad]."""
-        return self._values("damping")
-
-    @property
-    def rotor_inertia(self) -> Array:
-        """B, (n,) [kg·m²]."""
-        return self._values("rotor_inertia")
-
-    @property
-    def backlash(self) -> Array:
-        """Width of the dead bands, (n,) [rad]."""
-        return self._values("backlash")
-
-    @property
-    def coulomb_friction(self) -> Array:
-        """Coulomb friction on the links, (n,) [N·m]."""
-        return self._values("coulomb_friction")
-
-    @property
-    def viscous_friction(self) -> Array:
-        """Viscous friction on the links, (n,) [N·m·s/rad]."""
-        return self._values("viscous_friction")
-
-    @property
-    def load_friction(self) -> Array:
-        """Shares of the torques passed that are lost to dry friction, (n,) [1]."""
-        return self._values("load_friction")
-
-    @property
-    def static_friction(self) -> Array:
-        """What dry friction has more at rest, (n,) [N·m]."""
-        return self._values("static_friction")
-
-    @property
-    def stribeck_speed(self) -> Array:
-        """Speeds by which that falls to 37 %, (n,) [rad/s]."""
-        return self._values("stribeck_speed")
+    stiffness = _of_joints("stiffness")
+    """K, (n,) [N·m/rad]."""
+    damping = _of_joints("damping")
+    """D, (n,) [N·m·s/rad]."""
+    rotor_inertia = _of_joints("rotor_inertia")
+    """B, (n,) [kg·m²]."""
+    backlash = _of_joints("backlash")
+    """Width of the dead bands, (n,) [rad]."""
+    coulomb_friction = _of_joints("coulomb_friction")
+    """Coulomb friction on the links, (n,) [N·m]."""
+    viscous_friction = _of_joints("viscous_friction")
+    """Viscous friction on the links, (n,) [N·m·s/rad]."""
+    load_friction = _of_joints("load_friction")
+    """Shares of the torques passed that are lost to dry friction, (n,) [1]."""
+    static_friction = _of_joints("static_friction")
+    """What dry friction has more at rest, (n,) [N·m]."""
+    stribeck_speed = _of_joints("stribeck_speed")
+    """Speeds by which that falls to 37 %, (n,) [rad/s]."""
 
     def require_constant_friction(self, who: str) -> None:
         """Refuse friction that changes with load or speed, for one who does not know it.
@@ -131,20 +116,21 @@ class RobotModel:
         Raises:
             ConfigurationError: A joint has no servo.
         """
-        without = [name for name, joint in self.joints.items() if joint.servo is None]
+        servos = {name: joint.servo for name, joint in self.joints.items()}
+        without = ", ".join(name for name, servo in servos.items() if servo is None)
         if without:
             raise ConfigurationError(
-                f"a servo is needed on every joint, but there is none on: {', '.join(without)}"
+                f"a servo is needed on every joint, but there is none on: {without}"
             )
-        return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
+        return tuple(servo for servo in servos.values() if servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
         """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p, 0 with an integrator."""
         servos = [joint.servo for joint in self.joints.values()]
-        return np.array(
-            [0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos]
-        )
+        gives_way = [servo is not None and servo.integral_gain == 0.0 for servo in servos]
+        gains = [1.0 if servo is None else servo.position_gain for servo in servos]
+        return np.where(gives_way, 1.0 / np.array(gains), 0.0)
 
     @property
     def servo_lag(self) -> Array:
@@ -166,12 +152,12 @@ class RobotModel:
             (n,) or (..., n) [N·m/rad].
         """
         stiffness = factor * self.stiffness
-        springs = np.zeros_like(stiffness) if form == "rigid" else 1.0 / stiffness
+        if form == "rigid":
+            stiffness = np.full_like(stiffness, np.inf)
+        compliance = self.servo_compliance
         with np.errstate(divide="ignore"):
-            in_series = 1.0 / (springs + self.servo_compliance)
-        return np.where(
-            self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else stiffness
-        )
+            in_series = 1.0 / (1.0 / stiffness + compliance)
+        return np.where(compliance > 0.0, in_series, stiffness)
 
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
         """The same robot with another stiffness, one number or one per joint [N·m/rad].
@@ -182,14 +168,9 @@ class RobotModel:
         """
         return replace(self, joints=with_stiffness(self.joints, stiffness))
 
-    def observed_by(self, table: SignalTable) -> "RobotModel":
+    def observed_by(self, table: SignalTable) -> Self:
         """The same robot with this table of observations."""
         return replace(self, observation_table=table)
-
-    def _values(self, parameter: str) -> Array:
-        return np.array(
-            [getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64
-        )
 
 
 def with_stiffness(
@@ -243,7 +224,8 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
         try:
-            if any(isinstance(item, str | bool) for item in value):  # NumPy would convert them
+            # NumPy would convert them
+            if any(isinstance(item, str | bool) for item in value):
                 raise TypeError
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):

@@ -78,15 +78,28 @@ ADDRESS = record_type(
 )
 """Addresses of a joint in the physics."""
 
-JOINT_COLUMNS = (
-    "encoder_angle",
-    "encoder_rate",
-    "reference_angle",
-    "reference_rate",
-    "reference_acceleration",
-    "last_command",
+LINK_SCORES = record_type(("link_error", REAL), ("command_rate", REAL), ("divergence", REAL))
+"""Weighted terms of the reward of links on a fixed base, or their weights."""
+
+LINK_WORLD = record_type(
+    # as in a `Plan`
+    ("truth", record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))),
+    # link angle now, and as old as the scenario has it [rad]
+    ("shown", record_type(("imu", REAL), ("visible_imu", REAL))),
+    ("scores", LINK_SCORES),
 )
-"""Groups of an observation that have a column for every joint."""
+"""A control step of a world with links on a fixed base."""
+
+LINK_CONSTANTS = record_type(
+    ("weights", LINK_SCORES),
+    ("imu_noise_rad", REAL),
+    ("imu_bias_rad", REAL),
+    ("imu_sine_error_rad", REAL),
+)
+"""Constants of links on a fixed base."""
+
+SCHEDULE = record_type(("scored", np.bool_), ("rest", WHOLE), ("imu_is_due", np.bool_))
+"""What is to happen in a control step, as in a `Plan`."""
 
 
 class Sample(NamedTuple):

@@ -74,12 +74,11 @@ class Scenario(Model):
     @model_validator(mode="after")
     def _ranges_say_all_that_is_drawn(self) -> Self:
         fixed = [name for name in _LEFT_TO_RANGES if getattr(self, name)]
-        if self.ranges and (
-            fixed or self.imu.bias_spread_rad > 0.0 or self.pelvis_imu.bias_spread_rad > 0.0
-        ):
+        if self.imu.bias_spread_rad + self.pelvis_imu.bias_spread_rad > 0.0 and not fixed:
+            fixed = ["bias_spread_rad of pelvis_imu"]
+        if self.ranges and fixed:
             raise ValueError(
-                "ranges say what is drawn; leave out"
-                f" {', '.join(fixed or ['bias_spread_rad of pelvis_imu'])}, or give the ranges an"
+                f"ranges say what is drawn; leave out {', '.join(fixed)}, or give the ranges an"
                 " interval for it"
             )
         return self
@@ -122,38 +121,26 @@ class Scenario(Model):
 
         That is in joints, offsets of sensors, push or slope.
         """
-        drawn = (
-            self.stiffness_spread,
-            self.push_n,
-            self.slope_rad,
-            self.encoder_bias_rad,
-            self.imu.bias_spread_rad,
-            self.pelvis_imu.bias_spread_rad,
-        )
-        return bool(self.ranges) or self.inertial is not None or any(value > 0.0 for value in drawn)
+        spreads = (self.imu.bias_spread_rad, self.pelvis_imu.bias_spread_rad)
+        drawn = (self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad)
+        return bool(self.ranges) or self.inertial is not None or any(drawn + spreads)
 
     @property
     def is_random(self) -> bool:
         """True if episodes of the same motion differ, be it by noise alone."""
-        noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
-        return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
+        noise = (self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm)
+        imus = (self.imu.is_random, self.pelvis_imu.is_random)
+        return self.draws_robots or any(noise + imus)
 
     @property
     def homing_width_rad(self) -> float:
         """Half-width of the homing error of link encoders; of ranges their largest error."""
-        return max(
-            [self.encoder_bias_rad, *(abs(end) for own in self.ranges for end in own.homing_rad)]
-        )
+        drawn = [abs(end) for own in self.ranges for end in own.homing_rad]
+        return max([self.encoder_bias_rad, *drawn])
 
 
-_LEFT_TO_RANGES = (
-    "stiffness_spread",
-    "push_n",
-    "slope_rad",
-    "encoder_bias_rad",
-    "inertial",
-    "delay_steps",
-)
+_DRAWN = ("stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad")
+_LEFT_TO_RANGES = (*_DRAWN, "inertial", "delay_steps")
 """Parameters that `RobotRanges` has, too, for each robot its own."""
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
@@ -204,11 +191,12 @@ CHANGES: dict[str, ScenarioChange] = {
 }
 """Parameters that a change sets on its ground."""
 
+_MOST_FRICTION = 8.0 / H54_200_S500_R.coulomb_friction
 TRAINING_RANGES = RobotRanges(
     stiffness=(0.75, 1.25),
     joint_stiffness=(0.8, 1.12),
     damping=(0.5, 2.0),
-    friction=(0.0, 8.0 / H54_200_S500_R.coulomb_friction),
+    friction=(0.0, _MOST_FRICTION),
     backlash_rad=(0.0, 2e-3),
     load_kg=(0.0, 8.0),
     load_x_m=(-0.1, 0.1),
@@ -226,7 +214,7 @@ changes but `stiff`'s on all joints at once."""
 _BEYOND: tuple[dict[str, Any], ...] = (
     {"stiffness": (0.6, 0.7)},
     {"stiffness": (1.3, 1.5)},
-    {"friction": (8.0 / H54_200_S500_R.coulomb_friction, 11.0 / H54_200_S500_R.coulomb_friction)},
+    {"friction": (_MOST_FRICTION, 11.0 / H54_200_S500_R.coulomb_friction)},
     {"backlash_rad": (2e-3, 3e-3)},
     {"load_kg": (8.0, 11.0)},
     {"homing_rad": (_HOMING_ERROR_RAD, 1.5 * _HOMING_ERROR_RAD)},
@@ -238,7 +226,7 @@ _BEYOND: tuple[dict[str, Any], ...] = (
 
 DISTRIBUTIONS: dict[str, ScenarioChange] = {
     "drawn": lambda _: {"ranges": [TRAINING_RANGES]},
-    "drawn_beyond": lambda _: {"ranges": [TRAINING_RANGES.replace(**beyond) for beyond in _BEYOND]},
+    "drawn_beyond": lambda _: {"ranges": [TRAINING_RANGES.replace(**own) for own in _BEYOND]},
 }
 """Changes that draw every episode's robot from ranges: those to learn from, and for tests robots
 that have one quantity beyond these."""
@@ -273,19 +261,18 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
     """
     if isinstance(name, Scenario):
         return name
-    first, *rest = str(name)[:_LONGEST_JOINED].split("+")
-    ground, changes = (
-        (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
-    )
+    changes = str(name)[:_LONGEST_JOINED].split("+")
+    ground = GROUNDS[changes.pop(0) if changes[0] in GROUNDS else "nominal"]
+    known = CHANGES | DISTRIBUTIONS
     parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
             raise ConfigurationError(
                 f"scenario {name!r}: {change!r} is a ground and can only stand first"
             )
-        known = CHANGES | DISTRIBUTIONS
         if change not in known:
-            raise unknown_name("scenario", change, [*scenario_names(walks), *DISTRIBUTIONS])
+            choices = [*scenario_names(walks), *DISTRIBUTIONS]
+            raise unknown_name("scenario", change, choices)
         added = known[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:

@@ -13,12 +13,8 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.world.control_kernels import (
-    complementary_filter,
-    in_whole_counts,
-    settled_vertical,
-    shown_angle,
-)
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world.control_kernels import in_whole_counts, shown_angle
 
 
 class AttitudeSensor(Model):
@@ -41,7 +37,8 @@ class AttitudeSensor(Model):
         return self.noise_rad > 0.0 or self.bias_spread_rad > 0.0
 
 
-STANDARD_GRAVITY_M_S2 = 9.80665
+_G = 9.80665
+"""Standard gravity [m/s²]."""
 
 
 class InertialSensor(Model):
@@ -74,9 +71,9 @@ class InertialSensor(Model):
     """Noise density of the gyroscope [rad/s/√Hz]."""
     gyro_bias_rad_s: float = quantity("rad/s", math.radians(10.0) / 3600.0, ge=0)
     """Standard deviation of the gyroscope's bias [rad/s]."""
-    accelerometer_noise_density: float = quantity("m/s²/√Hz", 100e-6 * STANDARD_GRAVITY_M_S2, ge=0)
+    accelerometer_noise_density: float = quantity("m/s²/√Hz", 100e-6 * _G, ge=0)
     """Noise density of the accelerometer [m/s²/√Hz]."""
-    accelerometer_bias_m_s2: float = quantity("m/s²", 0.002 * STANDARD_GRAVITY_M_S2, ge=0)
+    accelerometer_bias_m_s2: float = quantity("m/s²", 0.002 * _G, ge=0)
     """Standard deviation of the accelerometer's bias [m/s²]."""
     static_error_rad: float = quantity("rad", math.radians(0.25), ge=0)
     """Standard deviation of roll's and pitch's error at rest [rad]."""
@@ -107,18 +104,17 @@ class InertialSensor(Model):
         Only noise across the vertical tilts the attitude, that along it has no effect to first
         order.
         """
-        return (
-            self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz) / STANDARD_GRAVITY_M_S2
-        )
+        return self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz) / _G
 
     @property
     def offset_rad(self) -> float:
         """Standard deviation of the offset of roll and pitch [rad]."""
-        return math.sqrt(max(self.static_error_rad**2 - self._error_by_bias_rad**2, 0.0))
+        rest = self.static_error_rad**2 - self._error_by_bias_rad**2
+        return math.sqrt(max(rest, 0.0))
 
     @property
     def _error_by_bias_rad(self) -> float:
-        by_accelerometer = self.accelerometer_bias_m_s2 / STANDARD_GRAVITY_M_S2
+        by_accelerometer = self.accelerometer_bias_m_s2 / _G
         return math.hypot(by_accelerometer, self.gyro_bias_rad_s * self.time_constant_s)
 
 
@@ -134,7 +130,8 @@ def quantise(angle: Array, count_rad: Array | float) -> Array:
         (...) [rad].
     """
     has_counts = np.asarray(count_rad) > 0.0
-    return np.where(has_counts, in_whole_counts(angle, np.where(has_counts, count_rad, 1.0)), angle)
+    counted = in_whole_counts(angle, np.where(has_counts, count_rad, 1.0))
+    return np.where(has_counts, counted, angle)
 
 
 def angle_of_count(counts_per_turn: int | None) -> float:
@@ -154,9 +151,8 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    return shown_angle(
-        angle, drawn_bias, sensor.noise_rad * noise, sensor.bias_rad, sensor.sine_error_rad
-    )
+    added = sensor.noise_rad * noise
+    return shown_angle(angle, drawn_bias, added, sensor.bias_rad, sensor.sine_error_rad)
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
@@ -167,9 +163,8 @@ def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray
     """
     samples_per_step = rate_hz * control_period_s
     # the small shift keeps a rate that divides the control rate exact in floating point
-    return (step == 0) | (
-        np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9)
-    )
+    now = np.floor(step * samples_per_step + 1e-9)
+    return (step == 0) | (now > np.floor((step - 1) * samples_per_step + 1e-9))
 
 
 class NoiseStream:
@@ -182,17 +177,19 @@ class NoiseStream:
         num_worlds: How many.
         kind: Structured type of a sample, of real numbers alone.
         block: Samples that are drawn at once.
+
+    Attributes:
+        samples: Those ahead and those used, (block, num_worlds).
+        used: How many of each world's are used, (num_worlds,): its next one has that number.
     """
 
     def __init__(self, num_worlds: int, kind: np.dtype[Any], block: int = 250) -> None:
         # samples of a time are neighbours in memory: worlds mostly use theirs together
-        self._samples = np.zeros((block, num_worlds), kind)
-        self._used = np.zeros(num_worlds, dtype=np.int64)
+        self.samples = np.zeros((block, num_worlds), kind)
+        self.used = np.zeros(num_worlds, dtype=np.int64)
         self._world = np.arange(num_worlds)
         self._most_used = 0
-        self._generators: list[np.random.Generator] = [
-            np.random.default_rng(0) for _ in range(num_worlds)
-        ]
+        self._generators = [np.random.default_rng(0) for _ in range(num_worlds)]
 
     def restart(self, world: int, generator: np.random.Generator) -> None:
         """Begin a new stream for one world."""
@@ -204,31 +201,26 @@ class NoiseStream:
 
         The rows of the others are not to be used.
         """
-        samples, used = self.ready()
-        sample = samples[np.minimum(used, len(samples) - 1), self._world]
-        used += worlds
+        self.make_ready()
+        sample = self.samples[np.minimum(self.used, len(self.samples) - 1), self._world]
+        self.used += worlds
         return sample
 
-    def ready(self) -> tuple[Any, IntArray]:
-        """Samples ahead, at least one of each world, for one step.
-
-        Returns:
-            (block, num_worlds), and how many of each world's are used, (num_worlds,): its next one
-            has that number, and counting it is for the caller.
-        """
-        block = len(self._samples)
+    def make_ready(self) -> None:
+        """Have at least one sample of each world ahead, for one step; who takes it counts it."""
+        block = len(self.samples)
         if self._most_used >= block:
-            for world in np.flatnonzero(self._used == block):
+            for world in np.flatnonzero(self.used == block):
                 self._refill(int(world))
-            self._most_used = int(self._used.max())
+            self._most_used = int(self.used.max())
         self._most_used += 1
-        return self._samples, self._used
 
     def _refill(self, world: int) -> None:
-        kind = self._samples.dtype
-        drawn = self._generators[world].standard_normal((len(self._samples), kind.itemsize // 8))
-        self._samples[:, world] = drawn.view(kind)[:, 0]
-        self._used[world] = 0
+        kind = self.samples.dtype
+        shape = (len(self.samples), kind.itemsize // 8)
+        drawn = self._generators[world].standard_normal(shape)
+        self.samples[:, world] = drawn.view(kind)[:, 0]
+        self.used[world] = 0
 
 
 _PENDULUM_NOISE = np.dtype([("rate", np.float64), ("force", np.float64, (2,))])
@@ -271,9 +263,8 @@ class PendulumImu:
         self._gain = 1.0 - math.exp(-period_s / sensor.time_constant_s)
         self._up = np.zeros((num_worlds, 3))
         self._last = np.zeros((num_worlds, 2))
-        self._bias = np.zeros(
-            (num_worlds, 3)
-        )  # of the gyroscope, then of the accelerometer along x and z
+        # of the gyroscope, then of the accelerometer along x and z
+        self._bias = np.zeros((num_worlds, 3))
         self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
 
     def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
@@ -287,11 +278,12 @@ class PendulumImu:
 
     def settle(self, worlds: BoolArray, q: Array) -> None:
         """The links of some worlds have been at rest at q, (num_worlds,) [rad], for long."""
-        self._last[worlds] = np.stack([q, np.zeros_like(q)], axis=1)[worlds]
+        at_rest = np.zeros_like(q)
+        self._last[worlds] = np.stack([q, at_rest], axis=1)[worlds]
         for world in np.flatnonzero(worlds):
-            force = self._force(q, np.zeros_like(q), np.zeros_like(q))[world]
+            force = self._force(q, at_rest, at_rest)[world]
             gyro = np.array([0.0, -self._bias[world, 0], 0.0])
-            settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
+            kernels.settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
 
     def advance(self, worlds: BoolArray, q: Array, q_dot: Array) -> None:
         """Advance by a control period to angles q [rad] and rates q̇ [rad/s], (num_worlds,)."""
@@ -300,15 +292,11 @@ class PendulumImu:
         sensor = self._sensor
         force = self._force(q, q_dot, (q_dot - last[:, 1]) / self._period_s)
         force[:, ::2] += sensor.accelerometer_noise_rad * self._gravity * drawn["force"]
-        turned = (
-            q
-            - last[:, 0]
-            + self._period_s * (self._bias[:, 0] + sensor.gyro_noise_rad_s * drawn["rate"])
-        )
+        error = self._bias[:, 0] + sensor.gyro_noise_rad_s * drawn["rate"]
+        turned = q - last[:, 0] + self._period_s * error
         for world in np.flatnonzero(worlds):
-            complementary_filter(
-                self._up[world], np.array([0.0, -turned[world], 0.0]), force[world], self._gain
-            )
+            about_y = np.array([0.0, -turned[world], 0.0])
+            kernels.complementary_filter(self._up[world], about_y, force[world], self._gain)
         self._last[worlds] = np.stack([q, q_dot], axis=1)[worlds]
 
     @property
@@ -320,7 +308,6 @@ class PendulumImu:
         """Specific force with its bias in the frame of the link, (num_worlds, 3) [m/s²]."""
         r = self._arm_m
         g = self._gravity
-        bias = self._bias
-        tangential = r * q_ddot + g * np.sin(q)
-        radial = r * np.square(q_dot) + g * np.cos(q)
-        return np.stack([tangential + bias[:, 1], np.zeros_like(q), radial + bias[:, 2]], axis=1)
+        tangential = r * q_ddot + g * np.sin(q) + self._bias[:, 1]
+        radial = r * np.square(q_dot) + g * np.cos(q) + self._bias[:, 2]
+        return np.stack([tangential, np.zeros_like(q), radial], axis=1)

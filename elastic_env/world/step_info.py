@@ -19,9 +19,9 @@ class StepInfo(dict[str, Any]):
 
     __slots__ = ("_rest",)
 
-    def __init__(self, given: dict[str, Any], rest: Callable[[], dict[str, Any]]) -> None:
+    def __init__(self, given: dict[str, Any], rest: Callable[[], dict[str, Any]] | None) -> None:
         super().__init__(given)
-        self._rest: Callable[[], dict[str, Any]] | None = rest
+        self._rest = rest
 
     def complete(self) -> dict[str, Any]:
         """A plain dictionary with everything."""
@@ -62,7 +62,8 @@ class StepInfo(dict[str, Any]):
         return dict(other) | self.complete()
 
     def __eq__(self, other: object) -> bool:
-        return self.complete() == (other.complete() if isinstance(other, StepInfo) else other)
+        theirs = other.complete() if isinstance(other, StepInfo) else other
+        return self.complete() == theirs
 
     def __ne__(self, other: object) -> bool:
         return not self == other
@@ -85,17 +86,7 @@ def _when_complete(name: str) -> Callable[..., Any]:
     return of_all
 
 
-for _name in (
-    "get",
-    "keys",
-    "values",
-    "items",
-    "pop",
-    "popitem",
-    "setdefault",
-    "__iter__",
-    "__len__",
-    "__delitem__",
-    "__repr__",
-):
+_ALTERED = ("pop", "popitem", "setdefault", "__delitem__")
+_READ = ("get", "keys", "values", "items", "__iter__", "__len__", "__repr__")
+for _name in (*_ALTERED, *_READ):
     setattr(StepInfo, _name, _when_complete(_name))

@@ -7,8 +7,7 @@ blocks of records, from which signals and metrics are made when they are needed.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,31 +20,23 @@ from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
 from elastic_env.core.robot_ranges import DrawnRobot
-from elastic_env.core.signals import (
-    Array,
-    BoolArray,
-    Kind,
-    Mirrored,
-    Signal,
-    SignalGroup,
-    Signals,
-    SignalTable,
-)
+from elastic_env.core.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.joint.elasticity import joint_torque
-from elastic_env.motion.trajectory import PlanTable
+from elastic_env.motion.trajectory import Motion, PlanTable
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.further_sensors import (
-    ACCELEROMETER,
-    FurtherSensors,
-    SensorInputs,
-    specific_force,
+from elastic_env.world import further_sensors as further
+from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.joint_signals import (
+    ACTION_BOUND_RAD,
+    JOINT_COLUMNS,
+    Mirrors,
+    action_table,
 )
 from elastic_env.world.metrics import EpisodeMetrics, Metric
 from elastic_env.world.physics import DIVERGED_RAD_S, Simulation, simulate, substeps
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.rows import (
     JOINT,
-    JOINT_COLUMNS,
     RULES,
     Records,
     Sample,
@@ -56,8 +47,6 @@ from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import NoiseStream, angle_of_count
 from elastic_env.world.step_info import StepInfo
 
-ACTION_BOUND_RAD = 0.3
-"""Largest command offset [rad]."""
 DIVERGED = "diverged"
 """Reason of termination where the simulation produced a bad number; MuJoCo alone would restart
 it silently.
@@ -69,34 +58,6 @@ _MOST_STEPS = 256
 """Rows (steps of all worlds) whose signals are computed together, and how many steps that can
 be.
 """
-
-
-def action_table(joints: Sequence[str], bound_rad: float = ACTION_BOUND_RAD) -> SignalTable:
-    """The action: an offset for every joint, within ± a bound."""
-    offsets = SignalGroup.of(
-        "command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command"
-    ).signals
-    return SignalTable(tuple(replace(own, low=-bound_rad, high=bound_rad) for own in offsets))
-
-
-def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
-    """Columns that every robot observes of its joints, `elastic_env.world.rows.JOINT_COLUMNS`.
-
-    Args:
-        joints: In order, and what an angle of theirs is in the mirror.
-    """
-    described: tuple[tuple[str, str, Kind], ...] = (
-        ("rad", "motor encoder, θ in whole counts", "measured"),
-        ("rad/s", "its change over the last control period", "measured"),
-        ("rad", "q_ref at the end of the coming control period", "reference"),
-        ("rad/s", "its rate", "reference"),
-        ("rad/s²", "its acceleration", "reference"),
-        ("rad", "θ_cmd of the last control period", "command"),
-    )
-    return [
-        SignalGroup.of(name, unit, meaning, joints, kind)
-        for name, (unit, meaning, kind) in zip(JOINT_COLUMNS, described, strict=True)
-    ]
 
 
 class Transition(NamedTuple):
@@ -122,12 +83,14 @@ class Task(ABC):
         name: Of the robot.
         model: Its plant, what is drawn aside.
         assumed: What a compensator may know of it.
-        reference: What the links are to do in every world.
+        motion: What the links are to do.
         table: What is observed, further sensors aside.
-        sensors: Further sensors, whose columns stand behind the others.
+        sensors: Names of further sensors, whose columns stand behind the others.
+        joints: In order, and what an angle of theirs is in the mirror.
         scenarios: Of every world.
         metrics: Figures of an episode.
-        rules: Records of `elastic_env.world.rows.RULES`, one for every kind of world.
+        kinds: Of worlds: counts per turn of the encoders, None for none, and whether measurements
+            are delayed.
         action_bound_rad: Largest command offset [rad].
 
     Attributes:
@@ -148,34 +111,38 @@ class Task(ABC):
         name: str,
         model: mujoco.MjModel,
         assumed: RobotModel,
-        reference: PlanTable,
+        motion: Motion,
         table: Sequence[Signal],
-        sensors: FurtherSensors,
+        sensors: Sequence[str],
+        joints: Mirrors,
         scenarios: Sequence[Scenario],
         metrics: Sequence[Metric],
-        rules: Records,
+        kinds: Sequence[tuple[int | None, bool]],
         action_bound_rad: float = ACTION_BOUND_RAD,
     ) -> None:
-        joints = assumed.joint_names
-        num_worlds = len(reference.plan_of_world)
+        num_worlds = len(scenarios)
+        names = list(joints)
+        counts = assumed.encoder_counts_per_turn
+        reference = PlanTable(motion, config.control_period_s, num_worlds)
         self.config = config
         self.name = name
         self.model = model
         self.num_worlds = num_worlds
         self.num_steps = reference.num_steps
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
-        self.observation_table = SignalTable((*table, *sensors.signals))
-        self.action_table = action_table(joints, action_bound_rad)
+        self._sensors = FurtherSensors(sensors, joints, scenarios, counts)
+        self.observation_table = SignalTable((*table, *self._sensors.signals))
+        self.action_table = action_table(names, action_bound_rad)
         self.assumed_model = assumed.observed_by(self.observation_table)
         self.metrics = metrics
         self._reference = reference
-        self._sensors = sensors
-        self._has_sensors = bool(sensors.signals)
-        self._has_further_terms = type(self).further_reward_terms is not Task.further_reward_terms
+        self._has_sensors = bool(sensors)
+        own_terms = type(self).further_reward_terms
+        self._has_further_terms = own_terms is not Task.further_reward_terms
         self._width = len(self.observation_table)
-        self._at = addresses(model, joints)
+        self._at = addresses(model, names)
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
-        self._rules = rules
+        self._rules = _joint_rules(config.control_period_s, kinds)
         self._kind = np.zeros(num_worlds, dtype=np.int64)
         self._scenarios = scenarios
         self._robots: dict[int, DrawnRobot] = {}
@@ -186,14 +153,17 @@ class Task(ABC):
         self._no_reason.flags.writeable = False
         self._begun = np.zeros(num_worlds, dtype=np.bool_)
         self._is_begun = False
-        self._steps_at_once = min(max(_SCORED_ROWS // num_worlds, _FEWEST_STEPS), _MOST_STEPS)
-        self._begin_block(
-            np.zeros((2, num_worlds, len(joints)), JOINT),
-            np.zeros((2, num_worlds), self.world_type),
+        self._constants = (
+            *(self._at, self._columns, reference.motion, reference.plan_of_world),
+            *(self._rules, self._kind, self._noise.samples, self._noise.used),
         )
+        steps = _SCORED_ROWS // num_worlds
+        self._steps_at_once = min(max(steps, _FEWEST_STEPS), _MOST_STEPS)
+        worlds = np.zeros((2, num_worlds), self.world_type)
+        self._begin_block(np.zeros((2, num_worlds, len(names)), JOINT), worlds)
 
     def attach(
-        self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False
+        self, simulation: Simulation | None, num_threads: int, is_scalar: bool = False
     ) -> None:
         """Attach the physics, and compile all that a control step needs.
 
@@ -204,10 +174,12 @@ class Task(ABC):
             num_threads: Threads of MuJoCo's physics, 0 for all cores; results do not depend on it.
             is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
         """
-        self.simulation = simulation or simulate(self.model, self.num_worlds, num_threads)
+        own = simulation or simulate(self.model, self.num_worlds, num_threads)
+        self.simulation = own
         self._is_scalar = is_scalar
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
-        if simulation is not None:  # scoring many takes 2 ms, half a control period of hardware
+        # scoring many takes 2 ms, half a control period of hardware
+        if simulation is not None:
             self._steps_at_once = _FEWEST_STEPS
         compile_now(self._rehearse)
 
@@ -234,6 +206,7 @@ class Task(ABC):
         for world in np.flatnonzero(worlds).tolist():
             self._draw(world, random[world])
         self._place(worlds)
+        self._noise.make_ready()
         self._begin_worlds(worlds)
         for block in (self._joints, self._worlds):
             block[last][worlds] = block[now][worlds]
@@ -250,19 +223,17 @@ class Task(ABC):
             ResetNeeded: A world has not begun an episode yet.
         """
         if not self._is_begun:
-            some = (
-                f", of the worlds {np.flatnonzero(~self._begun).tolist()} too"
-                if self._begun.any()
-                else ""
-            )
-            raise gymnasium.error.ResetNeeded(f"reset() comes before the first step(){some}")
+            missing = np.flatnonzero(~self._begun).tolist()
+            some = f", of the worlds {missing} too" if self._begun.any() else ""
+            problem = f"reset() comes before the first step(){some}"
+            raise gymnasium.error.ResetNeeded(problem)
         offset, is_clipped = self._command(action)
         self._disturb()
         self.simulation.advance(self.num_substeps)
         self._take_rows(1)
         observation, reward, ends, is_over = self._sense(offset, is_clipped)
-        sample = self.sample()
-        info = StepInfo({"termination": self._no_reason}, partial(self._describe, sample))
+        rest = partial(self._describe, self.sample())
+        info = StepInfo({"termination": self._no_reason}, rest)
         if is_over:
             info["termination"] = self._reasons(ends)
             self.score()
@@ -275,7 +246,7 @@ class Task(ABC):
     def observe(self) -> Array:
         """A fresh observation of the present state, (num_worlds, len(observation_table))."""
         observed = np.empty((self.num_worlds, self._width))
-        kernels.show_joints(self._constants, self._steps(), observed)
+        kernels.show_joints(self._step, observed)
         self._show_worlds(observed)
         self._show_sensors(observed)
         return observed
@@ -299,15 +270,15 @@ class Task(ABC):
         self._unscored = rows.stop
         if shape[0] <= 0:
             return
-        sample = Sample(
-            self._joints[rows].reshape(-1, len(self._at)), self._worlds[rows].reshape(-1)
-        )
+        joints = self._joints[rows].reshape(-1, len(self._at))
+        sample = Sample(joints, self._worlds[rows].reshape(-1))
         truth = sample.worlds["truth"]
         masks = self.masks(sample)
         if truth["diverged"].any():
             masks = {name: mask & ~truth["diverged"] for name, mask in masks.items()}
         masks["all"] = np.ones(shape, dtype=np.bool_)
-        signals = {**self.signals(sample), "clipped": truth["clipped"].astype(np.float64)}
+        clipped = truth["clipped"].astype(np.float64)
+        signals = {**self.signals(sample), "clipped": clipped}
         self._metrics.update(
             {name: signal.reshape(shape) for name, signal in signals.items()},
             {name: mask.reshape(shape) for name, mask in masks.items()},
@@ -316,9 +287,8 @@ class Task(ABC):
     def reward_terms(self, sample: Sample) -> dict[str, Array]:
         """Weighted terms whose sum is the reward, one value per row."""
         scores = sample.worlds["scores"]
-        return {
-            name: scores[name].copy() for name in scores.dtype.names or ()
-        } | self.further_reward_terms(sample)
+        terms = {name: scores[name].copy() for name in scores.dtype.names or ()}
+        return terms | self.further_reward_terms(sample)
 
     def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002
         """Terms that a task of one's own adds to the reward, one value per row."""
@@ -351,23 +321,8 @@ class Task(ABC):
         """Truth and measurements at the start of an episode in some worlds."""
 
     @abstractmethod
-    def _sense_worlds(
-        self,
-        joints: tuple[Any, ...],
-        noise: tuple[Any, ...],
-        commanded: tuple[Any, ...],
-        steps: tuple[Any, ...],
-        results: tuple[Any, ...],
-    ) -> bool:
-        """Sense, score, end and observe a control step; True if an episode ends.
-
-        Args:
-            joints: `kernels.Joints`.
-            noise: `kernels.Noise`.
-            commanded: `kernels.Commanded`.
-            steps: `kernels.Steps`.
-            results: To be filled, `kernels.Results`.
-        """
+    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
+        """Sense, score, end and observe a control step, `kernels.Control`; True if one ends."""
 
     @abstractmethod
     def _show_worlds(self, observed: Array) -> None:
@@ -377,20 +332,20 @@ class Task(ABC):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
-    def _take_robot(self, world: int, robot: DrawnRobot, true_model: RobotModel) -> None:
+    def _take_robot(self, world: int, robot: DrawnRobot, true: RobotModel) -> None:
         """Keep the robot of a world, and write what is true of its joints.
 
         Args:
             world: Number of the world.
             robot: As it was drawn.
-            true_model: The true robot, what is drawn aside.
+            true: The true robot, what is drawn aside.
         """
         self._robots[world] = robot
         truth = self._joints[self._row, world]["truth"]
         truth["homing"] = robot.homing_rad
-        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness)
-        truth["damping"] = true_model.damping * robot.damping
-        truth["backlash"] = true_model.backlash + robot.backlash_rad
+        truth["stiffness"] = true.stiffness * np.array(robot.stiffness)
+        truth["damping"] = true.damping * robot.damping
+        truth["backlash"] = true.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
         """Apply what acts on the robot from outside during the coming control period."""
@@ -399,29 +354,20 @@ class Task(ABC):
     """Control periods that the last step took."""
 
     @property
-    def _constants(self) -> tuple[Any, ...]:
-        """`kernels.Joints`."""
-        plans = self._reference
-        return self._at, self._columns, plans.motion, plans.plan_of_world, self._rules, self._kind
-
-    def _steps(self) -> tuple[Any, ...]:
-        """`kernels.Steps`."""
-        row = self._row
-        return self._joints[row - 1], self._joints[row], self._worlds[row - 1], self._worlds[row]
+    def _step(self) -> tuple[Any, ...]:
+        """The present step, as `kernels.step_of` takes it."""
+        return (self._joints, self._worlds, self._row, *self._constants)
 
     def _command(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
         """Command offsets within their bounds; where an action was beyond them, (num_worlds,)."""
         given = np.asarray(action)
-        if given.dtype.kind not in "fiub" or given.shape != (self.num_worlds, len(self._bound)):
+        shape = (self.num_worlds, len(self._bound))
+        if given.dtype.kind not in "fiub" or given.shape != shape:
             raise self._refused(given)
         offset = given.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
-        joints = self._joints[self._row]
-        worlds = self._worlds[self._row]
         inputs = self.simulation.ctrl
-        if not kernels.command(
-            self._constants, joints, worlds, offset, self._bound, is_clipped, inputs
-        ):
+        if not kernels.command(self._step, offset, self._bound, is_clipped, inputs):
             raise self._refused(given.astype(np.float64))
         return offset, is_clipped
 
@@ -431,12 +377,12 @@ class Task(ABC):
         observed = np.empty((n, self._width))
         reward = np.empty(n)
         ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
-        commanded = (offset, is_clipped, self.simulation.divergence(), self._periods)
-        results = (observed, reward, ends)
-        noise = self._noise.ready()
-        is_over = self._sense_worlds(self._constants, noise, commanded, self._steps(), results)
+        diverged = self.simulation.divergence()
+        self._noise.make_ready()
+        command = (offset, is_clipped, diverged, self._periods)
+        is_over = self._sense_worlds((*command, observed, reward, ends))
         if self._has_sensors:
-            self._sensors.measure(~commanded[2], self._sensor_inputs())
+            self._sensors.measure(~diverged, self._sensor_inputs())
             self._show_sensors(observed)
         if self._has_further_terms:
             for term in self.further_reward_terms(self.sample()).values():
@@ -447,27 +393,23 @@ class Task(ABC):
         """Fill the columns of further sensors."""
         if self._has_sensors:
             is_delayed = self._rules["is_delayed"][self._kind]
-            observed[:, -len(self._sensors.signals) :] = self._sensors.columns(is_delayed)
+            first = self._width - len(self._sensors.signals)
+            observed[:, first:] = self._sensors.columns(is_delayed)
 
     def _sensor_inputs(self) -> SensorInputs:
         """The truth that further sensors need; the specific force lags one physics step behind."""
         truth = self._joints[self._row]["truth"]
-        has_force = ACCELEROMETER in self.config.sensors
-        sensordata = self.simulation.bind("sensordata") if has_force else None
-        return SensorInputs(
-            q=truth["q"].copy(),
-            joint_torque=spring_torque(truth),
-            specific_force=specific_force(self.model, sensordata, self.num_worlds),
-        )
+        force = np.full((self.num_worlds, 3), np.nan)
+        if further.ACCELEROMETER in self.config.sensors:
+            begin = int(self.model.sensor(further.ACCELEROMETER).adr[0])
+            force = self.simulation.bind("sensordata")[:, begin : begin + 3].copy()
+        return SensorInputs(truth["q"].copy(), spring_torque(truth), force)
 
     def _describe(self, sample: Sample) -> dict[str, Any]:
         """Reward terms, signals and clipping of a step, computed when somebody looks at them."""
         clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
-        return {
-            "reward_terms": self.reward_terms(sample),
-            **self.signals(sample),
-            "clipped": clipped,
-        }
+        terms = self.reward_terms(sample)
+        return {"reward_terms": terms, **self.signals(sample), "clipped": clipped}
 
     def _take_rows(self, count: int) -> None:
         """Go on to fresh records, in a fresh block where this one is full.
@@ -493,18 +435,22 @@ class Task(ABC):
     def _rehearse(self) -> None:
         """Compile all kernels by a control step of records that nobody sees."""
         every = np.ones(self.num_worlds, dtype=np.bool_)
-        offset, is_clipped = self._command(np.zeros((self.num_worlds, len(self._bound))))
+        nothing = np.zeros((self.num_worlds, len(self._bound)))
+        offset, is_clipped = self._command(nothing)
         self.simulation.ctrl[:] = 0.0
+        self._noise.make_ready()
         self._begin_worlds(every)
         self._take_rows(1)
         self._sense(offset, is_clipped)
         self.observe()
         self.signals()
-        self._begin_block(np.zeros_like(self._joints[:2]), np.zeros_like(self._worlds[:2]))
+        joints = np.zeros_like(self._joints[:2])
+        self._begin_block(joints, np.zeros_like(self._worlds[:2]))
 
     def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
         """Reason of termination of every world, the first that applies, "" where there is none."""
-        reasons = np.full(self.num_worlds, "", dtype=f"<U{max(map(len, self._failures))}")
+        longest = max(map(len, self._failures))
+        reasons = np.full(self.num_worlds, "", dtype=f"<U{longest}")
         for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
             reasons[failed] = reason
         return reasons
@@ -514,33 +460,22 @@ class Task(ABC):
         shape = (self.num_worlds, len(self._bound))
         bounds = f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
-            return ActionError(
-                f"an action must be real numbers, {bounds}, got an array of {given.dtype}"
-            )
+            kind = given.dtype
+            return ActionError(f"an action must be real numbers, {bounds}, got an array of {kind}")
         if given.shape != shape:
             # a scalar environment adds the axis of worlds itself
-            expected, found = (
-                (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
-            )
-            return ActionError(
-                f"an action must have shape {expected} [rad], {bounds}; got shape {found}"
-            )
+            first = int(self._is_scalar)
+            needed = f"shape {shape[first:]} [rad], {bounds}"
+            return ActionError(f"an action must have {needed}; got shape {given.shape[first:]}")
         world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
-        return ActionError(
-            f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in"
-            f" world {world}"
-        )
+        needed = f"finite, {bounds}, shape {shape[1:]} a world"
+        return ActionError(f"an action must be {needed}; got {given[world]} in world {world}")
 
 
-def joint_rules(control_period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
-    """Records of `RULES`, one for every kind of world.
-
-    Args:
-        control_period_s: Control period [s].
-        kinds: Counts per turn of the encoders, None for none, and whether measurements are delayed.
-    """
+def _joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:
+    """Records of `RULES`, one for every kind of world."""
     rules = np.zeros(len(kinds), RULES)
-    rules["control_period_s"] = control_period_s
+    rules["control_period_s"] = period_s
     rules["count_rad"] = [angle_of_count(counts) for counts, _ in kinds]
     rules["is_delayed"] = [is_delayed for _, is_delayed in kinds]
     rules["highest_rad_s"] = DIVERGED_RAD_S
@@ -549,10 +484,7 @@ def joint_rules(control_period_s: float, kinds: Sequence[tuple[int | None, bool]
 
 def spring_torque(truth: Records) -> Array:
     """Torque of spring and damper on the links, from the truth of joints, (rows, n) [N·m]."""
-    return joint_torque(
-        truth["theta"] - truth["q"],
-        truth["theta_dot"] - truth["q_dot"],
-        truth["stiffness"],
-        truth["damping"],
-        truth["backlash"],
-    )
+    deflection = truth["theta"] - truth["q"]
+    rate = truth["theta_dot"] - truth["q_dot"]
+    spring = (truth["stiffness"], truth["damping"], truth["backlash"])
+    return joint_torque(deflection, rate, *spring)

@@ -29,7 +29,8 @@ from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
-from elastic_env.robots.robot.environment import RobotConfig, configure_robot
+from elastic_env.robots.joint_robot import JointRobotConfig
+from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.world.joint_task import JointPlant
 from train.commands.compare import CompareConfig, compare
 from train.commands.options import Motion, StiffnessOrFile
@@ -338,7 +339,7 @@ def _rms(values: Array) -> Array:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def picture(config: RobotConfig, plant: JointPlant) -> Image:
+def picture(config: JointRobotConfig, plant: JointPlant) -> Image:
     """The poses with the largest sag, in rows: left without compensation, right with it.
 
     It is in closed form, as `joint_shares`. Deviations from the translucent reference are enlarged.

@@ -25,7 +25,6 @@ from elastic_env.hardware.live.plant import CycleRecord, ServoPlant
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
-from elastic_env.robots.testbed.task import TestbedTask
 from elastic_env.world.joint_task import METRICS_OF_ONE, JointTask, JointTruth
 from elastic_env.world.metrics import Metric
 from elastic_env.world.rows import REAL, WHOLE, Records, record_type
@@ -45,7 +44,7 @@ _LINK = JointTask.world_type
 _OF_LINK = [(name, _LINK[name]) for name in _LINK.names or ()]
 
 
-class HardwareTestbedTask(TestbedTask):
+class HardwareTestbedTask(JointTask):
     """Rules of `elastic_env/HardwareTestbed-v0`.
 
     Args:
@@ -53,6 +52,7 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
+    config: TestbedConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     world_type = record_type(*_OF_LINK, ("cycle", _CYCLE))
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
@@ -92,9 +92,9 @@ class HardwareTestbedTask(TestbedTask):
         super()._begin_worlds(worlds)
         self._keep_cycle()
 
-    def _sense_worlds(self, *arguments: Any, **named: Any) -> bool:
+    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
         """Behind the last step the pendulum is brought to rest."""
-        is_over = super()._sense_worlds(*arguments, **named)
+        is_over = super()._sense_worlds(control)
         self._keep_cycle()  # before the way back to rest, which measures too
         if is_over:
             self.plant.finish()

@@ -13,30 +13,24 @@ import mujoco
 
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.joint import supported_models as supported
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
 from elastic_env.joint.model_file import GivenModel, compiled_spec
-from elastic_env.joint.supported_models import (
-    has_nameless_hinge,
-    hinges_of,
-    nameless_hinge,
-    require_robot,
-    without_fingers,
-)
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
 from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
-from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
+from elastic_env.robots.robot import joints as own_joints
 from elastic_env.robots.robot.model import RigidModel, read_robot
 from elastic_env.world.drawn_robot import stiffest_plant
 from elastic_env.world.joint_config import RewardWeights
+from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointTask
 from elastic_env.world.physics import MOST_SUBSTEPS
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.task import ACTION_BOUND_RAD
 
 EXAMPLE = Path(__file__).with_name("example.xml")
 """The made-up arm that is played where no model is named; its joints are in the YAML file beside
@@ -47,13 +41,6 @@ LOAD_SHARE = 0.2
 """Share of the mass of the joints' links that servos of unknown limits can carry: what the
 scenario `payload` adds.
 """
-
-
-class RobotConfig(JointRobotConfig):
-    """All of the environment of any robot."""
-
-    robot: JointRobot
-    """The robot as its files describe it."""
 
 
 def configure_robot(
@@ -71,7 +58,7 @@ def configure_robot(
     reward: RewardWeights | dict[str, float] | None = None,
     timestep_s: float | None = None,
     action_bound_rad: float = ACTION_BOUND_RAD,
-) -> RobotConfig:
+) -> JointRobotConfig:
     """The configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
 
     Args:
@@ -107,11 +94,11 @@ def configure_robot(
         joints = EXAMPLE.with_suffix(".yaml")
         end_effector = end_effector or "tool"
     if model is None:
-        raise ConfigurationError(f"{ID} needs a model beside joints, such as model='arm.xml'")
+        problem = "needs a model beside joints, such as model='arm.xml'"
+        raise ConfigurationError(f"{ID} {problem}")
     robot = joint_robot(model, {} if joints is None else joints, end_effector)
-    robot = replace(
-        robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg})
-    )
+    carried_kg = robot.load_kg if load_kg is None else load_kg
+    robot = replace(robot, home=_home(robot, home), imu=imu, load_kg=carried_kg)
     settings = robot.configure(
         reference=reference,
         scenario=scenario,
@@ -123,27 +110,17 @@ def configure_robot(
         action_bound_rad=action_bound_rad,
     )
     if timestep_s is None:
-        played = stiffest_plant(
-            compiled_spec(robot.elastic(settings), "the model with elastic joints"),
-            settings.scenario,
-        )
-        timestep_s = stable_timestep(played, settings.control_period_s)
-        _require_step(timestep_s, settings.control_period_s)
+        period_s = settings.control_period_s
+        model = compiled_spec(robot.elastic(settings), "the model with elastic joints")
+        timestep_s = stable_timestep(stiffest_plant(model, settings.scenario), period_s)
+        if timestep_s < (shortest_s := period_s / MOST_SUBSTEPS):
+            raise ConfigurationError(
+                "the joints are too stiff, or their links or rotors too light: they explode with"
+                f" a physics step of {shortest_s:g} s, the shortest that is played; give them less"
+                " stiffness, or more rotor_inertia"
+            )
         settings = settings.replace(timestep_s=timestep_s)
-    return RobotConfig(
-        robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields}
-    )
-
-
-def _require_step(timestep_s: float, control_period_s: float) -> None:
-    """Refuse joints that only a physics step follows which is too short to be played."""
-    shortest_s = control_period_s / MOST_SUBSTEPS
-    if timestep_s < shortest_s:
-        raise ConfigurationError(
-            "the joints are too stiff, or their links or rotors too light: they explode with a"
-            f" physics step of {shortest_s:g} s, the shortest that is played; give them less"
-            " stiffness, or more rotor_inertia"
-        )
+    return settings
 
 
 def joint_robot(
@@ -152,13 +129,13 @@ def joint_robot(
     """A robot from its model and its elastic joints; arguments and errors as `configure_robot`."""
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
-    require_robot(whole)
+    supported.require_robot(whole)
     settings = _elastic_hinges(whole, joints)
     names = list(settings)
     moving = hold_other_joints(spec, settings)
     rigid = compiled_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
-    elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)
+    elastic = own_joints.elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
         raise ConfigurationError(
             "encoder_counts_per_turn must be the same for all joints; give it under '*'"
@@ -167,7 +144,7 @@ def joint_robot(
         NAME,
         RigidModel(model, tuple(names)),
         elastic,
-        home=home_of_joints(whole, names).tolist(),
+        home=own_joints.home_of_joints(whole, names).tolist(),
         end_effector=end_effector or outermost_body(rigid),
         load_kg=mass,
     )
@@ -175,14 +152,17 @@ def joint_robot(
 
 def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
-    hinges = hinges_of(model)
+    hinges = supported.hinges_of(model)
     given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
-    others = [name for j in range(model.njnt) if (name := model.joint(j).name) not in hinges]
-    settings = elastic_settings(given, hinges, others)
-    key_of_nameless = key_of(given, "")
-    if has_nameless_hinge(model) and key_of_nameless is not None and given[key_of_nameless] != HELD:
-        raise nameless_hinge()
-    return {name: settings[name] for name in without_fingers(model, settings, given)}
+    names = [model.joint(j).name for j in range(model.njnt)]
+    others = [name for name in names if name not in hinges]
+    settings = own_joints.elastic_settings(given, hinges, others)
+    nameless = key_of(given, "")
+    is_meant = nameless is not None and given[nameless] != HELD
+    if is_meant and supported.has_nameless_hinge(model):
+        raise supported.nameless_hinge()
+    moving = supported.without_fingers(model, settings, given)
+    return {name: settings[name] for name in moving}
 
 
 def _home(
@@ -193,18 +173,10 @@ def _home(
         return robot.home if given is None else given
     require_known("joint of home", given, robot.joints)
     own: Sequence[float] = robot.home or [0.0] * len(robot.joints)
-    return [given.get(name, angle) for name, angle in zip(robot.joints, own, strict=True)]
+    pairs = zip(robot.joints, own, strict=True)
+    return [given.get(name, angle) for name, angle in pairs]
 
 
-def _task(config: RobotConfig, num_worlds: int) -> JointTask:
-    return JointTask(config, config.robot.plant(config), num_worlds)
-
-
-def _picture(task: JointTask) -> JointPicture:
-    assert isinstance(task.config, RobotConfig)
-    return JointPicture(task.config.robot, task)
-
-
-ROBOT = Robot(NAME, ID, configure_robot, _task, _picture)  # pyright: ignore[reportArgumentType]
+ROBOT = Robot(NAME, ID, configure_robot, JointTask, JointPicture)
 make = ROBOT.make
 make_vector = ROBOT.make_vector

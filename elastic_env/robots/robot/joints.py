@@ -123,13 +123,12 @@ def elastic_joints(
     found: dict[str, ElasticJoint] = {}
     said: list[str] = []
     for (name, own), *of_links in zip(settings.items(), torque, *inertias, strict=True):
-        joint = _Assumed(model, name, own, _Links(*map(float, of_links)))
-        found[name] = joint.elastic()
-        said += joint.said
+        links = _Links(*map(float, of_links))
+        found[name] = _Assumed(model, name, own, links, said).elastic()
     if said:
-        warnings.warn(
-            f"assumed, as neither `joints` nor the model says it: {'; '.join(said)}", stacklevel=4
-        )
+        assumed = "; ".join(said)
+        reason = "as neither `joints` nor the model says it"
+        warnings.warn(f"assumed, {reason}: {assumed}", stacklevel=4)
     return found
 
 
@@ -174,20 +173,23 @@ def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Ar
     return least, most, together
 
 
+@dataclass(frozen=True)
 class _Assumed:
     """One elastic joint: given, read from the model, or assumed within the scale of the model.
 
     Attributes:
-        said: Assumptions that the default would not lead one to expect, with their values.
+        model, name: The joint's.
+        own: What is given of it.
+        links: That it moves.
+        said: To be added to: assumptions that the default would not lead one to expect, with their
+            values.
     """
 
-    def __init__(self, model: mujoco.MjModel, name: str, own: JointSettings, links: _Links) -> None:
-        self._model = model
-        self._name = name
-        self._own = own
-        self._links = links
-        self._dof = int(model.joint(name).dofadr[0])
-        self.said: list[str] = []
+    model: mujoco.MjModel
+    name: str
+    own: JointSettings
+    links: _Links
+    said: list[str]
 
     def elastic(self) -> ElasticJoint:
         """The joint.
@@ -195,23 +197,26 @@ class _Assumed:
         Raises:
             ConfigurationError: See `elastic_joints`.
         """
-        own = self._own
-        damping = float(self._model.dof_damping[self._dof])
+        own = self.own
+        dof = int(self.model.joint(self.name).dofadr[0])
+        damping = float(self.model.dof_damping[dof])
+        friction = float(self.model.dof_frictionloss[dof])
         is_given = own.servo.position_gain is not None
-        actuator = None if is_given else position_servo(self._model, self._name)
+        actuator = None if is_given else position_servo(self.model, self.name)
         if actuator is not None and own.servo.velocity_gain is None:
             damping -= actuator.joint_damping
-        servo = own.servo.over(ServoSettings() if actuator is None else actuator.settings)
-        known = own.rotor_inertia or rotor_inertia(self._model, self._name) or None
-        rotor = self._rotor_inertia(servo.velocity_gain or 0.0) if known is None else known
-        ratio = self._servo_to_spring(rotor) if known is None else _SERVO_TO_SPRING
+        read = ServoSettings() if actuator is None else actuator.settings
+        servo = own.servo.over(read)
+        rotor = own.rotor_inertia or rotor_inertia(self.model, self.name)
+        ratio = _SERVO_TO_SPRING
+        if not rotor:
+            rotor = self._rotor_inertia(servo.velocity_gain or 0.0)
+            ratio = self._servo_to_spring(rotor)
         return ElasticJoint(
             stiffness=own.stiffness,
             rotor_inertia=rotor,
             damping=_first(own.damping, self._damping(rotor)),
-            coulomb_friction=_first(
-                own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])
-            ),
+            coulomb_friction=_first(own.coulomb_friction, friction),
             viscous_friction=_first(own.viscous_friction, damping),
             load_friction=own.load_friction,
             static_friction=own.static_friction,
@@ -226,23 +231,25 @@ class _Assumed:
 
         A servo of a known velocity gain needs a rotor that is not too light for it.
         """
-        by_frequency = self._own.stiffness / ROTOR_FREQUENCY_RAD_S**2
-        most = max(self._links.most, velocity_gain / _FASTEST_PER_S)
+        by_frequency = self.own.stiffness / ROTOR_FREQUENCY_RAD_S**2
+        most = max(self.links.most, velocity_gain / _FASTEST_PER_S)
         if by_frequency <= most:
             return by_frequency
-        scale = "its links have" if most == self._links.most else "its velocity gain needs"
+        is_of_links = most == self.links.most
+        scale = "its links have" if is_of_links else "its velocity gain needs"
         self.said.append(
-            f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)²"
+            f"rotor_inertia of {self.name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)²"
             f" would be {by_frequency:.3g}"
         )
         return most
 
     def _servo_to_spring(self, rotor: float) -> float:
         """k_p over K of a servo that nobody knows, on a rotor whose inertia is assumed."""
-        K = self._own.stiffness
+        K = self.own.stiffness
         if rotor == K / ROTOR_FREQUENCY_RAD_S**2:
             return _SERVO_TO_SPRING
-        return min(max(rotor * _SERVO_RAD_S**2 / K, _LEAST_SERVO_TO_SPRING), _SERVO_TO_SPRING)
+        ratio = rotor * _SERVO_RAD_S**2 / K
+        return min(max(ratio, _LEAST_SERVO_TO_SPRING), _SERVO_TO_SPRING)
 
     def _damping(self, rotor: float) -> float:
         r"""D of a transmission that nobody knows [N·m·s/rad].
@@ -253,9 +260,9 @@ class _Assumed:
         \ge 2 \sigma m_j` lets it decay by :math:`\sigma`. A soft spring is damped critically at
         most, and light links no faster than a physics step follows.
         """
-        K = self._own.stiffness
-        least = self._links.least
-        together = self._links.together
+        K = self.own.stiffness
+        least = self.links.least
+        together = self.links.together
         of_lightest = DAMPING_RATIO * np.sqrt(K * rotor * least / (rotor + least))
         of_slowest = min(DECAY_RATE_PER_S * together, np.sqrt(K * together))
         fastest = _FASTEST_PER_S / 2.0 * rotor * least / (rotor + least)
@@ -263,26 +270,25 @@ class _Assumed:
 
     def _servo(self, known: ServoSettings, rotor: float, ratio: float, is_given: bool) -> Servo:
         """The servo of which some is known."""
-        links = self._links
-        kp = _first(known.position_gain, ratio * self._own.stiffness)
+        links = self.links
+        kp = _first(known.position_gain, ratio * self.own.stiffness)
         kv = known.velocity_gain
         back_emf = 0.0 if known.motor is None else known.motor.damping
         if kv is None:
-            carries_links = (
-                known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
-            )
+            is_soft = kp < _FAR_STIFFER * self.own.stiffness
+            carries_links = known.position_gain is not None and is_soft
             critical = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
             kv = max(critical - back_emf, 0.0)
             if known.position_gain is not None and not is_given:
                 self.said.append(
-                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as"
+                    f"velocity_gain of {self.name} {kv:.3g} N·m·s/rad, critical damping, as"
                     " nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
         motor = known.motor
         limit = known.torque_limit
         if limit is None:
-            limit = force_limit(self._model, self._name)
+            limit = force_limit(self.model, self.name)
         if limit is None and motor is not None:
             limit = motor.stall_torque
         # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh

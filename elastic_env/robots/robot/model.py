@@ -60,7 +60,8 @@ class RigidModel:
     def __call__(self) -> mujoco.MjSpec:
         """A copy that the caller may change."""
         if self._spec is None:
-            with warnings.catch_warnings():  # they were said when it was read for the first time
+            # they were said when it was read for the first time
+            with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 self._spec = _bare(
                     hold_other_joints(read_robot(self._model), self._joints), self._joints

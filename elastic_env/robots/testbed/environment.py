@@ -1,4 +1,37 @@
-"""`elastic_env/Testbed-v0`: the arguments of `gymnasium.make`, and what they make."""
+"""`elastic_env/Testbed-v0`: make the link follow a reference although the joint bends.
+
+Observation of one world (float64):
+
+| column | name | unit | meaning |
+|---|---|---|---|
+| 0 | `encoder_angle` | rad | motor encoder, θ in whole counts |
+| 1 | `encoder_rate` | rad/s | its change over the last control period |
+| 2 | `reference_angle` | rad | q_ref at the end of the coming control period |
+| 3 | `reference_rate` | rad/s | its rate |
+| 4 | `reference_acceleration` | rad/s² | its acceleration |
+| 5 | `last_command` | rad | θ_cmd of the last control period |
+| 6 | `link_angle_imu` | rad | IMU on the link; only with `observe_link=True` or `sensors=["link_imu"]` |
+
+Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
+
+`info` of one world, all at the end of the control period, the truth where nothing else is said:
+
+| key | unit | meaning |
+|---|---|---|
+| `time_s` | s | since the start of the episode |
+| `reference_angle` | rad | q_ref |
+| `link_angle`, `link_angle_imu` | rad | q, and what its IMU shows |
+| `link_error`, `link_error_imu` | rad | q_ref − q, and by the IMU; positive where the link hangs behind |
+| `deflection` | rad | δ = θ − q |
+| `joint_torque` | N·m | of spring and damper on the link, positive along q |
+| `servo_error` | rad | θ_cmd − θ |
+| `command_rate` | rad/s | rate of change of the offset a |
+| `rest` | 1 | number of the window at rest of `hold`, −1 elsewhere |
+| `clipped` | 1 | 1 where the action was beyond its bounds |
+| `reward_terms` | 1 | weighted terms of the reward, by name |
+| `termination` | | why the episode ended: "diverged", or "" |
+| `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit |
+"""  # noqa: E501
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,11 +46,11 @@ from elastic_env.robots.testbed import ID, NAME
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
-from elastic_env.robots.testbed.task import TestbedTask
 from elastic_env.world.joint_config import RewardWeights
+from elastic_env.world.joint_signals import ACTION_BOUND_RAD
+from elastic_env.world.joint_task import LINK_IMU_SENSOR, JointTask
 from elastic_env.world.robot_model import read_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
-from elastic_env.world.task import ACTION_BOUND_RAD
 
 
 def configure_testbed(
@@ -67,19 +100,18 @@ def configure_testbed(
         joint=chosen,
         pendulum=as_model("pendulum", pendulum, Pendulum()),
         form=form,
-        sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
-        observe_link=observe_link,
+        sensors=(*sensors, LINK_IMU_SENSOR) if observe_link else sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         reward=as_model("reward", reward, RewardWeights()),
         action_bound_rad=action_bound_rad,
         **({} if timestep_s is None else {"timestep_s": timestep_s}),
     )
 
 
-def picture(task: TestbedTask) -> TestbedPicture:
-    """The picture of a testbed."""
+def _picture(task: JointTask) -> TestbedPicture:
+    assert isinstance(task.config, TestbedConfig)
     return TestbedPicture(task.config.pendulum)
 
 
-TESTBED = Robot(NAME, ID, configure_testbed, TestbedTask, picture)
+TESTBED = Robot(NAME, ID, configure_testbed, JointTask, _picture)
 make = TESTBED.make
 make_vector = TESTBED.make_vector

@@ -7,7 +7,7 @@ which 60 N·m leave room; a steel bob of 10 kg, 0.61 m from the axis, with a rad
 0.1 m, is our choice.
 """
 
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -22,7 +22,7 @@ JOINT = "joint"
 GRAVITY_M_S2 = 9.81
 _LEAST = 1e-3
 """Of the parameters of a pendulum, in their units: with less its inertia is lost in rounding."""
-_MOST = {"gravity_torque": ("N·m", 1e4), "mass": ("kg", 1e4), "gyration_radius": ("m", 10.0)}
+_MOST = {"gravity_torque": 1e4, "mass": 1e4, "gyration_radius": 10.0}
 
 
 class Pendulum(Model):
@@ -37,11 +37,11 @@ class Pendulum(Model):
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
-        for name, (unit, most) in _MOST.items():
+        for name, most in _MOST.items():
+            extra: Any = type(self).model_fields[name].json_schema_extra
+            bounds = f"from {_LEAST:g} to {most:g} [{extra['unit']}]"
             if not _LEAST <= (value := getattr(self, name)) <= most:
-                raise ValueError(
-                    f"{name} must be from {_LEAST:g} to {most:g} [{unit}], got {value:g}"
-                )
+                raise ValueError(f"{name} must be {bounds}, got {value:g}")
         return self
 
     @property
@@ -64,7 +64,8 @@ class Pendulum(Model):
 
     def with_mass_scaled(self, scale: float) -> "Pendulum":
         """The same pendulum with another mass at the same place."""
-        return self.replace(mass=self.mass * scale, gravity_torque=self.gravity_torque * scale)
+        torque = self.gravity_torque * scale
+        return self.replace(mass=self.mass * scale, gravity_torque=torque)
 
 
 def imu_arm(pendulum: Pendulum) -> float:
@@ -86,13 +87,9 @@ def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> mujoco.MjSp
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # a NaN must end the episode, not restart the world behind the task's back
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    link = spec.worldbody.add_body(
-        name="link",
-        mass=pendulum.mass,
-        ipos=[0.0, 0.0, -pendulum.com_distance],
-        inertia=[pendulum.mass * pendulum.gyration_radius**2] * 3,
-        explicitinertial=True,
-    )
+    link = spec.worldbody.add_body(name="link", mass=pendulum.mass, explicitinertial=True)
+    link.ipos = [0.0, 0.0, -pendulum.com_distance]
+    link.inertia = [pendulum.mass * pendulum.gyration_radius**2] * 3
     # the axis points to −y, so that positive q carries the pendulum towards +x
     link.add_joint(name=JOINT, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
     link.add_site(name="imu", pos=[0.0, 0.0, -imu_arm(pendulum)])

@@ -10,21 +10,19 @@ import numpy as np
 
 from elastic_env.rendering.picture import CAMERA, Picture, Rgba, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
-from elastic_env.robots.deviations import (
-    HEIGHT,
-    REFERENCE_RGBA,
-    REFERENCE_WORD_RGBA,
-    WIDTH,
-    deviation_caption,
-    enlarge_deviation,
-)
+from elastic_env.robots import deviations
+from elastic_env.robots.deviations import REFERENCE_RGBA, enlarge_deviation
 from elastic_env.robots.testbed.model import Pendulum
 
 _LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
 _STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
 _HOUSING_RGBA = (0.2, 0.22, 0.26, 1.0)
 _ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
-_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", REFERENCE_WORD_RGBA))
+_LEGEND = (
+    ("rotor", _ROTOR_RGBA),
+    ("link", _LINK_RGBA),
+    ("reference", deviations.REFERENCE_WORD_RGBA),
+)
 
 
 class TestbedPicture(Picture):
@@ -40,19 +38,16 @@ class TestbedPicture(Picture):
         """The robot of a side-by-side picture."""
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
+        reach = self._pendulum.com_distance
         _add_mount(spec.worldbody)
-        _add_pendulum(
-            spec.worldbody, "link", 0.0, self._pendulum.com_distance, _STEEL_RGBA, _LINK_RGBA
-        )
-        return Alone(
-            spec, ["link"], (1.6 * self._pendulum.com_distance, 0.0, 0.0), dress=_add_light
-        )
+        _add_pendulum(spec.worldbody, "link", 0.0, reach, _STEEL_RGBA, _LINK_RGBA)
+        return Alone(spec, ["link"], (1.6 * reach, 0.0, 0.0), dress=_add_light)
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002
         """Reference, motor side and link side of a world."""
         link = now["link_angle"]
-        reference = now["reference_angle"]
-        return Sides(*(np.array([angle]) for angle in (reference, link + now["deflection"], link)))
+        angles = (now["reference_angle"], link + now["deflection"], link)
+        return Sides(*(np.array([angle]) for angle in angles))
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         reference = now["reference_angle"]
@@ -63,37 +58,34 @@ class TestbedPicture(Picture):
         self._data.joint("rotor").qpos = enlarge_deviation(rotor, reference)
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
-        return deviation_caption(now)
+        return deviations.deviation_caption(now)
 
 
 def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     """A model for drawing only: three independent hinges, no dynamics."""
     spec = mujoco.MjSpec()
-    set_stage(spec, WIDTH, HEIGHT)
+    set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
     reach = pendulum.com_distance
     world = spec.worldbody
     _add_light(spec)
-    world.add_camera(
-        name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50
-    )
+    eye = [0.0, -2.25 * reach, -0.22 * reach]
+    world.add_camera(name=CAMERA, pos=eye, xyaxes=[1, 0, 0, 0, 0, 1], fovy=50)
     _add_mount(world)
     _add_pendulum(world, "reference", 0.03, reach, REFERENCE_RGBA, REFERENCE_RGBA)
     _add_pendulum(world, "link", 0.0, reach, _STEEL_RGBA, _LINK_RGBA)
     rotor = _add_hinge(world, "rotor")
-    _add_disc(rotor, "rotor_disc", [0.055, 0.01, 0], [0, -0.03, 0], _ROTOR_RGBA)
     half = 0.36 * reach
-    _add_box(rotor, "rotor_pointer", [0.005, 0.004, half], [0, -0.03, -half], _ROTOR_RGBA)
+    pointer = ([0.005, 0.004, half], [0, -0.03, -half])
+    _add_disc(rotor, "rotor_disc", [0.055, 0.01, 0], [0, -0.03, 0], _ROTOR_RGBA)
+    _add_box(rotor, "rotor_pointer", *pointer, _ROTOR_RGBA)
     return spec
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
-    spec.worldbody.add_light(
-        pos=[0.3, -2.0, 2.0],
-        dir=[-0.1, 0.8, -0.8],
-        castshadow=False,
-        diffuse=[0.45] * 3,
-        specular=[0.1] * 3,
-    )
+    light = spec.worldbody.add_light(pos=[0.3, -2.0, 2.0], dir=[-0.1, 0.8, -0.8])
+    light.castshadow = False
+    light.diffuse = [0.45] * 3
+    light.specular = [0.1] * 3
 
 
 def _add_mount(world: mujoco.MjsBody) -> None:
@@ -118,12 +110,15 @@ def _add_hinge(world: mujoco.MjsBody, name: str) -> mujoco.MjsBody:
 def _add_box(
     body: mujoco.MjsBody, name: str, size: list[float], place: list[float], rgba: Rgba
 ) -> None:
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, rgba=rgba)
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    body.add_geom(name=name, type=box, size=size, pos=place, rgba=rgba)
 
 
 def _add_disc(
     body: mujoco.MjsBody, name: str, size: list[float], place: list[float], rgba: Rgba
 ) -> None:
     """A cylinder across the plane of the motion."""
-    disc = mujoco.mjtGeom.mjGEOM_CYLINDER
-    body.add_geom(name=name, type=disc, size=size, pos=place, zaxis=[0, 1, 0], rgba=rgba)
+    geom = body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER, zaxis=[0, 1, 0])
+    geom.size = size
+    geom.pos = place
+    geom.rgba = rgba

@@ -2,13 +2,13 @@
 
 import copy
 from functools import lru_cache, partial
-from typing import Literal, Self
+from typing import Self
 
 import mujoco
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.robot_ranges import DrawnRobot, draw_robots
 from elastic_env.core.signals import Array
@@ -18,19 +18,13 @@ from elastic_env.joint.time_step import require_stable
 from elastic_env.joint.varying_friction import varies
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
-from elastic_env.robots.thormang.model import (
-    DRAWN_LOAD,
-    LEG_JOINTS,
-    Thormang,
-    add_load,
-    biped,
-    elastic_spec,
-    place_load,
-)
+from elastic_env.robots.thormang import model as thormang
+from elastic_env.robots.thormang.model import DRAWN_LOAD, LEG_JOINTS, Thormang
 from elastic_env.robots.thormang.standing import Equilibrium, settle
 from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.world.scenario import Scenario, make_scenario
+from elastic_env.world.joint_config import TaskConfig
+from elastic_env.world.scenario import Scenario
 
 FALL_HEIGHT_SHARE = 0.75
 """A pelvis below this share of its planned height has fallen."""
@@ -55,27 +49,19 @@ class WalkRewardWeights(Model):
     """Factor of tilt and zmp before and after the walk, which is not scored [1]."""
 
 
-class WalkConfig(Model):
+class WalkConfig(TaskConfig):
     """All of the walking environment."""
 
     gait: Gait = Gait()
-    scenario: Scenario = make_scenario("nominal")
-    """Of all worlds, or of the first one where each has its own."""
     scenarios: tuple[Scenario, ...] = ()
-    """Of every world of a vector environment, where they differ; with the same friction and rate
-    of the IMU.
+    """Of every world of a vector environment, where they differ, `scenario` being the first; with
+    the same friction and rate of the IMU.
     """
     robot: Thormang = Thormang()
     joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
     """The leg joints in order, as they are known; the scenario says in what the true ones
     differ.
     """
-    form: Literal["tendon", "rigid"] = "tendon"
-    """Elastic, or rigid for what an inelastic robot would do."""
-    sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """Sensors beside the standard set, see `elastic_env.world.further_sensors`."""
-    control_period_s: float = quantity("s", 0.004, gt=0)
-    """Time between commands [s]."""
     timestep_s: float = quantity("s", 1e-3, gt=0)
     """Physics step [s]."""
     reward: WalkRewardWeights = WalkRewardWeights()
@@ -95,17 +81,14 @@ class WalkConfig(Model):
 
     @model_validator(mode="after")
     def _worlds_know_the_same(self) -> Self:
-        for name, known in (
-            ("friction_scale", lambda scenario: scenario.friction_scale),
-            ("rate_hz of pelvis_imu", lambda scenario: scenario.pelvis_imu.rate_hz),
-        ):
-            values = {known(scenario): scenario.name for scenario in self.scenarios}
+        frictions = {own.friction_scale: own.name for own in self.scenarios}
+        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
+        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
+        for name, values in known.items():
+            given = " and ".join(f"{value:g} of {own!r}" for value, own in values.items())
             if len(values) > 1:
                 raise ValueError(
-                    f"the scenarios of all worlds must have the same {name}, got "
-                    + " and ".join(
-                        f"{value:g} of {scenario!r}" for value, scenario in values.items()
-                    )
+                    f"the scenarios of all worlds must have the same {name}, got {given}"
                 )
         return self
 
@@ -113,10 +96,8 @@ class WalkConfig(Model):
         """Configurations of the scenarios, in the order in which these first occur."""
         if not self.scenarios:
             return [self]
-        alone = [
-            self.replace(scenario=scenario, scenarios=())
-            for scenario in dict.fromkeys(self.scenarios)
-        ]
+        each = dict.fromkeys(self.scenarios)
+        alone = [self.replace(scenario=scenario, scenarios=()) for scenario in each]
         most = max(config.loads for config in alone)
         return [config.replace(spare_bodies=most - config.loads) for config in alone]
 
@@ -128,10 +109,11 @@ class WalkConfig(Model):
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
         """The joints as a policy may know them, with the ground's friction."""
+        scale = self.scenario.friction_scale
         return {
             name: joint.replace(
-                coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
-                viscous_friction=joint.viscous_friction * self.scenario.friction_scale,
+                coulomb_friction=joint.coulomb_friction * scale,
+                viscous_friction=joint.viscous_friction * scale,
             )
             for name, joint in zip(LEG_JOINTS, self.joints, strict=True)
         }
@@ -151,17 +133,17 @@ class WalkConfig(Model):
     @property
     def true_robot(self) -> Thormang:
         """The robot as the plant has it."""
-        return self.robot.replace(
-            torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg
-        )
+        load_kg = self.robot.torso_load_kg + self.scenario.torso_load_kg
+        return self.robot.replace(torso_load_kg=load_kg)
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
-        spec = elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
+        joints = self.true_joints
+        spec = thormang.elastic_spec(self.true_robot, joints, self.form, self.timestep_s)
         if self.scenario.ranges:
-            add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
+            thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):
-            add_load(spec, f"spare_{number}", 0.0, np.zeros(3))
+            thormang.add_load(spec, f"spare_{number}", 0.0, np.zeros(3))
         if ACCELEROMETER in self.sensors:
             add_accelerometer(spec, "imu")
         return spec.compile()
@@ -188,7 +170,7 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel,
     Raises:
         ElasticError: It does not stand.
     """
-    plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
+    plan = plan_walk(config.gait, thormang.biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
     model = drawn_model(config, robot)
     q = plan.q[0] - np.array(robot.homing_rad)
     try:
@@ -210,7 +192,8 @@ def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
     set_joints(partial(getattr, model), undrawn, springs, links, robot)
     model.body("floor").quat[:] = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
     if config.scenario.ranges:
-        place_load(model, robot.load_kg, np.array([robot.load_x_m, robot.load_y_m, robot.load_z_m]))
+        place = np.array([robot.load_x_m, robot.load_y_m, robot.load_z_m])
+        thormang.place_load(model, robot.load_kg, place)
     return model
 
 
@@ -223,9 +206,8 @@ def undrawn_model(config: WalkConfig) -> mujoco.MjModel:
 def floor_tilt(angle: float, direction: float) -> Array:
     """Quaternion of a floor that rises by an angle in a direction, both [rad], (4,)."""
     half = angle / 2.0
-    return np.array(
-        [np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0]
-    )
+    x = np.sin(half) * np.sin(direction)
+    return np.array([np.cos(half), x, -np.sin(half) * np.cos(direction), 0.0])
 
 
 def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:

@@ -62,14 +62,16 @@ def configure_walk(
         raise ConfigurationError(
             f"gait must be a mapping of {', '.join(_GAIT)}, got {quote(gait)}; see also step_period"
         )
-    require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT)
+    what = "parameter of gait beside step_period and num_steps"
+    require_known(what, gait or {}, _GAIT)
     chosen = as_model("robot", robot, Thormang())
-    joints = {name: as_model("joint", joint, own) for name, own in chosen.joints.items()}
+    of_robot = chosen.joints
+    joints = {name: as_model("joint", joint, own) for name, own in of_robot.items()}
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}
     is_list = isinstance(scenario, list | tuple)
-    scenarios = [make_scenario(own) for own in scenario] if is_list else [make_scenario(scenario)]
+    scenarios = [make_scenario(own) for own in (scenario if is_list else [scenario])]
     if not scenarios:
         raise ConfigurationError(
             "scenario must be a name, or a list with one for each world, got an empty list"

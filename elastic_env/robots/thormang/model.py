@@ -16,7 +16,8 @@ Sources (public GitHub repositories):
 import csv
 from collections.abc import Mapping
 from functools import lru_cache
-from importlib import resources
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -42,7 +43,8 @@ SOLE_HALF_SIZE_M = (0.13, 0.08)
 _SOLE_HALF_THICKNESS = 0.01
 _LOAD_GYRATION_M = 0.1
 _TORSO = "upper_body"
-_TWIN_KNEE = {"stiffness": 2.0, "rotor_inertia": 2.0, "damping": 2.0, "coulomb_friction": 2.0}
+_DOUBLED = ("stiffness", "rotor_inertia", "damping", "coulomb_friction")
+"""Parameters of a knee that are those of one servo twice."""
 
 
 class Thormang(Model):
@@ -62,28 +64,28 @@ class Thormang(Model):
     @property
     def joints(self) -> dict[str, ElasticJoint]:
         """The elastic leg joints: the paper's servo on all of them."""
-        return {
-            name: _twin(H54_200_S500_R) if self.twin_knee and "knee" in name else H54_200_S500_R
-            for name in LEG_JOINTS
-        }
+        servo = H54_200_S500_R
+        knee = _twin(servo) if self.twin_knee else servo
+        return {name: knee if "knee" in name else servo for name in LEG_JOINTS}
 
 
 @lru_cache(maxsize=8)
 def biped(robot: Thormang) -> Biped:
     """The robot as gait and controller see it."""
-    hips = np.array([[0.0, robot.hip_half_spacing, 0.0], [0.0, -robot.hip_half_spacing, 0.0]])
-    return Biped(
-        rigid_spec(robot).compile(), LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M
-    )
+    half = robot.hip_half_spacing
+    hips = np.array([[0.0, half, 0.0], [0.0, -half, 0.0]])
+    rigid = rigid_spec(robot).compile()
+    return Biped(rigid, LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
 
 
-def _link_table() -> list[dict[str, str]]:
-    """Rows of the link table, parents before children, in the link frame and SI units.
+def read_rows(table: str) -> list[dict[str, str]]:
+    """Rows of a table beside this file.
 
-    The column `joint` is "fixed", "floating" or the name of a hinge.
+    `legs.csv` has links, parents before children, in the link frame and SI units. The column
+    `joint` is "fixed", "floating" or the name of a hinge.
     """
-    file = resources.files("elastic_env.robots.thormang").joinpath("legs.csv")
-    return list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+    text = Path(__file__).with_name(table).read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
 
 
 def _numbers(row: dict[str, str], *columns: str) -> Array:
@@ -102,41 +104,39 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0  # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    spec.option.impratio = 10.0
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
-    for row in _link_table():
+    for row in read_rows("legs.csv"):
         joint = row["joint"]
         position = _numbers(row, "x_m", "y_m", "z_m")
         if joint.endswith("hip_yaw"):
             position[1] = np.sign(position[1]) * robot.hip_half_spacing
-        body = bodies[row["parent"]].add_body(
-            name=row["name"],
-            pos=position,
-            mass=float(row["mass_kg"]),
-            ipos=_numbers(row, "com_x", "com_y", "com_z"),
-            fullinertia=_numbers(row, "ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
-            explicitinertial=True,
-        )
+        body = bodies[row["parent"]].add_body(name=row["name"], pos=position)
+        body.mass = float(row["mass_kg"])
+        body.ipos = _numbers(row, "com_x", "com_y", "com_z")
+        body.fullinertia = _numbers(row, "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        body.explicitinertial = True
         bodies[row["name"]] = body
         if joint == "floating" and floating:
             body.add_freejoint(name="pelvis")
         elif row["lower_rad"]:
-            body.add_joint(
-                name=joint,
-                type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=_numbers(row, "axis_x", "axis_y", "axis_z"),
-                range=_numbers(row, "lower_rad", "upper_rad"),
-                limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            )
+            hinge = body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_HINGE)
+            hinge.axis = _numbers(row, "axis_x", "axis_y", "axis_z")
+            hinge.range = _numbers(row, "lower_rad", "upper_rad")
+            hinge.limited = mujoco.mjtLimited.mjLIMITED_TRUE
     if robot.torso_load_kg > 0.0:
         # 0.16 m above the center of mass of the torso, which is itself 0.16 m above its frame
-        add_load(spec, "load", robot.torso_load_kg, np.zeros(3)).ipos = bodies[_TORSO].ipos
+        load = add_load(spec, "load", robot.torso_load_kg, np.zeros(3))
+        load.ipos = bodies[_TORSO].ipos
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
-    floor = spec.worldbody.add_body(name="floor")  # a body of its own, so that it can be tilted
-    floor.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+    # a body of its own, so that it can be tilted
+    floor = spec.worldbody.add_body(name="floor")
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    floor.add_geom(name="floor", type=plane, size=[0.0, 0.0, 0.05])
     return spec
 
 
@@ -158,12 +158,10 @@ def elastic_spec(
     spec.option.timestep = timestep_s
     for side in SIDES:
         for name in ("FORCE", "TORQUE"):
-            spec.add_sensor(
-                name=f"{side}_{name.lower()}",
-                type=getattr(mujoco.mjtSensor, f"mjSENS_{name}"),
-                objtype=mujoco.mjtObj.mjOBJ_SITE,
-                objname=f"{side}_ft",
-            )
+            sensor = spec.add_sensor(name=f"{side}_{name.lower()}")
+            sensor.objname = f"{side}_ft"
+            sensor.type = getattr(mujoco.mjtSensor, f"mjSENS_{name}")
+            sensor.objtype = mujoco.mjtObj.mjOBJ_SITE
     return spec
 
 
@@ -181,7 +179,8 @@ def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoc
         place: From the center of mass of the upper body, (3,) [m].
     """
     torso = spec.body(_TORSO)
-    load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass, explicitinertial=True)
+    load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass)
+    load.explicitinertial = True
     load.ipos = np.zeros(3)
     load.inertia = np.full(3, mass * _LOAD_GYRATION_M**2)
     return load
@@ -198,26 +197,23 @@ def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
 
 def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
     """Box sole and the site of the force-torque sensor at the ankle."""
-    foot.add_geom(
-        name=f"{side}_sole",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS],
-        pos=[0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M],
-        friction=[friction, 0.005, 0.0001],
-        mass=0.0,
-        condim=4,
-        contype=0,
-        conaffinity=1,
-        priority=1,  # else the larger friction of sole and floor would count
-    )
+    sole = foot.add_geom(name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, mass=0.0)
+    sole.size = [*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS]
+    sole.pos = [0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M]
+    sole.friction = [friction, 0.005, 0.0001]
+    sole.condim = 4
+    sole.contype = 0
+    sole.conaffinity = 1
+    sole.priority = 1  # else the larger friction of sole and floor would count
     foot.add_site(name=f"{side}_ft")
 
 
 def _twin(joint: ElasticJoint) -> ElasticJoint:
     """The joint of two servos side by side."""
     servo = joint.servo
-    doubled = {name: factor * getattr(joint, name) for name, factor in _TWIN_KNEE.items()}
+    doubled: dict[str, Any] = {name: 2.0 * getattr(joint, name) for name in _DOUBLED}
     if servo is not None:
         gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit")
-        doubled["servo"] = servo.replace(**{gain: 2.0 * getattr(servo, gain) for gain in gains})
+        own = {gain: 2.0 * getattr(servo, gain) for gain in gains}
+        doubled["servo"] = servo.replace(**own)
     return joint.replace(**doubled)

@@ -22,19 +22,8 @@ from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
 from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles
-from elastic_env.robots.thormang.humanoid import (
-    GRID_M,
-    LEFT_RGBA,
-    PLAN,
-    RIGHT_RGBA,
-    ZMP,
-    ZMP_REFERENCE,
-    ZMP_REFERENCE_RGBA,
-    ZMP_RGBA,
-    display_spec,
-    set_floor_and_light,
-    solid_spec,
-)
+from elastic_env.robots.thormang import humanoid
+from elastic_env.robots.thormang.humanoid import PLAN, ZMP, ZMP_REFERENCE
 from elastic_env.robots.thormang.model import LEG_JOINTS
 from elastic_env.robots.thormang.rows import WalkTruth
 from elastic_env.robots.thormang.tables import FELL
@@ -48,12 +37,12 @@ _ROBOT_DISTANCE_M = (0.0, 0.8, 0.0)
 _ALMOST = 1.0 - 1e-9
 _BELOW_THE_FLOOR = (0.0, 0.0, -1.0)
 _LEGEND = (
-    ("left", LEFT_RGBA),
-    ("right", RIGHT_RGBA),
+    ("left", humanoid.LEFT_RGBA),
+    ("right", humanoid.RIGHT_RGBA),
     ("plan", (0.35, 0.66, 0.45, 1.0)),
-    ("ZMP", ZMP_RGBA),
-    ("ZMP reference", ZMP_REFERENCE_RGBA),
-    (f"grid {GRID_M:g} m", (0.55, 0.57, 0.60, 1.0)),
+    ("ZMP", humanoid.ZMP_RGBA),
+    ("ZMP reference", humanoid.ZMP_REFERENCE_RGBA),
+    (f"grid {humanoid.GRID_M:g} m", (0.55, 0.57, 0.60, 1.0)),
 )
 
 
@@ -88,10 +77,10 @@ class Posture:
     def joint_angles(self, robot: Biped) -> Array:
         """Its joint angles, (12,) [rad]; of a straight leg where a foot is out of reach."""
         legs = hip_to_ankle(robot, self.pelvis, self.R, self.ankles)
-        stretch = np.linalg.norm(legs, axis=-1, keepdims=True) / (_ALMOST * robot.leg.reach)
-        return leg_angles(
-            robot.leg, legs / np.maximum(stretch, 1.0), self.R.T @ self.feet_R
-        ).ravel()
+        reach = _ALMOST * robot.leg.reach
+        stretch = np.linalg.norm(legs, axis=-1, keepdims=True) / reach
+        within = legs / np.maximum(stretch, 1.0)
+        return leg_angles(robot.leg, within, self.R.T @ self.feet_R).ravel()
 
 
 def hip_to_ankle(robot: Biped, pelvis: Array, R: Array, ankles: Array) -> Array:
@@ -122,17 +111,17 @@ def enlarge_posture(
     factors = np.linspace(largest, 1.0, _NUM_FACTORS)
     origin = planned.pelvis + shares(np.asarray(share)) @ (true.ankles - planned.ankles)
     pelvis = origin + factors[:, None] * (true.pelvis - origin)
-    from scipy.spatial.transform import Rotation  # takes a quarter of a second, and few draw
+    # takes a quarter of a second, and few draw
+    from scipy.spatial.transform import Rotation
 
-    R = Rotation.from_rotvec(
-        np.outer(factors, Rotation.from_matrix(true.R).as_rotvec())
-    ).as_matrix()
-    reaches = (
-        np.linalg.norm(hip_to_ankle(robot, pelvis, R, true.ankles), axis=-1) <= robot.leg.reach
-    ).all(axis=-1)
+    turned = Rotation.from_matrix(true.R).as_rotvec()
+    R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix()
+    legs = hip_to_ankle(robot, pelvis, R, true.ankles)
+    reaches = (np.linalg.norm(legs, axis=-1) <= robot.leg.reach).all(axis=-1)
     reaches[-1] = True  # the true posture
     chosen = int(np.argmax(reaches))
-    return Posture(pelvis[chosen], R[chosen], true.ankles, true.feet_R), float(factors[chosen])
+    drawn = Posture(pelvis[chosen], R[chosen], true.ankles, true.feet_R)
+    return drawn, float(factors[chosen])
 
 
 class WalkerPicture(Picture):
@@ -143,38 +132,29 @@ class WalkerPicture(Picture):
     """
 
     def __init__(self, task: WalkTask) -> None:
-        super().__init__(display_spec(task.config.robot), _LEGEND)
+        super().__init__(humanoid.display_spec(task.config.robot), _LEGEND)
         self._task = task
         self._factor = LARGEST_FACTOR
 
     def alone(self) -> Alone:
         """The robot of a side-by-side picture."""
-        return Alone(
-            solid_spec(self._task.config.robot),
-            LEG_JOINTS,
-            _ROBOT_DISTANCE_M,
-            "pelvis",
-            set_floor_and_light,
-        )
+        spec = humanoid.solid_spec(self._task.config.robot)
+        dress = humanoid.set_floor_and_light
+        return Alone(spec, LEG_JOINTS, _ROBOT_DISTANCE_M, "pelvis", dress)
 
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
         """Reference, motor side and link side of a world."""
         truth = self._task.truth()
-        row = self._row(now)
-        planned = Posture.of_plan(self._task.plan, row)
+        planned = Posture.of_plan(self._task.plan, self._row(now))
         q_ref = planned.joint_angles(truth.model.biped)
-        return Sides(
-            q_ref,
-            truth.theta[world].copy(),
-            truth.q[world].copy(),
-            _pose(planned.pelvis, planned.R),
-            _pose(truth.pelvis[world], truth.pelvis_R[world]),
-        )
+        base_ref = _pose(planned.pelvis, planned.R)
+        base = _pose(truth.pelvis[world], truth.pelvis_R[world])
+        theta = truth.theta[world].copy()
+        return Sides(q_ref, theta, truth.q[world].copy(), base_ref, base)
 
     def _row(self, now: Mapping[str, float]) -> int:
-        return min(
-            round(now["time_s"] / self._task.config.control_period_s), self._task.plan.num_steps
-        )
+        step = round(now["time_s"] / self._task.config.control_period_s)
+        return min(step, self._task.plan.num_steps)
 
     def _pose(self, now: dict[str, float], world: int) -> None:
         plan = self._task.plan
@@ -192,19 +172,15 @@ class WalkerPicture(Picture):
     def _caption(self, now: dict[str, float], world: int) -> list[str]:
         failures = [FELL] if self._task.has_fallen()[world] else []
         deviation = now["zmp_deviation"]
-        zmp = (
-            "no ground contact"
-            if np.isnan(deviation)
-            else f"ZMP deviation {1e3 * deviation:5.1f} mm"
-        )
-        return [
-            "     ".join([f"t = {now['time_s']:6.2f} s", _phase(now), *failures]),
-            (
-                f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad     pitch"
-                f" {1e3 * now['pelvis_pitch']:+6.1f} mrad     {zmp}"
-            ),
-            f"tilt and shift of the pelvis drawn x {self._factor:.2g}     feet and ZMP to scale",
-        ]
+        zmp = f"ZMP deviation {1e3 * deviation:5.1f} mm"
+        if np.isnan(deviation):
+            zmp = "no ground contact"
+        roll = f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad"
+        pitch = f"pitch {1e3 * now['pelvis_pitch']:+6.1f} mrad"
+        factor = f"tilt and shift of the pelvis drawn x {self._factor:.2g}"
+        first = [f"t = {now['time_s']:6.2f} s", _phase(now), *failures]
+        lines = (first, [roll, pitch, zmp], [factor, "feet and ZMP to scale"])
+        return ["     ".join(line) for line in lines]
 
     def _place(self, prefix: str, posture: Posture, robot: Biped) -> None:
         """Bring one of the two robots into a posture."""

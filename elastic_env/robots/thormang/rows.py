@@ -6,7 +6,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.robots.thormang.tables import GROUPS
+from elastic_env.robots.thormang.tables import GROUPS, MEASURED
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import COURSE, REAL, WHOLE, record_type
 
@@ -23,17 +23,16 @@ TRUTH = record_type(
     ("pitch", REAL),
     ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
     ("ankles", REAL, (2, 3)),  # positions [m]
-    ("wrench", REAL, _FEET_WRENCH),  # of the feet on the legs, in the frames of the feet [N], [N·m]
+    # of the feet on the legs, in the frames of the feet [N], [N·m]
+    ("wrench", REAL, _FEET_WRENCH),
     ("force", REAL, 2),  # vertical force of the ground on the feet [N]
     ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
-    (
-        "contact_since",
-        WHOLE,
-    ),  # step of the first touch in the second half of the swing, -1 before it
+    # step of the first touch in the second half of the swing, -1 before it
+    ("contact_since", WHOLE),
 )
 """True state after a control step."""
 
-MEASURED = record_type(
+SHOWN = record_type(
     ("imu_attitude", REAL, 2),
     ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
     ("wrench", REAL, _FEET_WRENCH),  # as in the truth
@@ -44,7 +43,7 @@ MEASURED = record_type(
 """Measurements, and the state of an inertial IMU."""
 
 NOISE = record_type(
-    *((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None)
+    *((group.name, REAL, group.shape) for group in GROUPS if group.name in MEASURED)
 )
 """Standard normal samples of a control step [1], or their standard deviations in the units of
 the signals.
@@ -57,12 +56,11 @@ BIAS = record_type(
 )
 """Errors that are drawn per episode."""
 
-SCORES = record_type(
-    ("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL)
-)
+_TERMS = ("tilt", "zmp", "effort", "smoothness", "fall")
+SCORES = record_type(*((term, REAL) for term in _TERMS))
 """Weighted terms of the reward."""
 
-WORLD = record_type(("truth", TRUTH), ("shown", MEASURED), ("scores", SCORES))
+WORLD = record_type(("truth", TRUTH), ("shown", SHOWN), ("scores", SCORES))
 """A control step of a world."""
 
 ROW_OF_PLAN = record_type(
@@ -79,33 +77,23 @@ ROW_OF_PLAN = record_type(
 INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
 """An inertial IMU, one row beside every row of `CONSTANTS`.
 
-Where none is fitted, the attitude comes with the errors that `QUALITY` has for it.
+Where none is fitted, the attitude comes with the errors that these have for it.
 """
 
-QUALITY = record_type(
+CONSTANTS = record_type(
+    ("ankles", WHOLE, 2),  # among the sites
+    ("foot_com", REAL, (2, 3)),  # from the ankle [m]
+    ("foot_weight", REAL, (2, 3)),  # in the world [N]
     ("noise", NOISE),  # standard deviations
     ("imu_bias_rad", REAL),
     ("imu_sine_error_rad", REAL),
-)
-"""Quality of the sensors: noise and constant errors."""
-
-WALK_RULES = record_type(
     ("lowest_pelvis_m", REAL),
     ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP
     ("weights", SCORES),
 )
-"""Numbers that judge a control step."""
-
-CONSTANTS = record_type(
-    ("at", record_type(("ankles", WHOLE, 2))),  # among the sites
-    ("foot_com", REAL, (2, 3)),
-    ("foot_weight", REAL, (2, 3)),  # from the ankle [m], in the world [N]
-    ("quality", QUALITY),
-    ("rules", WALK_RULES),
-)
-"""Constants of a kind of world."""
+"""Constants of a kind of world: feet, quality of the sensors, and rules."""
 
 COLUMNS = ("imu_attitude", "imu_rate", "wrench", "clock", "load_share", "zmp_reference")
 """Groups of the observation that are not of the joints."""

@@ -68,7 +68,8 @@ def settle(
         is_calm = was_calm and rate < _REST_RATE
         was_calm = rate < _REST_RATE
         if is_calm:  # twice in a row: once may be the turning point of a swing
-            return Equilibrium(data.qpos.copy(), data.act.copy(), data.qacc_warmstart.copy())
+            state = (data.qpos, data.act, data.qacc_warmstart)
+            return Equilibrium(*(values.copy() for values in state))
     raise ElasticError(
         f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and"
         f" moving with {np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a"
@@ -78,9 +79,8 @@ def settle(
 
 def _diverged(model: mujoco.MjModel, data: mujoco.MjData) -> ElasticError:
     """The error for a state that is not finite: joints that the physics step cannot resolve."""
-    stiffest = model.tendon_stiffness.max(
-        initial=0.0
-    )  # the elastic joints' springs are all tendons that there are
+    # the elastic joints' springs are all tendons that there are
+    stiffest = model.tendon_stiffness.max(initial=0.0)
     return ElasticError(
         f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K"
         f" of {stiffest:g} N·m/rad its joints are too stiff, or their links or rotors too light,"

@@ -1,118 +1,86 @@
 """Signals and metrics of the walking task, by name."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from elastic_env.core.signals import Mirrored, Signal, SignalGroup, SignalTable
+from elastic_env.core.signals import Mirrored, Parameter, Signal, SignalGroup, SignalTable
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES
-from elastic_env.world.metrics import Metric
+from elastic_env.world.joint_signals import joint_groups
+from elastic_env.world.metrics import Metric, metrics_of
 from elastic_env.world.scenario import Scenario
-from elastic_env.world.task import joint_groups
 
 JOINTS: Mapping[str, Mirrored] = {
-    joint: "opposite" if joint.endswith(("_yaw", "_roll")) else "same" for joint in LEG_JOINTS
+    name: "opposite" if name.endswith(("_yaw", "_roll")) else "same" for name in LEG_JOINTS
 }
 """The joints in order, and what an angle of theirs is in the mirror."""
 
 
-def _wrenches() -> tuple[Signal, ...]:
-    of_force: dict[str, Mirrored] = {"x": "same", "y": "opposite", "z": "same"}
-    of_moment: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
-    kinds = ("f", "N", "force", of_force), ("m", "N·m", "moment", of_moment)
-    return tuple(
-        Signal(
-            f"wrench.{side}_{letter}{axis}",
-            unit,
-            f"{what} of the {foot} foot on its leg along {axis}, in the frame of the foot, at the"
-            " ankle",
-            kind="measured",
-            mirrored=mirrored,
-        )
-        for side, foot in zip(SIDES, ("left", "right"), strict=True)
-        for letter, unit, what, axes in kinds
-        for axis, mirrored in axes.items()
-    )
-
-
-def _clock() -> tuple[Signal, ...]:
-    parts: tuple[tuple[str, str, str, Mirrored], ...] = (
-        ("time", "s", "end of the coming control period, from the start of the walk plan", "same"),
-        ("swing", "1", "progress of the swing, 0 before lift-off, 1 after touch-down", "same"),
-        ("support", "1", "support foot of the step, 0 left, 1 right", "complement"),
-    )
-    return tuple(
-        Signal(f"clock.{part}", unit, meaning, kind="reference", mirrored=mirrored)
-        for part, unit, meaning, mirrored in parts
-    )
-
-
-def _attitude_noise_rad(scenario: Scenario) -> float:
-    """Of roll and pitch, in an inertial IMU before its filter."""
-    imu = scenario.inertial
-    return scenario.pelvis_imu.noise_rad if imu is None else imu.accelerometer_noise_rad
-
-
-def _gyro_noise_rad_s(scenario: Scenario) -> float:
-    imu = scenario.inertial
-    return scenario.gyro_noise_rad_s if imu is None else imu.gyro_noise_rad_s
-
-
-_TURNS: dict[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
-_RATES: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
+_ALONG: Mapping[str, Mirrored] = {"x": "same", "y": "opposite", "z": "same"}
+_ABOUT: Mapping[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
+_TURNS: Mapping[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
+_WHERE = "in the frame of the foot, at the ankle"
 _of = SignalGroup.of
-
-_of_joints = {group.name: group for group in joint_groups(JOINTS)}
+_of_joints = joint_groups(JOINTS)
+_wrenches = tuple(
+    Signal(
+        f"wrench.{side}_{what[0]}{axis}",
+        unit,
+        f"{what} of the {foot} foot on its leg along {axis}, {_WHERE}",
+        kind="measured",
+        mirrored=mirrored,
+    )
+    for side, foot in zip(SIDES, ("left", "right"), strict=True)
+    for what, unit, axes in (("force", "N", _ALONG), ("moment", "N·m", _ABOUT))
+    for axis, mirrored in axes.items()
+)
+_TIME = "end of the coming control period, from the start of the walk plan"
+_SWING = "progress of the swing, 0 before lift-off, 1 after touch-down"
+_CLOCK: Mapping[str, tuple[str, str, Mirrored]] = {
+    "time": ("s", _TIME, "same"),
+    "swing": ("1", _SWING, "same"),
+    "support": ("1", "support foot of the step, 0 left, 1 right", "complement"),
+}
+_clock = tuple(
+    Signal(f"clock.{part}", unit, meaning, kind="reference", mirrored=mirrored)
+    for part, (unit, meaning, mirrored) in _CLOCK.items()
+)
+_attitude = "{part} of the pelvis by its IMU"
+_rate = "gyroscope of the pelvis about its {part}"
+_share = "share of the weight on the right foot"
+_zmp = "reference of the ZMP along {part}"
 
 GROUPS = (
     _of_joints["encoder_angle"],
     _of_joints["encoder_rate"],
-    _of(
-        "imu_attitude",
-        "rad",
-        "{part} of the pelvis by its IMU",
-        _TURNS,
-        "measured",
-        noise=_attitude_noise_rad,
-    ),
-    _of(
-        "imu_rate",
-        "rad/s",
-        "gyroscope of the pelvis about its {part}",
-        _RATES,
-        "measured",
-        noise=_gyro_noise_rad_s,
-    ),
-    SignalGroup(
-        "wrench",
-        _wrenches(),
-        shape=(2, 2, 3),
-        noise=lambda scenario: np.array(
-            [[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3]
-        ),
-    ),
+    _of("imu_attitude", "rad", _attitude, _TURNS, "measured"),
+    _of("imu_rate", "rad/s", _rate, _ABOUT, "measured"),
+    SignalGroup("wrench", _wrenches, shape=(2, 2, 3)),
     _of_joints["reference_angle"],
     _of_joints["reference_rate"],
     _of_joints["reference_acceleration"],
-    SignalGroup("clock", _clock(), shape=(3,)),
-    _of(
-        "load_share",
-        "1",
-        "share of the weight on the right foot",
-        {"right": "complement"},
-        "reference",
-        shape=(),
-    ),
-    _of(
-        "zmp_reference",
-        "m",
-        "reference of the ZMP along {part}",
-        {"x": "same", "y": "opposite"},
-        "reference",
-    ),
+    SignalGroup("clock", _clock, shape=(3,)),
+    _of("load_share", "1", _share, {"right": "complement"}, "reference"),
+    _of("zmp_reference", "m", _zmp, {"x": "same", "y": "opposite"}, "reference"),
     _of_joints["last_command"],
 )
-"""The observation; what a sensor shows, its noise and its mirror image are said here alone."""
+"""The observation; what a signal is in the mirror is said here alone."""
+
+MEASURED = ("imu_attitude", "imu_rate", "wrench")
+"""Groups with the noise of `sensor_noise`."""
+
+
+def sensor_noise(scenario: Scenario) -> dict[str, Parameter]:
+    """Standard deviations of the groups in `MEASURED`; in an inertial IMU before its filter."""
+    imu = scenario.inertial
+    attitude_rad = scenario.pelvis_imu.noise_rad
+    rate_rad_s = scenario.gyro_noise_rad_s
+    if imu is not None:
+        attitude_rad = imu.accelerometer_noise_rad
+        rate_rad_s = imu.gyro_noise_rad_s
+    wrench = np.array([[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3])
+    return {"imu_attitude": attitude_rad, "imu_rate": rate_rad_s, "wrench": wrench}
+
 
 OBSERVATION = SignalTable.of(GROUPS)
 
@@ -126,33 +94,31 @@ and touch-down.
 _PELVIS = ("pelvis_roll", "pelvis_pitch", "pelvis_error")
 _ZMP = ("zmp_deviation", "zmp_deviation_x", "zmp_deviation_y")
 
+
+def _metrics_of_the_body() -> Iterator[Metric]:
+    for signal in _PELVIS:
+        yield from metrics_of(signal, "rad", "rms", "peak")
+    for signal in _ZMP:
+        yield from metrics_of(signal, "m", "rms", "peak", over="loaded")
+    for phase in PHASES:
+        for signal in _PELVIS:
+            yield Metric(f"{signal}_{phase}_rms_rad", signal, "rms", phase)
+    for phase in PHASES:
+        for signal in _ZMP:
+            yield Metric(f"{signal}_{phase}_rms_m", signal, "rms", f"{phase}_loaded")
+
+
 METRICS = (
-    *(Metric(f"{signal}_{s}_rad", signal, s) for signal in _PELVIS for s in ("rms", "peak")),
-    *(
-        Metric(f"{signal}_{s}_m", signal, s, over="loaded")
-        for signal in _ZMP
-        for s in ("rms", "peak")
-    ),
-    *(
-        Metric(f"{signal}_{phase}_rms_rad", signal, "rms", over=phase)
-        for phase in PHASES
-        for signal in _PELVIS
-    ),
-    *(
-        Metric(f"{signal}_{phase}_rms_m", signal, "rms", over=f"{phase}_loaded")
-        for phase in PHASES
-        for signal in _ZMP
-    ),
+    *_metrics_of_the_body(),
     Metric("unloaded_samples_count", "zmp_deviation", "count", over="unloaded"),
-    Metric("link_error_rms_rad", "link_error", "rms"),
+    *metrics_of("link_error", "rad", "rms"),
     Metric("link_error_min_rad", "link_error_lowest", "min"),
     Metric("link_error_max_rad", "link_error_highest", "max"),
-    Metric("deflection_rms_rad", "deflection", "rms"),
-    Metric("early_touchdown_mean_s", "early_touchdown", "mean", over="touchdown"),
-    Metric("early_touchdown_max_s", "early_touchdown", "max", over="touchdown"),
-    Metric("servo_torque_rms_nm", "servo_torque", "rms"),
-    Metric("joint_torque_peak_nm", "joint_torque", "peak", over="all"),
-    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
+    *metrics_of("deflection", "rad", "rms"),
+    *metrics_of("early_touchdown", "s", "mean", "max", over="touchdown"),
+    *metrics_of("servo_torque", "nm", "rms"),
+    *metrics_of("joint_torque", "nm", "peak", over="all"),
+    *metrics_of("command_rate", "rad_s", "rms", "peak", over="all"),
     Metric("clipped_share", "clipped", "mean", over="all"),
     Metric("duration_s", "time_s", "max", over="all"),
 )

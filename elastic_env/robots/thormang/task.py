@@ -58,20 +58,21 @@ positions are in the plan's world frame, x forward, y to the left:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
-from typing_extensions import override
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import DrawnRobot
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.motion.gait import LEFT, RIGHT
-from elastic_env.motion.trajectory import Plan, PlanTable
+from elastic_env.motion.trajectory import Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
-from elastic_env.robots.thormang import NAME
+from elastic_env.robots.thormang import NAME, tables
+from elastic_env.robots.thormang import rows as records
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
@@ -81,28 +82,12 @@ from elastic_env.robots.thormang.config import (
     robot_bank,
 )
 from elastic_env.robots.thormang.model import SIDES, biped
-from elastic_env.robots.thormang.rows import (
-    BIAS,
-    COLUMNS,
-    CONSTANTS,
-    INERTIAL,
-    NOISE,
-    QUALITY,
-    ROW_OF_PLAN,
-    SCORES,
-    WALK_RULES,
-    WORLD,
-    WalkTruth,
-)
-from elastic_env.robots.thormang.tables import FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.further_sensors import FurtherSensors
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
-from elastic_env.world.scenario import Scenario
 from elastic_env.world.sensors import InertialSensor, is_due
-from elastic_env.world.task import Task, joint_rules, spring_torque
+from elastic_env.world.task import Task, spring_torque
 
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
@@ -125,8 +110,8 @@ class _Kind:
     true_model: WalkerModel
 
     @staticmethod
-    def of(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> "_Kind":
-        """Those of a configuration, a planned motion, and what is observed."""
+    def of(config: WalkConfig, plan: WalkPlan) -> "_Kind":
+        """Those of a configuration and a planned motion."""
         require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         bank = robot_bank(config.scenario, config.bank)
         body = biped(config.true_robot)  # pyright: ignore[reportArgumentType]
@@ -134,8 +119,8 @@ class _Kind:
         if config.true_robot != config.robot:
             plan = with_torque(plan, body, period_s)
         joints = config.true_joints
-        true_model = WalkerModel(joints, body.rigid, period_s, table, biped=body, plan=plan)
-        return _Kind(config, bank, config.true_model(), true_model)
+        model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
+        return _Kind(config, bank, config.true_model(), model)
 
     @property
     def inertial(self) -> InertialSensor:
@@ -151,7 +136,8 @@ class _Kind:
     @property
     def fits(self) -> list[tuple[bool, bool]]:
         """Pairs (measurements are delayed, IMU is inertial) that robots of the bank have."""
-        return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
+        pairs = [(robot.is_delayed, robot.is_inertial) for robot in self.bank]
+        return list(dict.fromkeys(pairs))
 
 
 class WalkTask(Task):
@@ -159,60 +145,54 @@ class WalkTask(Task):
 
     config: WalkConfig
     assumed_model: WalkerModel
-    failure_names: tuple[str, ...] = (FELL,)
-    world_type = WORLD
-    noise_type = NOISE
+    failure_names: tuple[str, ...] = (tables.FELL,)
+    world_type = records.WORLD
+    noise_type = records.NOISE
 
     def __init__(self, config: WalkConfig, num_worlds: int) -> None:
-        counts = next(iter(config.true_joints.values())).encoder_counts_per_turn
         scenarios = config.scenarios or (config.scenario,) * num_worlds
         if len(scenarios) != num_worlds:
             raise ConfigurationError(
                 f"scenario must be a name, or a list with one for each world, {num_worlds}, got"
                 f" {len(scenarios)}"
             )
-        sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
-        table = SignalTable((*OBSERVATION, *sensors.signals))
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
-        assumed = WalkerModel(
-            config.assumed_joints,
-            robot.rigid,
-            config.control_period_s,
-            table,
-            biped=robot,
-            plan=self.plan,
-        )
-        require_feasible(self.plan, robot, assumed.servos)
-        self._kinds = [_Kind.of(own, self.plan, table) for own in config.of_each_scenario()]
-        self._fits = [(kind, *fit) for kind in self._kinds for fit in kind.fits]
+        joints = config.assumed_joints
+        period_s = config.control_period_s
+        plan = plan_walk(config.gait, robot, period_s)  # pyright: ignore[reportArgumentType]
+        assumed = WalkerModel(joints, robot.rigid, period_s, biped=robot, plan=plan)
+        require_feasible(plan, robot, assumed.servos)
+        kinds = [_Kind.of(own, plan) for own in config.of_each_scenario()]
+        self._fits = [(kind, *fit) for kind in kinds for fit in kind.fits]
         super().__init__(
             config=config,
             name=NAME,
-            model=self._kinds[0].model,
+            model=kinds[0].model,
             assumed=assumed,
-            reference=PlanTable(_Walk(self.plan), config.control_period_s, num_worlds),
-            table=OBSERVATION.signals,
-            sensors=sensors,
+            motion=Motion(partial(_joint_plan, plan)),
+            table=tables.OBSERVATION.signals,
+            sensors=config.sensors,
+            joints=tables.JOINTS,
             scenarios=scenarios,
-            metrics=METRICS,
-            rules=joint_rules(
-                config.control_period_s,
-                [(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._fits],
-            ),
+            metrics=tables.METRICS,
+            kinds=[(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._fits],
         )
-        kinds = {kind.config.scenario: kind for kind in self._kinds}
-        self._kind_of_world = [kinds[scenario] for scenario in scenarios]
+        table = self.observation_table
+        by_scenario = {kind.config.scenario: kind for kind in kinds}
+        self.plan = plan
+        self._kinds = kinds
+        self._true_models = tuple(kind.true_model.observed_by(table) for kind in kinds)
+        self._kind_of_world = [by_scenario[scenario] for scenario in scenarios]
         self._torso = self.model.body("upper_body").id
-        self._phases = _phase_rows(self.plan)
-        self._bias = np.zeros(num_worlds, BIAS)
-        self._walk_constants = np.concatenate([_constants(*fit) for fit in self._fits])
+        self._phases = _phase_rows(plan)
+        self._bias = np.zeros(num_worlds, records.BIAS)
+        self._walk_constants = np.concatenate([_constants_of(*fit) for fit in self._fits])
         self._inertial = _inertial(self._fits, robot.gravity)
-        self._plan_rows = _plan_rows(self.plan, config)
-        self._walk_columns = columns_of(OBSERVATION, COLUMNS)
-        self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
+        self._plan_rows = _plan_rows(plan, config)
+        self._walk_columns = columns_of(table, records.COLUMNS)
+        self._pushes = any(drawn.push_n > 0.0 for kind in kinds for drawn in kind.bank)
         push_s = np.array([scenario.push_s for scenario in scenarios])
-        self._push_steps = (push_s / config.control_period_s).round()
+        self._push_steps = (push_s / period_s).round()
         self._push_force = np.zeros((num_worlds, 3))
         self._push_begin = np.full(num_worlds, -1, dtype=np.int64)
         self._phases.flags.writeable = False
@@ -220,24 +200,25 @@ class WalkTask(Task):
     def has_fallen(self) -> BoolArray:
         """Worlds whose pelvis is too low or too much tilted, (num_worlds,)."""
         truth = self._worlds[self._row]["truth"]
-        rules = self._walk_constants["rules"][self._kind]
-        is_down = (truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]) | (
-            truth["tilt"] > rules["highest_tilt_rad"]
-        )
-        return is_down & ~truth["diverged"]
+        rules = self._walk_constants[self._kind]
+        is_low = truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]
+        is_tilted = truth["tilt"] > rules["highest_tilt_rad"]
+        return (is_low | is_tilted) & ~truth["diverged"]
 
-    def truth(self) -> WalkTruth:
+    def truth(self) -> records.WalkTruth:
         """State without noise, and the true parameters."""
         joints = self._joints[self._row]["truth"]
         body = self._worlds[self._row]["truth"]
-        return WalkTruth(
-            **{
-                name: joints[name].copy()
-                for name in ("theta", "theta_dot", "q", "q_dot", "stiffness")
-            },
-            **{name: body[name].copy() for name in ("pelvis", "ankles")},
-            pelvis_R=rotation_of(body["quaternion"]),
-            models=tuple(kind.true_model for kind in self._kinds),
+        return records.WalkTruth(
+            theta=joints["theta"].copy(),
+            theta_dot=joints["theta_dot"].copy(),
+            q=joints["q"].copy(),
+            q_dot=joints["q_dot"].copy(),
+            stiffness=joints["stiffness"].copy(),
+            pelvis=body["pelvis"].copy(),
+            ankles=body["ankles"].copy(),
+            pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
+            models=self._true_models,
         )
 
     def _draw(self, world: int, random: EpisodeRandom) -> None:
@@ -246,22 +227,23 @@ class WalkTask(Task):
         bias = self._bias
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot, kind.true_model)
-        mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+        spread = kind.config.scenario.pelvis_imu.bias_spread_rad
+        mounting = spread * generator.uniform(-1.0, 1.0, 2)
         bias["imu_attitude"][world] = mounting + np.array(robot.mounting_rad)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
-        self._kind[world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
+        fit = (kind, robot.is_delayed, robot.is_inertial)
+        self._kind[world] = self._fits.index(fit)
         self._draw_imu(world, generator)
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
         """Time and direction of the push, in the walk."""
         walking = np.flatnonzero(self.plan.timing.walking)
-        begin = random.draw_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
-        direction = random.draw_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
-        self._push_begin[world] = begin
-        self._push_force[world] = self._robots[world].push_n * np.array(
-            [np.cos(direction), np.sin(direction), 0.0]
-        )
+        ends = (walking[0], walking[-1] + 1)
+        self._push_begin[world] = random.draw_trial(lambda own: own.integers(*ends))
+        direction = random.draw_trial(lambda own: own.uniform(0.0, 2.0 * np.pi))
+        unit = np.array([np.cos(direction), np.sin(direction), 0.0])
+        self._push_force[world] = self._robots[world].push_n * unit
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
@@ -269,14 +251,14 @@ class WalkTask(Task):
         sensor = self._kind_of_world[world].inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
         if self._robots[world].is_inertial:
-            bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
-            bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
-            bias["specific_force"][world] = (
-                sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
-            )
+            normal = generator.standard_normal
+            bias["imu_attitude"][world] += sensor.offset_rad * normal(2)
+            bias["gyro"][world] = sensor.gyro_bias_rad_s * normal(3)
+            bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * normal(3)
 
     def _place(self, worlds: BoolArray) -> None:
         simulation = self.simulation
+        homing = self._joints[self._row]["truth"]["homing"]
         simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
         for world in np.flatnonzero(worlds).tolist():
@@ -286,9 +268,7 @@ class WalkTask(Task):
             simulation.qpos[world] = rest.qpos
             simulation.qvel[world] = 0.0
             simulation.act[world] = rest.act
-            simulation.ctrl[world] = (
-                self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
-            )
+            simulation.ctrl[world] = self.plan.q[0] - homing[world]
             simulation.bind("qacc_warmstart")[world] = rest.warmstart
         simulation.refresh(worlds)
 
@@ -301,27 +281,14 @@ class WalkTask(Task):
             self.simulation.bind("xfrc_applied")[:, self._torso, :3] = force
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
-        steps = self._steps()
-        kernels.begin_walk(
-            self._physics, self._constants, self._walker, self._noise.ready(), worlds, steps
-        )
-        self._worlds[self._row]["scores"][worlds] = np.zeros((), SCORES)
+        kernels.begin_walk(self._physics, self._step, self._walker, worlds)
+        self._worlds[self._row]["scores"][worlds] = np.zeros((), records.SCORES)
 
-    @override
-    def _sense_worlds(
-        self,
-        joints: tuple[Any, ...],
-        noise: tuple[Any, ...],
-        commanded: tuple[Any, ...],
-        steps: tuple[Any, ...],
-        results: tuple[Any, ...],
-    ) -> bool:
-        return kernels.sense_walk(
-            self._physics, joints, self._walker, noise, commanded, steps, results
-        )
+    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
+        return kernels.sense_walk(self._physics, self._step, self._walker, control)
 
     def _show_worlds(self, observed: Array) -> None:
-        kernels.show_walk(self._constants, self._walker, self._steps(), observed)
+        kernels.show_walk(self._step, self._walker, observed)
 
     @property
     def _physics(self) -> tuple[Any, ...]:
@@ -331,7 +298,8 @@ class WalkTask(Task):
     @property
     def _walker(self) -> tuple[Any, ...]:
         """`kernels.Walker`."""
-        return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
+        fixed = (self._walk_constants, self._plan_rows)
+        return (*fixed, self._bias, self._inertial, self._walk_columns)
 
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         truth = worlds["truth"]
@@ -376,9 +344,9 @@ class WalkTask(Task):
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
-        names = [f"{name}_loaded" for name in PHASES]
+        names = [f"{name}_loaded" for name in tables.PHASES]
         return {
-            **dict(zip(["scored", *PHASES, "touchdown"], phases, strict=True)),
+            **dict(zip(["scored", *tables.PHASES, "touchdown"], phases, strict=True)),
             **dict(zip(["loaded", *names], phases[:-1] & loaded, strict=True)),
             "unloaded": phases[0] & ~loaded,
         }
@@ -389,35 +357,32 @@ class WalkTask(Task):
 
     def _earliness(self, truth: Records, row: IntArray) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
-        early = (truth["step"] - truth["contact_since"]) * self.config.control_period_s
-        return np.where(self._phases[TOUCHDOWN, row] & (truth["contact_since"] >= 0), early, 0.0)
+        since = truth["contact_since"]
+        early = (truth["step"] - since) * self.config.control_period_s
+        return np.where(self._phases[TOUCHDOWN, row] & (since >= 0), early, 0.0)
 
 
-@dataclass(frozen=True)
-class _Walk:
+def _joint_plan(walk: WalkPlan, *_: Any) -> Plan:
     """A walk plan as the joints' reference, the same in all episodes."""
-
-    walk: WalkPlan
-    is_random = False
-
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002
-        """The walk as a plan of the joints."""
-        scored = self.walk.timing.walking
-        nowhere = np.full(len(scored), -1, dtype=np.int64)
-        return Plan(self.walk.q, self.walk.q_dot, self.walk.q_ddot, scored, nowhere)
+    scored = walk.timing.walking
+    nowhere = np.full(len(scored), -1, dtype=np.int64)
+    return Plan(walk.q, walk.q_dot, walk.q_ddot, scored, nowhere)
 
 
 def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
     """The plan as a control step needs it, one row per step."""
     timing = plan.timing
     steps = np.arange(plan.num_steps + 1)
-    rows = np.zeros(len(steps), ROW_OF_PLAN)
+    rows = np.zeros(len(steps), records.ROW_OF_PLAN)
+    is_late = timing.swing > 0.5
+    halves = np.where(is_late, kernels.SECOND_HALF, kernels.FIRST_HALF)
+    imu_hz = config.scenario.pelvis_imu.rate_hz
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
     rows["share"] = plan.share
     rows["zmp"] = plan.zmp
-    rows["half_of_swing"] = _halves_of_swing(plan)
+    rows["half_of_swing"] = np.where(timing.single, halves, 0)
     rows["swing_foot"] = RIGHT - timing.support
-    rows["imu_is_due"] = is_due(steps, config.scenario.pelvis_imu.rate_hz, config.control_period_s)
+    rows["imu_is_due"] = is_due(steps, imu_hz, config.control_period_s)
     rows["weight"] = np.where(timing.walking, 1.0, config.reward.standing)
     rows.flags.writeable = False
     return rows
@@ -426,22 +391,15 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
 def _phase_rows(plan: WalkPlan) -> BoolArray:
     """The walk, its phases as in `PHASES`, and the planned touch-downs, by control step."""
     timing = plan.timing
-    touchdown = np.zeros_like(plan.timing.single)
-    touchdown[1:] = timing.single[:-1] & ~timing.single[1:]
-    return timing.walking & np.stack(
-        [np.ones_like(touchdown), ~timing.single, timing.single, timing.transition, touchdown]
-    )
+    single = timing.single
+    touchdown = np.zeros_like(single)
+    touchdown[1:] = single[:-1] & ~single[1:]
+    all_of_it = np.ones_like(single)
+    phases = np.stack([all_of_it, ~single, single, timing.transition, touchdown])
+    return timing.walking & phases
 
 
-def _halves_of_swing(plan: WalkPlan) -> IntArray:
-    """Which half of a swing a control step is in, 0 for none."""
-    timing = plan.timing
-    return np.where(
-        timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0
-    )
-
-
-def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
+def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
     """Constants of a robot, one record of `CONSTANTS`.
 
     Args:
@@ -453,27 +411,30 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # 
     scenario = config.scenario
     if is_inertial:
         scenario = scenario.replace(ranges=(), inertial=kind.inertial)
+    noise = np.zeros(1, records.NOISE)
+    for group, deviation in tables.sensor_noise(scenario).items():
+        noise[group] = deviation
     model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
-    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
-    gravity = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * gravity
-    rules = one(
-        WALK_RULES,
+    gravity = model.opt.gravity.copy()
+    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], gravity)
+    g = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+    loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * g
+    weights = {term: getattr(config.reward, term) for term in records.SCORES.names or ()}
+    return one(
+        records.CONSTANTS,
+        ankles=[model.site(f"{side}_ft").id for side in SIDES],
+        foot_com=sensors.com,
+        foot_weight=sensors.weight,
+        noise=noise,
+        imu_bias_rad=scenario.pelvis_imu.bias_rad,
+        imu_sine_error_rad=scenario.pelvis_imu.sine_error_rad,
         lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m,
         highest_tilt_rad=FALL_TILT_RAD,
         loaded_n=loaded_n,
         # sensors that carry nothing stand for a ground that carries the feet
-        zmp_n=loaded_n + float(model.body_mass[feet].sum()) * gravity,
-        weights=one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()}),
-    )
-    return one(
-        CONSTANTS,
-        at=one(CONSTANTS["at"], ankles=[model.site(f"{side}_ft").id for side in SIDES]),
-        foot_com=sensors.com,
-        foot_weight=sensors.weight,
-        quality=_quality(scenario),
-        rules=rules,
+        zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,
+        weights=one(records.SCORES, **weights),
     )
 
 
@@ -481,23 +442,11 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
     """Rows of `INERTIAL`, one for every kind of world; None where no robot has such an IMU."""
     if not any(is_inertial for _, _, is_inertial in fits):
         return None
-    rows = np.zeros(len(fits), INERTIAL)
+    rows = np.zeros(len(fits), records.INERTIAL)
     rows["is_fitted"] = [is_inertial for _, _, is_inertial in fits]
     rows["time_constant_s"] = [kind.inertial.time_constant_s for kind, _, _ in fits]
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
-
-
-def _quality(scenario: Scenario) -> Records:
-    """Quality of the sensors in a scenario, one row of `QUALITY`."""
-    imu = scenario.pelvis_imu
-    noise = np.zeros(1, NOISE)
-    for group in GROUPS:
-        if group.noise is not None:
-            noise[group.name] = group.noise(scenario)
-    return one(
-        QUALITY, noise=noise, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad
-    )
 
 
 TOUCHDOWN = -1
@@ -511,20 +460,5 @@ def highest(values: Array) -> Array:
 
 def rms(values: Array) -> Array:
     """Root of the mean square over the last axis of (n, m)."""
-    return kernels.rms_of_rows(np.array(values, order="C"))  # of one kind, for which it is compiled
-
-
-def rotation_of(quaternion: Array) -> Array:
-    """Rotation of unit quaternions w, x, y, z, (n, 4) to (n, 3, 3)."""
-    w, x, y, z = quaternion.T
-    R = np.empty((len(quaternion), 3, 3))
-    R[:, 0, 0] = 1 - 2 * (y * y + z * z)
-    R[:, 0, 1] = 2 * (x * y - w * z)
-    R[:, 0, 2] = 2 * (x * z + w * y)
-    R[:, 1, 0] = 2 * (x * y + w * z)
-    R[:, 1, 1] = 1 - 2 * (x * x + z * z)
-    R[:, 1, 2] = 2 * (y * z - w * x)
-    R[:, 2, 0] = 2 * (x * z - w * y)
-    R[:, 2, 1] = 2 * (y * z + w * x)
-    R[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    return R
+    # of one kind, for which it is compiled
+    return kernels.rms_of_rows(np.array(values, order="C"))
