@@ -61,7 +61,7 @@ class ResidualSettings(Model):
         if not isinstance(values, Mapping) or not {"space", "scale"} & values.keys():
             return values
         if "acts_on" in values:
-            raise ValueError("acts_on takes the place of space and scale; leave them out")
+            raise ValueError("acts_on says what space and scale did; leave these two out")
         space = values.get("space", "model")
         if not isinstance(space, str) or space not in _OLD_SPACES:
             known = ", ".join(_OLD_SPACES)
