@@ -68,7 +68,9 @@ def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Conditio
 def made_up(condition: Condition, *episodes: tuple[str, float]) -> Evaluation:
     """An evaluation whose metrics all have one value, with the termination of every episode."""
     names = [column.metric for column in condition.environment.columns]
-    names += [column.metric for _, columns in condition.environment.splits for column in columns]
+    names += [
+        column.metric for columns in condition.environment.splits.values() for column in columns
+    ]
     return Evaluation(
         condition, [{"termination": end, **dict.fromkeys(names, value)} for end, value in episodes]
     )
@@ -456,7 +458,7 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
     played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
     points = by_option(played)
-    chart = sweep_chart(points, [cells[0].environment.overview], "", policy_colours(list(points)))
+    chart = sweep_chart(points, [cells[0].environment.swept[0]], "", policy_colours(list(points)))
     input_curve, level = chart.panels[0].curves
     np.testing.assert_array_equal(input_curve.x, [0.5, 1.0, 2.0])
     np.testing.assert_allclose(input_curve.y, [np.nan, 10.0, 30.0])
@@ -476,7 +478,7 @@ def test_references_are_swept_by_their_step_period() -> None:
     points = by_reference(
         [made_up(walk(reference=reference), ("", 0.01)) for reference in references]
     )
-    chart = sweep_chart(points, [walk().environment.overview], "", policy_colours(list(points)))
+    chart = sweep_chart(points, [walk().environment.swept[0]], "", policy_colours(list(points)))
     (curve,) = chart.panels[0].curves
     np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
 

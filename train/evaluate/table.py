@@ -62,7 +62,7 @@ class EpisodeTable:
         self.rows = pd.DataFrame(records)
         known = self.environment
         columns = [*known.columns, *known.judged, *known.also]
-        columns += [column for _, split in known.splits for column in split]
+        columns += [column for split in known.splits.values() for column in split]
         for metric in {column.metric for column in columns}:
             values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
             self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(

@@ -54,7 +54,7 @@ def draw_figures(
         paths = {folder / f"sweep_{_stem(own[0])}.png": own for own in cells}
         return [draw_sweep(own, by_option(own), swept, path) for path, own in paths.items()]
     known = evaluations[0].condition.environment
-    files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
+    files = [draw_overview(evaluations, known.swept[0], folder / "overview.png")]
     for scenario in swept_scenarios(evaluations):
         own = [e for e in evaluations if e.condition.scenario == scenario]
         path = folder / f"sweep_{_safe(scenario)}.png"

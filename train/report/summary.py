@@ -112,7 +112,7 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
         _legend(known, known.columns),
         to_markdown(summary_table(evaluations, known.columns, worst=True)),
     ]
-    for title, columns in known.splits:
+    for title, columns in known.splits.items():
         parts += [f"{title}:", to_markdown(summary_table(evaluations, columns, worst=True))]
     notes = failure_notes(evaluations)
     return [*parts, "Where all episodes failed:", bullets(notes)] if notes else parts

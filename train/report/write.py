@@ -88,7 +88,7 @@ def _page(results: Results) -> Page:
     if results.robots:
         page.section("Drawn robots", ROBOTS)
         _add_table(page, robots_table(results.robots), "Table of drawn robots")
-    for title, columns in results.environment.splits:
+    for title, columns in results.environment.splits.items():
         page.section(title, SCORES)
         _add_table(page, scores_table(results.table, columns))
     if results.has_conditions:
