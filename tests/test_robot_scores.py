@@ -78,7 +78,7 @@ def test_a_robot_that_falls_is_worse_off_than_any_other() -> None:
     base = episode_rows(records([2.0, 2.0, None, None, 2.0]))
     assert share_better(mine, base, METRIC) == pytest.approx((1.0 + 0.0 + 1.0 + 0.5 + 0.5) / 5.0)
     assert share_better(base, mine, METRIC) == pytest.approx(1.0 - share_better(mine, base, METRIC))
-    assert share_better(mine[::-1], base, METRIC) == share_better(mine, base, METRIC)
+    assert share_better(mine[::-1], base, METRIC).item() == share_better(mine, base, METRIC)
     assert np.isnan(share_better(mine, episode_rows(records([1.0], first=50)), METRIC))
     without = [{**record, METRIC: float("nan")} for record in records([1.0])]
     assert (

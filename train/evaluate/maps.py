@@ -15,7 +15,7 @@ from baselines.options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
-from train.evaluate.changes import Change, Pairings
+from train.evaluate.changes import Change, change_of
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, vary_scenario
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
@@ -233,7 +233,6 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
         for (_, cell), condition in table.conditions.items()
     }
     rows = [[cells[y, x] for x in range(len(config.x.values))] for y in range(len(config.y.values))]
-    pairings = Pairings(table)
     return [
         HeatMap(
             title=title,
@@ -243,15 +242,14 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
             known=table.environment,
             policies=tuple(table.policies),
             families=tuple(table.members),
-            cells=tuple(tuple(_cell(pairings, cell, column) for cell in row) for row in rows),
+            cells=tuple(tuple(_cell(table, cell, column) for cell in row) for row in rows),
         )
         for column in table.environment.judged
     ]
 
 
-def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
+def _cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
-    table = pairings.table
     played = [title for title in table.policies if (title, cell) in table.conditions]
     rows = {title: table.of(title, cell) for title in played}
     scores = {title: (score(own, column), failures(own)) for title, own in rows.items()}
@@ -260,14 +258,13 @@ def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
     without_truth = [title for title in played if tracks[title] is not Track.TRUTH]
     analytic = best_of({title: scores[title] for title in standard})
     learned = [title for title in played if title in table.members] if analytic else []
-    scenario = table.conditions[played[0], cell].scenario
     return MapCell(
         levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},
         best=best_of({title: scores[title] for title in without_truth}),
         best_analytic=analytic,
         learned={
-            title: pairings.change(title, str(analytic), column, [cell], scenario)
+            title: change_of(table, table.scope(title, cell), str(analytic), column)
             for title in learned
         },
     )

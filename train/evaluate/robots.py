@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from elastic_env.core.signals import Array
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.changes import opponents
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.statistics import Estimate, interquartile_mean, wins, worst_share_mean
-from train.evaluate.table import EpisodeTable, estimate, failures, score
+from train.evaluate.statistics import Estimate, interquartile_mean, worst_share_mean
+from train.evaluate.table import EpisodeTable, estimate, failures, pair, per_seed, score
 
 FEWEST_ROBOTS = 4
 """Episodes from which on there is a middle half."""
@@ -63,57 +64,44 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
             if condition.swept or is_small or not _draws_robots(condition):
                 continue
             against = [other for other in others if (other, cell) in table.conditions]
-            found += [
-                _robot_scores(table, cell, policy, against, column)
-                for column in table.environment.judged
-            ]
+            failed, episodes = failures(rows)
+            for column in table.environment.judged:
+                metric = column.metric
+                shares = {t: share_better(rows, table.of(t, cell), metric) for t in against}
+                scores = RobotScores(
+                    policy=policy,
+                    reference=condition.reference_name,
+                    scenario=condition.scenario,
+                    column=column,
+                    mean=score(rows, column),
+                    middle=score(rows, column, interquartile_mean),
+                    worst=score(rows, column, worst_share_mean),
+                    failed=failed,
+                    episodes=episodes,
+                    better={title: estimate(rows, share) for title, share in shares.items()},
+                    failure=table.environment.failures,
+                )
+                found.append(scores)
     return found
 
 
-def _robot_scores(
-    table: EpisodeTable, cell: int, policy: str, others: Sequence[str], column: Column
-) -> RobotScores:
-    condition = table.conditions[policy, cell]
-    rows = table.of(policy, cell)
-    failed, episodes = failures(rows)
-    return RobotScores(
-        policy=policy,
-        reference=condition.reference_name,
-        scenario=condition.scenario,
-        column=column,
-        mean=score(rows, column),
-        middle=score(rows, column, interquartile_mean),
-        worst=score(rows, column, worst_share_mean),
-        failed=failed,
-        episodes=episodes,
-        better={other: _better(rows, table.of(other, cell), column) for other in others},
-        failure=table.environment.failures,
-    )
+def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Array:
+    """Share of common episodes in which a policy is better (lower), by training seed.
 
-
-def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
-    """Share of the robots for which a policy is better than another one."""
-    members = mine.groupby("member", sort=False)
-    shares = [share_better(own, base, column.metric) for _, own in members]
-    return estimate(mine, np.array(shares))
-
-
-def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
-    """Share of common episodes in which the policy is better (lower); ties count half.
-
-    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
-    in common. An episode that reached its end without a figure, such as a ZMP of feet that never
-    carried anything, is left out.
+    Ties count half. To fail is worse than any value, and where both fail it is a tie. nan where
+    they have no episode in common. An episode that reached its end without a figure, such as a ZMP
+    of feet that never carried anything, is left out.
 
     Args:
-        mine: Episodes of one cell with `seed`, `failed` and the metric.
+        mine: Episodes of one cell with `member`, `cell`, `seed`, `failed` and the metric.
         base: The same of the base.
         metric: Name of the metric.
     """
-    both = mine.merge(base, on="seed", suffixes=("", "_base"))
-    ranks = [both[f"{metric}{end}"].where(~both[f"failed{end}"], np.inf) for end in ("", "_base")]
-    values = pd.concat(ranks, axis=1).dropna().to_numpy()
-    return wins(*values.T) / len(values) if len(values) else float("nan")
+    mine, base = (
+        rows.assign(**{metric: rows[metric].where(~rows["failed"], np.inf)})
+        for rows in (mine, base)
+    )
+    return per_seed(pair(mine, base, metric), "won")[:, 0]
 
 
 def _draws_robots(condition: Condition) -> bool:

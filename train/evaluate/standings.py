@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from typing import Self
 
 from baselines.catalogue import Track
-from train.evaluate.changes import Change, Groups, Pairings
+from train.evaluate.changes import Change, change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures, score
+from train.evaluate.table import EpisodeTable, Groups, Scope, failures, score
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,10 @@ def standings(
         step_us: Time per step of every policy, by its title.
     """
     table = EpisodeTable(evaluations)
-    pairings = Pairings(table)
-    scopes = _scopes(table, groups)
-    standard = [scope for scope in scopes if table.condition(scope.policy).track is Track.STANDARD]
-    rivals = group_by(standard, lambda scope: scope.name)
+    scopes = [scope for policy in table.policies for scope in _in_columns(table, policy, groups)]
+    standard = [scope for scope in scopes if scope.first.track is Track.STANDARD]
+    rivals = group_by(standard, _place)
+    grouped = group_by((s for s in scopes if s.is_group), lambda s: (s.policy, _reference(s)))
     against_base = {
         (row.policy, row.reference, row.scope, row.is_group, row.column): Paired.of(row)
         for row in reversed(changes)
@@ -105,86 +105,52 @@ def standings(
     }
     found = []
     for scope in scopes:
-        members = table.members.get(scope.policy, {})
-        rows = table.of(scope.policy, *scope.cells)
+        policy = scope.policy
+        reference = _reference(scope)
+        pooled = {c.scenario for s in grouped.get((policy, reference), ()) for c in s.conditions}
+        members = table.members.get(policy, {})
+        rows = table.of(policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            rival = None
-            if members:
-                rival = _against_the_best(pairings, scope, column, rivals.get(scope.name, []))
-            found.append(
-                Standing(
-                    track=table.condition(scope.policy).track,
-                    policy=scope.policy,
-                    reference=scope.reference,
-                    scope=scope.scope,
-                    is_group=scope.is_group,
-                    is_column=scope.is_column,
-                    title=column.title,
-                    metric=column.metric,
-                    score=score(rows, column),
-                    failed=failed,
-                    episodes=episodes,
-                    training_seeds=len(members),
-                    base=against_base.get((scope.policy, *scope.name, column)),
-                    rival=rival,
-                    step_us=step_us.get(scope.policy, float("nan")),
-                )
+            best = _best(table, rivals.get(_place(scope), []), column) if members else None
+            standing = Standing(
+                track=table.condition(policy).track,
+                policy=policy,
+                reference=reference,
+                scope=scope.name,
+                is_group=scope.is_group,
+                is_column=scope.is_group or scope.name not in pooled,
+                title=column.title,
+                metric=column.metric,
+                score=score(rows, column),
+                failed=failed,
+                episodes=episodes,
+                training_seeds=len(members),
+                base=against_base.get((policy, *_place(scope), column)),
+                rival=Paired.of(change_of(table, scope, best, column)) if best else None,
+                step_us=step_us.get(policy, float("nan")),
             )
+            found.append(standing)
     return found
 
 
-@dataclass(frozen=True)
-class _Scope:
-    """A policy in one scenario, or in a group of them.
-
-    Attributes:
-        policy: Its title.
-        reference: Label of the motion.
-        scope: Scenario or group.
-        is_group: Whether it is a group.
-        is_column: Whether it is a column of the leaderboard.
-        cells: Numbers of its cells.
-    """
-
-    policy: str
-    reference: str
-    scope: str
-    is_group: bool
-    is_column: bool
-    cells: Sequence[int]
-
-    @property
-    def name(self) -> tuple[str, str, bool]:
-        """Name that scopes of several policies share."""
-        return self.reference, self.scope, self.is_group
+def _in_columns(table: EpisodeTable, policy: str, groups: Groups) -> list[Scope]:
+    """Scopes of a policy, by motion the groups before the scenarios."""
+    order = table.references.index
+    scopes = table.scopes(policy, groups)
+    return sorted(scopes, key=lambda scope: (order(_reference(scope)), not scope.is_group))
 
 
-def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
-    """Scenarios and whole groups of every policy and motion, in their order."""
-    found = []
-    for policy in table.policies:
-        for reference in table.references:
-            cells = table.cells_of(policy, reference)
-            own = {table.conditions[policy, cell].scenario: cell for cell in cells}
-            grouped = set[str]()
-            for name, parts in groups.items():
-                if all(part in own for part in parts):
-                    grouped.update(parts)
-                    members = [own[part] for part in parts]
-                    found.append(_Scope(policy, reference, name, True, True, members))
-            for name, cell in own.items():
-                found.append(_Scope(policy, reference, name, False, name not in grouped, [cell]))
-    return found
+def _reference(scope: Scope) -> str:
+    return scope.first.reference_name
 
 
-def _against_the_best(
-    pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]
-) -> Paired | None:
-    """A residual against the best of some policies; None where none has a score."""
-    played = {rival.policy: pairings.table.of(rival.policy, *rival.cells) for rival in rivals}
-    best = best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
-    if best is None:
-        return None
-    own = (scope.cells, scope.scope, scope.is_group)
-    return Paired.of(pairings.change(scope.policy, best, column, *own))
+def _place(scope: Scope) -> tuple[str, str, bool]:
+    """Name that scopes of several policies share."""
+    return _reference(scope), scope.name, scope.is_group
+
+
+def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str | None:
+    """The best of some policies; None where none has a score."""
+    played = {scope.policy: table.of(scope.policy, *scope.cells) for scope in scopes}
+    return best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})

@@ -110,9 +110,9 @@ def worst_share_mean(values: Array, share: float = WORST) -> float:
     return float(weights @ np.sort(values)[::-1] / counted)
 
 
-def wins(mine: Array, base: Array) -> float:
-    """Number of pairs in which a policy is better (lower) than its base; ties count half."""
-    return float(np.sum(mine < base) + 0.5 * np.sum(mine == base))
+def beats(mine: Any, base: Any) -> Any:
+    """1 where a policy is better (lower) than its base, one half in a tie, else 0."""
+    return (mine < base) + 0.5 * (mine == base)
 
 
 def over_seeds(values: Sequence[float] | Array) -> Estimate:
