@@ -2,10 +2,11 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
 from rich.console import Console
 
 from baselines.catalogue import Track
@@ -22,16 +23,17 @@ from train.report.report_text import capital
 from train.report.table_formats import Head, Part, Row, Table, print_table, to_markdown
 from train.runs.escaping import write_records
 
-_SCORE = ("mean", "low", "high")
-_BASE = ("base", "change", "change_low", "change_high", "verdict")
-_RIVAL = (
-    "best_without_learning",
-    "change_to_best",
-    "change_to_best_low",
-    "change_to_best_high",
-    "verdict_to_best",
-)
-"""Columns of `leaderboard.csv` for a score, and for a paired change."""
+_COLUMNS = {
+    "is_group": ("pooled",),
+    "is_column": ("column",),
+    "score": ("mean", "low", "high"),
+    "base": ("base", "change", "change_low", "change_high", "verdict"),
+    "rival": (
+        *("best_without_learning", "change_to_best", "change_to_best_low"),
+        *("change_to_best_high", "verdict_to_best"),
+    ),
+}
+"""Columns of `leaderboard.csv` by fields of a `Standing`; of the others they have the same name."""
 
 
 def board(found: Sequence[Standing]) -> Table:
@@ -212,33 +214,22 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     return [table, text]
 
 
-def _record(s: Standing) -> dict[str, Any]:
-    return {
-        "track": str(s.track),
-        "policy": s.policy,
-        "reference": s.reference,
-        "scope": s.scope,
-        "pooled": s.is_group,
-        "column": s.is_column,
-        "title": s.title,
-        "metric": s.metric,
-        **dict(zip(_SCORE, _cells(s.score), strict=True)),
-        "failed": s.failed,
-        "episodes": s.episodes,
-        "training_seeds": s.training_seeds,
-        **dict(zip(_BASE, _paired_cells(s.base), strict=True)),
-        **dict(zip(_RIVAL, _paired_cells(s.rival), strict=True)),
-        "step_us": f"{s.step_us:.3g}",
-    }
+def _record(standing: Standing) -> dict[str, str]:
+    record = {}
+    for name, value in vars(standing).items():
+        columns = _COLUMNS.get(name, (name,))
+        record |= dict(zip(columns, _cells(value, len(columns)), strict=True))
+    return {**record, "step_us": f"{standing.step_us:.3g}"}
 
 
-def _cells(estimate: Estimate) -> list[str]:
-    values = (estimate.value, estimate.low, estimate.high)
-    return ["" if value is None else f"{value:.6g}" for value in values]
-
-
-def _paired_cells(paired: Paired | None) -> list[str]:
-    return [""] * 5 if paired is None else [paired.to, *_cells(paired.change), paired.verdict]
+def _cells(value: Any, number: int) -> list[str]:
+    """A field as cells of a CSV file, empty where there is nothing."""
+    if isinstance(value, Paired):
+        return [value.to, *_cells(value.change, 3), value.verdict]
+    if isinstance(value, Estimate):
+        figures = (value.value, value.low, value.high)
+        return ["" if figure is None else f"{figure:.6g}" for figure in figures]
+    return [""] * number if value is None else [str(value)]
 
 
 def read_leaderboard(path: Path) -> list[Standing]:
@@ -258,28 +249,21 @@ def read_leaderboard(path: Path) -> list[Standing]:
 
 
 def _standing(row: Mapping[str, str]) -> Standing:
-    return Standing(
-        track=Track(row["track"]),
-        policy=row["policy"],
-        reference=row["reference"],
-        scope=row["scope"],
-        is_group=row["pooled"] == "True",
-        is_column=row["column"] == "True",
-        title=row["title"],
-        metric=row["metric"],
-        score=_estimate(*(row[name] for name in _SCORE)),
-        failed=int(row["failed"]),
-        episodes=int(row["episodes"]),
-        training_seeds=int(row["training_seeds"]),
-        base=_paired(*(row[name] for name in _BASE)),
-        rival=_paired(*(row[name] for name in _RIVAL)),
-        step_us=float(row["step_us"]),
-    )
+    fields = {}
+    for name in Standing.__dataclass_fields__:
+        cells = [row[column] for column in _COLUMNS.get(name, (name,))]
+        fields[name] = _FIELDS[len(cells)](*cells)
+    return _STANDING.validate_python(fields)
+
+
+def _estimate(value: str, low: str, high: str) -> Estimate:
+    return Estimate(float(value), float(low) if low else None, float(high) if high else None)
 
 
 def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
     return Paired(to, _estimate(value, low, high), verdict) if to else None
 
 
-def _estimate(value: str, low: str, high: str) -> Estimate:
-    return Estimate(float(value), float(low) if low else None, float(high) if high else None)
+_FIELDS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
+"""Fields from so many columns."""
+_STANDING = TypeAdapter(Standing)
