@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from train.figures import plots
-from train.figures.chart import Chart, Curve, Failing, Panel
+from train.figures.chart import Chart, Curve, Panel
 from train.report.page import Page
 from train.report.specs import PageChart
 from train.report.table_formats import Table as ReportTable
@@ -278,8 +278,9 @@ def test_a_picture_shows_a_label_as_it_is(label: str, fails: bool, tmp_path: Pat
     traceback, and one that it leaves out of the legend."""
     x = np.linspace(0.0, 1.0, 3)
     curves = [Curve(label, "#123456", x, x, fails=fails), Curve("", "#123456", x, -x)]
-    failing = [Failing(label, "#123456", [0.5], [True])] if fails else []
-    chart = Chart(label, label, [Panel(label, curves)], failing=failing, failure=label)
+    crosses = [Curve("", "#123456", x, 0.0 * x, crosses=[True] * len(x))]
+    failing = [Panel(label, crosses, rows=[label])] if fails else []
+    chart = Chart(label, label, [*failing, Panel(label, curves)])
     plt = plots.require_matplotlib()
     figure, axis = plt.subplots()
     axis.plot(x, x, label=plots.label_text(label))

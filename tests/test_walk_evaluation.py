@@ -40,9 +40,8 @@ from train.figures.colours import policy_colours
 from train.figures.comparison_figures import (
     by_option,
     by_reference,
-    draw_pelvis,
+    draw_signals,
     draw_sweep,
-    draw_zmp,
     figure_name,
 )
 from train.learn.train_config import TrainConfig
@@ -389,8 +388,10 @@ def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
     upright = evaluate(
         walk("input_output", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1
     )
-    for draw in (draw_pelvis, draw_zmp):
-        with Image.open(draw([fallen, upright], Path(f"{draw.__name__}.png"))) as image:
+    files = draw_signals([fallen, upright], Path())
+    assert [file.name.partition("_")[0] for file in files] == ["pelvis", "zmp"]
+    for file in files:
+        with Image.open(file) as image:
             pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
         for colour in (
             (0x9C, 0x66, 0x44),
@@ -459,13 +460,15 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
     points = by_option(played)
     chart = sweep_chart(points, [cells[0].environment.swept[0]], "", policy_colours(list(points)))
-    input_curve, level = chart.panels[0].curves
+    failing_panel, panel = chart.panels
+    input_curve, level = panel.curves
     np.testing.assert_array_equal(input_curve.x, [0.5, 1.0, 2.0])
     np.testing.assert_allclose(input_curve.y, [np.nan, 10.0, 30.0])
     np.testing.assert_allclose(level.y, [2.0, 2.0])
     assert (input_curve.dash, level.dash) == ("solid", "dot")
-    (failing,) = chart.failing
-    assert (failing.x, failing.is_all) == ([0.5, 1.0], [True, False])
+    (failing,) = failing_panel.curves
+    assert (failing.x.tolist(), failing.crosses) == ([0.5, 1.0], [True, False])
+    assert failing_panel.rows == ["input"]
     with Image.open(
         draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))
     ) as image:
@@ -547,14 +550,13 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     """Catches files that are lost or not named, and figures with policies that they should not
     show."""
     drawn: list[list[str]] = []
-    for name in ("pelvis", "zmp"):
-        draw = train.figures.comparison_figures._FIGURES[name]
+    draw = train.figures.comparison_figures.draw_picture
 
-        def record(evaluations: Sequence[Evaluation], path: Path, draw: Any = draw) -> Path:
-            drawn.append([e.condition.policy.title for e in evaluations])
-            return draw(evaluations, path)
+    def record(name: str, signals: Any, evaluations: Sequence[Evaluation], path: Path) -> Path:
+        drawn.append([e.condition.policy.title for e in evaluations])
+        return draw(name, signals, evaluations, path)
 
-        monkeypatch.setitem(train.figures.comparison_figures._FIGURES, name, record)
+    monkeypatch.setattr(train.figures.comparison_figures, "draw_picture", record)
     content = {
         "name": "walks",
         "env": "walker",

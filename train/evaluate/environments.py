@@ -82,12 +82,14 @@ class TracedSignal:
         name: Its name in the trace.
         unit: Unit in which it is shown.
         reference: Name of what it should be in the trace; None where that is zero.
+        picture: Name of the picture that shows it; empty where it stands on the page alone.
     """
 
     title: str
     name: str
     unit: str
     reference: str | None = None
+    picture: str = ""
 
     @property
     def scale(self) -> float:
@@ -122,13 +124,12 @@ class Environment:
         splits: Further tables of the summary: columns by title.
         subject: What the summary table is about.
         note: What its reader has to know beside the legend of the columns.
-        figures: Names of the time series to draw, see `train.figures.comparison_figures`.
         swept: Columns drawn against a swept value; the first is that of the bar chart.
         learned_from: Further arguments of worlds that are learned from, which keep them apart from
             those of evaluation.
         judged: Columns that policies are compared by, pair by pair.
         also: Columns whose paired changes stand in the tables too.
-        curves: Signals over time in the report.
+        curves: Signals over time in the report and in pictures.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
         is_real: Whether it is hardware: one world at a time, in this process, without a truth to
@@ -143,7 +144,6 @@ class Environment:
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
     subject: str
-    figures: tuple[str, ...]
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
     curves: tuple[TracedSignal, ...]

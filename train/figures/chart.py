@@ -34,6 +34,8 @@ class Curve:
         width: Width of the line.
         has_points: Whether its points are marked.
         fails: Whether a cross marks its end.
+        crosses: Whether each point is a filled cross or an open one, in place of a line; empty for
+            a line.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Curve:
     width: float = 1.4
     has_points: bool = False
     fails: bool = False
+    crosses: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +59,16 @@ class Panel:
         curves: What it shows.
         limits: Ends of its axis; None for those of the curves.
         is_log: Whether its axis is logarithmic.
-        height: Its share of the height.
+        height: Its height in a picture [in].
+        rows: Names of rows in place of numbers, from the top; a curve has the row as its y.
     """
 
     label: str
     curves: Sequence[Curve]
     limits: tuple[float, float] | None = None
     is_log: bool = False
-    height: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Failing:
-    """Values at which a policy fails, each in all or in some of its episodes."""
-
-    name: str
-    colour: str
-    x: Sequence[float]
-    is_all: Sequence[bool]
+    height: float = 1.9
+    rows: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +82,7 @@ class Chart:
         shaded: Beginnings and ends of what is shaded.
         shade_name: Name of that in the legend.
         ticks: Values of a logarithmic axis; None for a linear one.
-        failing: Policies that fail somewhere, each in a row on top.
-        failure: Title of these rows.
-        width, height: Size of a picture [in].
-        panel_height: Height of a panel on a page [px].
+        width: Width of a picture [in].
     """
 
     title: str
@@ -99,11 +91,7 @@ class Chart:
     shaded: Sequence[tuple[float, float]] = ()
     shade_name: str = "single support"
     ticks: Sequence[float] | None = None
-    failing: Sequence[Failing] = ()
-    failure: str = ""
     width: float = 9.0
-    height: float = 5.2
-    panel_height: int = 165
 
 
 def time_chart(
@@ -214,59 +202,52 @@ def sweep_chart(
         statistic: Over the episodes of a cell [SI].
     """
     values = sorted({value for own in cells.values() for value in own if value is not None})
-    panels = []
+    panels = _failures(cells, values, colours)
     for column in columns:
         curves = []
         for title, own in cells.items():
             is_level = None in own
             x = [values[0], values[-1]] if is_level else [value for value in values if value in own]
-            keys = [None, None] if is_level else x
-            found = [statistic(own[key], column).times(column.scale) for key in keys]
-            low, high = np.array([estimate.ends for estimate in found]).T
-            has_band = not is_level and any(estimate.has_interval for estimate in found)
+            found = [statistic(own[None if is_level else key], column) for key in x]
+            shown = [estimate.times(column.scale) for estimate in found]
+            low, high = np.array([estimate.ends for estimate in shown]).T
+            has_band = not is_level and any(estimate.has_interval for estimate in shown)
             curve = Curve(
                 title,
                 colours[title],
                 np.array(x),
-                np.array([estimate.value for estimate in found]),
+                np.array([estimate.value for estimate in shown]),
                 dash="dot" if is_level else dash_of(title),
                 band=(low, high) if has_band else None,
                 width=1.6,
                 has_points=not is_level,
             )
             curves.append(curve)
-        panels.append(Panel(column.label, curves, is_log=True, height=2.2))
-    failing = [_failing(title, colours[title], own, values) for title, own in cells.items()]
-    failing = [policy for policy in failing if policy.x]
+        panels.append(Panel(column.label, curves, is_log=True, height=2.4))
+    return Chart("", label, panels, ticks=values, width=8.0)
+
+
+def _failures(cells: Cells, values: Sequence[float], colours: Mapping[str, str]) -> list[Panel]:
+    """A panel with a row for each policy that fails somewhere; none where nobody does."""
+    rows = []
+    curves = []
+    for title, own in cells.items():
+        shares = {}
+        for value in values:
+            cell = own.get(value, own.get(None, ()))  # a level fails at all of them
+            failed = sum(e.num_failed for e in cell)
+            if failed:
+                shares[value] = failed == sum(len(e.episodes) for e in cell)
+        if shares:
+            y = np.full(len(shares), float(len(rows)))
+            x = np.array(list(shares))
+            curves.append(Curve("", colours[title], x, y, crosses=list(shares.values())))
+            rows.append(title)
     first = next(e for own in cells.values() for cell in own.values() for e in cell).condition
-    height = 2.2 * len(columns) + 1.6 + (0.16 * len(failing) + 0.2 if failing else 0.0)
-    return Chart(
-        "",
-        label,
-        panels,
-        ticks=values,
-        failing=failing,
-        failure=first.environment.failure,
-        width=8.0,
-        height=height,
-        panel_height=300,
-    )
-
-
-def _failing(
-    title: str,
-    colour: str,
-    own: Mapping[float | None, Sequence[Evaluation]],
-    values: Sequence[float],
-) -> Failing:
-    """Values at which a policy fails; a level fails at all of them."""
-    shares = {}
-    for value in values:
-        cell = own.get(value, own.get(None, ()))
-        failed = sum(e.num_failed for e in cell)
-        if failed:
-            shares[value] = failed == sum(len(e.episodes) for e in cell)
-    return Failing(title, colour, list(shares), list(shares.values()))
+    limits = (len(rows) - 0.4, -0.6)
+    height = 0.2 * len(rows) + 0.2
+    panel = Panel(first.environment.failure, curves, limits, height=height, rows=rows)
+    return [panel] if rows else []
 
 
 def learning_chart(
@@ -283,14 +264,13 @@ def learning_chart(
             line = {"band": band, "width": 2.0, "has_points": True}
             curves.append(Curve(title, colours[title], found.decisions, middle, **line))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
-        all_ratios = np.concatenate(
-            [own.ratios[column.metric].ravel() for own in learning.values()]
-        )
-        top = float(np.nanmax(all_ratios, initial=1.0))
+        ratios = [own.ratios[column.metric].ravel() for own in learning.values()]
+        all_ratios = np.concatenate(ratios)
+        top = min(float(np.nanmax(all_ratios, initial=1.0)), 2.0)
         curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
-        limits = (0.0, 1.08 * min(float(top), 2.0))
-        panels.append(Panel(f"{column.title}, share of the base's", curves, limits))
-    return Chart("", "decisions of all worlds", panels, panel_height=260)
+        label = f"{column.title}, share of the base's"
+        panels.append(Panel(label, curves, (0.0, 1.08 * top), height=2.4))
+    return Chart("", "decisions of all worlds", panels)
 
 
 def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
@@ -314,4 +294,4 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
         curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
         limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
         panels.append(Panel(column.label, curves, limits))
-    return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))
+    return Chart(title, "trials learned from", panels, width=7.0)

@@ -12,7 +12,7 @@ from train.evaluate.environments import TracedSignal
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.rollout import make_vector_env
-from train.figures.chart import Cells, Chart, Curve, sweep_chart, time_chart
+from train.figures.chart import Cells, Curve, Panel, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
 from train.figures.plots import draw_chart, draw_overview
@@ -24,15 +24,8 @@ _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
 _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
-_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad") for name in ("roll", "pitch"))
-_ZMP = (
-    TracedSignal("x, forward", "zmp_x", "mm", reference="zmp_reference_x"),
-    TracedSignal("y, to the left", "zmp_y", "mm", reference="zmp_reference_y"),
-)
-_LINK = (
-    TracedSignal("q_ref", "reference_angle", "rad"),
-    TracedSignal("link error q_ref − q", "link_error", "mrad"),
-)
+_SUBJECTS = {"pelvis": "Pelvis error, ", "zmp": "Zero moment point, "}
+"""Beginnings of the titles of pictures of a walk."""
 
 
 def draw_figures(
@@ -61,8 +54,7 @@ def draw_figures(
         files.append(draw_sweep(own, by_reference(own), f"{known.quantity} [s]", path))
     for group in cells:
         shown = [e for e in group if not policies or e.condition.policy.title in policies]
-        for name in known.figures:
-            files += draw_figure(name, shown, folder)
+        files += draw_signals(shown, folder) if shown else []
     return files
 
 
@@ -72,18 +64,56 @@ def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     return [draw_map(m, folder / f"map_{name}.png") for m, name in zip(maps, names, strict=True)]
 
 
-def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
-    """Draw a figure of one reference and scenario, if there is something to show.
+def draw_signals(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
+    """Draw the signals of one motion and scenario over time, and what it shows at rest.
 
     Args:
-        name: Name in the environment's description.
-        evaluations: The policies.
+        evaluations: The policies, a line each.
         folder: Where to.
     """
-    if not evaluations or (name == "static" and evaluations[0].points is None):
-        return []
-    path = folder / f"{figure_name(name, evaluations[0])}.png"
-    return [_FIGURES[name](evaluations, path)]
+    first = evaluations[0]
+    known = first.condition.environment
+    pictures = group_by((s for s in known.curves if s.picture), lambda signal: signal.picture)
+    files = [
+        draw_picture(name, signals, evaluations, folder / f"{figure_name(name, first)}.png")
+        for name, signals in pictures.items()
+    ]
+    if first.points is not None:
+        path = folder / f"{figure_name('static', first)}.png"
+        model = make_vector_env(first.condition, 1).unwrapped.assumed_model
+        files.append(draw_static_errors(evaluations, model, path))
+    return files
+
+
+def draw_picture(
+    name: str, signals: Sequence[TracedSignal], evaluations: Sequence[Evaluation], path: Path
+) -> Path:
+    """Draw signals of several policies over time, as Figs. 7 to 10 of the paper."""
+    condition = evaluations[0].condition
+    policies = {e.condition.policy.title: [e] for e in evaluations}
+    chart = time_chart(policies, signals, policy_colours(list(policies)))
+    number = paper_figure(name, condition)
+    motion = condition.environment.title(condition.reference_name)
+    title = f"{_SUBJECTS.get(name, '')}{motion}, scenario {condition.scenario}"
+    if number is not None:
+        title = f"{title} (cf. Fig. {number} of the paper)"
+        if name == "pelvis":
+            chart = replace(chart, panels=list(map(_with_bounds, chart.panels)))
+    return draw_chart(replace(chart, title=title), path)
+
+
+def _with_bounds(panel: Panel) -> Panel:
+    """A panel of the pelvis error with the bounds that the paper's stays in."""
+    bound = _PAPER_BOUND_MRAD
+    name = f"paper, compensated: ±{bound:.0f} mrad"
+    ends = panel.curves[0].x[[0, -1]]
+    bounds = [
+        Curve(label, "#777777", ends, np.full(2, y), dash="dot", width=0.9)
+        for label, y in ((name, bound), ("", -bound))
+    ]
+    low, high = panel.limits or (0.0, 0.0)
+    limits = (min(low, -1.2 * bound), max(high, 1.2 * bound))
+    return replace(panel, curves=[*panel.curves, *bounds], limits=limits)
 
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
@@ -147,61 +177,6 @@ def draw_sweep(evaluations: Sequence[Evaluation], cells: Cells, label: str, path
     return draw_chart(replace(chart, title=title[0].upper() + title[1:]), path)
 
 
-def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Reference and link error over time, one line per policy."""
-    condition = evaluations[0].condition
-    chart = _over_time(evaluations, _LINK)
-    reference, error = chart.panels
-    once = replace(reference.curves[0], name="", colour="#333333", dash="solid")
-    panels = [replace(reference, curves=[once]), replace(error, height=2.0)]
-    title = f"{condition.reference_name}, scenario {condition.scenario}"
-    return draw_chart(replace(chart, panels=panels, title=title, width=8.0, height=5.0), path)
-
-
-def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Roll and pitch of the pelvis, one line per policy, as Figs. 7 and 8 of the paper."""
-    title = _walk_title(evaluations, "pelvis", "Pelvis error")
-    chart = _over_time(evaluations, _PELVIS, title)
-    if paper_figure("pelvis", evaluations[0].condition) is None:
-        return draw_chart(chart, path)
-    panels = []
-    for panel in chart.panels:
-        ends = panel.curves[0].x[[0, -1]]
-        bounds = [
-            Curve(name, "#777777", ends, np.full(2, bound), dash="dot", width=0.9)
-            for name, bound in (
-                ("paper, compensated: ±10 mrad", _PAPER_BOUND_MRAD),
-                ("", -_PAPER_BOUND_MRAD),
-            )
-        ]
-        low, high = panel.limits or (0.0, 0.0)
-        limits = (min(low, -1.2 * _PAPER_BOUND_MRAD), max(high, 1.2 * _PAPER_BOUND_MRAD))
-        panels.append(replace(panel, curves=[*panel.curves, *bounds], limits=limits))
-    return draw_chart(replace(chart, panels=panels), path)
-
-
-def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
-    title = _walk_title(evaluations, "zmp", "Zero moment point")
-    return draw_chart(_over_time(evaluations, _ZMP, title), path)
-
-
-def _over_time(
-    evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = ""
-) -> Chart:
-    policies = {e.condition.policy.title: [e] for e in evaluations}
-    chart = time_chart(policies, signals, policy_colours(list(policies)))
-    return replace(chart, title=title)
-
-
-def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> str:
-    condition = evaluations[0].condition
-    number = paper_figure(name, condition)
-    beside = "" if number is None else f" (cf. Fig. {number} of the paper)"
-    reference = condition.environment.title(condition.reference_name)
-    return f"{subject}, {reference}, scenario {condition.scenario}{beside}"
-
-
 def _stem(evaluation: Evaluation) -> str:
     condition = evaluation.condition
     return _safe(f"{condition.reference_name}_{condition.scenario}")
@@ -209,16 +184,3 @@ def _stem(evaluation: Evaluation) -> str:
 
 def _safe(text: str) -> str:
     return re.sub(r"[^\w.=+-]+", "_", text)
-
-
-def _draw_static(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    model = make_vector_env(evaluations[0].condition, 1).unwrapped.assumed_model
-    return draw_static_errors(evaluations, model, path)
-
-
-_FIGURES: dict[str, Callable[[Sequence[Evaluation], Path], Path]] = {
-    "time": draw_time_series,
-    "static": _draw_static,
-    "pelvis": draw_pelvis,
-    "zmp": draw_zmp,
-}

@@ -32,23 +32,7 @@ def require_matplotlib() -> Any:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.rcParams.update(
-        {
-            "figure.dpi": 130,
-            "font.size": 10,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.grid": True,
-            "axes.axisbelow": True,
-            "grid.alpha": 0.25,
-            "legend.frameon": False,
-            "axes.titlesize": 11,
-            "axes.titleweight": "bold",
-            "axes.titlelocation": "left",
-            "text.parse_math": False,  # a label of the user's is no formula
-            "text.usetex": False,
-        }
-    )
+    plt.style.use(Path(__file__).with_name("pictures.mplstyle"))
     return plt
 
 
@@ -81,20 +65,12 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     A filled cross on top stands where all episodes of a policy failed, an open one where some did.
     """
     plt = require_matplotlib()
-    rows = [0.16 * len(chart.failing) + 0.2] if chart.failing else []
-    figure, axes = plt.subplots(
-        len(rows) + len(chart.panels),
-        1,
-        figsize=(chart.width, chart.height),
-        sharex=True,
-        squeeze=False,
-        height_ratios=[*rows, *(panel.height for panel in chart.panels)],
-        layout="constrained",
-    )
+    heights = [panel.height for panel in chart.panels]
+    shape = {"sharex": True, "squeeze": False, "height_ratios": heights, "layout": "constrained"}
+    size = (chart.width, sum(heights) + 1.2)
+    figure, axes = plt.subplots(len(heights), 1, figsize=size, **shape)
     axes = list(axes[:, 0])
-    if chart.failing:
-        _draw_failing(axes[0], chart)
-    for axis, panel in zip(axes[len(rows) :], chart.panels, strict=True):
+    for axis, panel in zip(axes, chart.panels, strict=True):
         for begin, end in chart.shaded:
             axis.axvspan(begin, end, color="#e9ebee", lw=0, zorder=0, label=chart.shade_name)
         for curve in panel.curves:
@@ -103,11 +79,15 @@ def draw_chart(chart: Chart, path: Path) -> Path:
         axis.grid(axis="x", visible=chart.ticks is not None)
         if panel.is_log:
             axis.set_yscale("log")
-            _show_numbers(axis.yaxis)
+            show_numbers(axis.yaxis)
         if panel.limits is not None:
             axis.set_ylim(*panel.limits)
-            if panel.limits[0] < 0.0 < panel.limits[1]:
-                axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
+        if panel.rows:
+            names = [label_text(row) for row in panel.rows]
+            axis.set_yticks(range(len(names)), names, fontsize=8)
+            axis.grid(axis="y", visible=False)
+        elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
+            axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
         if chart.ticks is None:
             axis.margins(x=0.0)
     if chart.ticks is not None:
@@ -129,6 +109,11 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 
 
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
+    if curve.crosses:
+        faces = [curve.colour if is_filled else "none" for is_filled in curve.crosses]
+        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": curve.colour}
+        axis.scatter(curve.x, curve.y, lw=1.0, **style)
+        return
     style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
     marker = {"marker": "o", "ms": 4} if curve.has_points else {}
     name = label_text(curve.name) or "_"  # without a name Matplotlib has it in no legend
@@ -142,25 +127,11 @@ def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> 
         axis.scatter(curve.x[-1:], y, color=curve.colour, clip_on=False, **cross)
 
 
-def _draw_failing(axis: Any, chart: Chart) -> None:
-    """A row of crosses per policy that fails somewhere."""
-    for row, policy in enumerate(reversed(chart.failing)):
-        faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
-        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": policy.colour}
-        axis.scatter(policy.x, np.full(len(policy.x), row), lw=1.0, **style)
-    names = [label_text(policy.name) for policy in reversed(chart.failing)]
-    axis.set_yticks(range(len(names)), names, fontsize=8)
-    axis.set_ylim(-0.7, len(chart.failing) - 0.3)
-    axis.set_ylabel(chart.failure)
-    axis.tick_params(axis="x", length=0)
-    axis.grid(axis="y", visible=False)
-
-
-def _show_numbers(axis: Any) -> None:
+def show_numbers(axis: Any, numticks: int | None = None) -> None:
     """Numbers instead of powers of ten on a logarithmic axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=numticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
 
