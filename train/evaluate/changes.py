@@ -287,7 +287,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         policy=policy,
         base=base,
         is_family=member is not None,
-        reference=scope.first.reference_name,
+        reference=scope.reference,
         scope=scope.name,
         is_group=scope.is_group,
         swept=scope.first.swept,

@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 from baselines.catalogue import Track
-from train.evaluate.changes import Change, change_of
+from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import best_of
@@ -26,11 +25,6 @@ class Paired:
     to: str
     change: Estimate
     verdict: str
-
-    @classmethod
-    def of(cls, row: Change) -> Self:
-        """The part of a change that a leaderboard keeps."""
-        return cls(row.base, row.relative, row.verdict)
 
 
 @dataclass(frozen=True)
@@ -77,10 +71,7 @@ class Standing:
 
 
 def standings(
-    evaluations: Sequence[Evaluation],
-    changes: Sequence[Change],
-    groups: Groups,
-    step_us: Mapping[str, float],
+    evaluations: Sequence[Evaluation], groups: Groups, step_us: Mapping[str, float]
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
@@ -89,34 +80,32 @@ def standings(
 
     Args:
         evaluations: All cells, one per training seed.
-        changes: Paired changes of the same.
         groups: Scenarios to pool over, by name.
         step_us: Time per step of every policy, by its title.
     """
     table = EpisodeTable(evaluations)
-    scopes = [scope for policy in table.policies for scope in _in_columns(table, policy, groups)]
+    order = table.references.index
+    scopes = [scope for title in table.policies for scope in table.scopes(title, groups)]
+    scopes.sort(key=lambda s: (table.policies.index(s.policy), order(s.reference), not s.is_group))
     standard = [scope for scope in scopes if scope.first.track is Track.STANDARD]
-    rivals = group_by(standard, _place)
-    grouped = group_by((s for s in scopes if s.is_group), lambda s: (s.policy, _reference(s)))
-    against_base = {
-        (row.policy, row.reference, row.scope, row.is_group, row.column): Paired.of(row)
-        for row in reversed(changes)
-        if row.is_family and not row.is_rival
-    }
+    rivals = group_by(standard, lambda scope: scope.place)
+    grouped = group_by((s for s in scopes if s.is_group), lambda s: (s.policy, s.reference))
     found = []
     for scope in scopes:
-        policy = scope.policy
-        reference = _reference(scope)
-        pooled = {c.scenario for s in grouped.get((policy, reference), ()) for c in s.conditions}
-        members = table.members.get(policy, {})
-        rows = table.of(policy, *scope.cells)
+        parts = grouped.get((scope.policy, scope.reference), ())
+        pooled = {condition.scenario for part in parts for condition in part.conditions}
+        rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            best = _best(table, rivals.get(_place(scope), []), column) if members else None
+            base = best = None
+            if scope.first.member is not None:
+                base = _paired(table, scope, scope.first.member.base, column)
+                beside = rivals.get(scope.place, [])
+                best = _paired(table, scope, _best(table, beside, column), column)
             standing = Standing(
-                track=table.condition(policy).track,
-                policy=policy,
-                reference=reference,
+                track=table.condition(scope.policy).track,
+                policy=scope.policy,
+                reference=scope.reference,
                 scope=scope.name,
                 is_group=scope.is_group,
                 is_column=scope.is_group or scope.name not in pooled,
@@ -125,29 +114,21 @@ def standings(
                 score=score(rows, column),
                 failed=failed,
                 episodes=episodes,
-                training_seeds=len(members),
-                base=against_base.get((policy, *_place(scope), column)),
-                rival=Paired.of(change_of(table, scope, best, column)) if best else None,
-                step_us=step_us.get(policy, float("nan")),
+                training_seeds=len(table.members.get(scope.policy, ())),
+                base=base,
+                rival=best,
+                step_us=step_us.get(scope.policy, float("nan")),
             )
             found.append(standing)
     return found
 
 
-def _in_columns(table: EpisodeTable, policy: str, groups: Groups) -> list[Scope]:
-    """Scopes of a policy, by motion the groups before the scenarios."""
-    order = table.references.index
-    scopes = table.scopes(policy, groups)
-    return sorted(scopes, key=lambda scope: (order(_reference(scope)), not scope.is_group))
-
-
-def _reference(scope: Scope) -> str:
-    return scope.first.reference_name
-
-
-def _place(scope: Scope) -> tuple[str, str, bool]:
-    """Name that scopes of several policies share."""
-    return _reference(scope), scope.name, scope.is_group
+def _paired(table: EpisodeTable, scope: Scope, to: str | None, column: Column) -> Paired | None:
+    """A policy against another one; None where that does not play the same cells."""
+    if to is None or len(table.cells_of_base(scope, to)) < len(scope.cells):
+        return None
+    row = change_of(table, scope, to, column)
+    return Paired(to, row.relative, row.verdict)
 
 
 def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str | None:

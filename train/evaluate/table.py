@@ -42,6 +42,16 @@ class Scope:
         """The first condition: all share motion and swept values."""
         return self.conditions[0]
 
+    @property
+    def reference(self) -> str:
+        """Label of the motion."""
+        return self.first.reference_name
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """Name that scopes of several policies share."""
+        return self.reference, self.name, self.is_group, *self.first.swept.items()
+
 
 class EpisodeTable:
     """All episodes of a comparison.

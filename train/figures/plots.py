@@ -98,8 +98,10 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     axes[-1].set_xlabel(chart.label)
     if any(curve.fails for panel in chart.panels for curve in panel.curves):
         axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
-    handles, labels = axes[-1].get_legend_handles_labels()
-    once = dict(zip(labels, handles, strict=True))
+    once = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        once |= dict(zip(labels, handles, strict=True))
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)

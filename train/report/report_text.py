@@ -340,6 +340,7 @@ def notes(results: Results) -> list[str]:
     kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
     text = load_template("notes.html.j2").render(
         failures=results.environment.failures,
+        walks=results.environment.walks,
         families=results.table.families,
         maps=results.maps,
         has_rivals=any(row.is_rival for row in results.changes),

@@ -198,9 +198,8 @@ def print_table(table: Table, console: Console, file: str) -> None:
         shown = shown.without(place)
     console.print(fitting)
     if left_out:
-        console.print(
-            f"no room for {'; '.join(left_out)}; {file} has them", style="dim", markup=False
-        )
+        missing = f"no room for {'; '.join(left_out)}: widen the terminal, or see {file}"
+        console.print(missing, style="dim", markup=False)
 
 
 def _fit(table: Table, console: Console) -> RichTable | None:
