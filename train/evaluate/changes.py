@@ -4,7 +4,7 @@ A residual is compared with its base and with the best policy without learning. 
 compared with the base of the residuals, or without residuals with the first policy.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -158,10 +158,8 @@ class Change:
     def _size(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "in no episode did both stay"
-            if self.is_group:
-                where = "in one of the scenarios there is no episode in which both stayed"
-            return f"nothing to compare: {where} up to the end"
+            where = "in one of the scenarios there is" if self.is_group else "there is"
+            return f"nothing to compare: {where} no episode in which both got to the end"
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:
             size = "no change"
@@ -193,7 +191,8 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     if not estimate.has_interval:
         return percent(estimate.value, signed)
     shares = (estimate.value, *estimate.ends)
-    is_fine = 0.0 < max(map(abs, shares)) < _SMALL or any(0.0 < abs(s) < _LEAST for s in shares)
+    sizes = [abs(share) for share in shares]
+    is_fine = 0.0 < max(sizes) < _SMALL or any(0.0 < size < _LEAST for size in sizes)
     value, low, high = (_hundredths(share, signed, is_fine) for share in shares)
     return f"{value} % [{low}, {high}]"
 
@@ -228,13 +227,14 @@ def opponents(table: EpisodeTable) -> dict[str, list[str]]:
     policy.
     """
     found = {}
-    bases = dict.fromkeys(m.base for own in table.members.values() for m in own.values())
+    families = table.members.values()
+    bases = dict.fromkeys(member.base for own in families for member in own.values())
     for title in table.policies:
+        others: Iterable[str | None] = bases or table.policies[:1]
         if title in table.members:
             member = next(reversed(table.members[title].values()))
-            found[title] = [other for other in (member.base, member.rival) if other is not None]
-        else:
-            found[title] = [base for base in bases or table.policies[:1] if base != title]
+            others = (member.base, member.rival)
+        found[title] = [other for other in others if other not in (title, None)]
     return found
 
 
@@ -274,7 +274,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     own = table.of(policy, *scope.cells)
     cells = table.cells_of_base(scope, base)
     beside = zip(cells, scope.cells, strict=True)
-    theirs = pd.concat([table.of(base, number).assign(cell=cell) for number, cell in beside])
+    theirs = pd.concat(table.of(base, there).assign(cell=cell) for there, cell in beside)
     both = pair(own, theirs, column.metric)
     means = per_seed(both, "mine")
     base_means = per_seed(both, "base")
@@ -341,7 +341,7 @@ def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str
         return ()
     if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
         return (CEILING,)
-    same = [scenario for scenario in scenarios if known.differs_by_noise_alone(scenario, motion)]
+    same = [s for s in scenarios if known.differs_by_noise_alone(s, motion)]
     named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
     return (f"{SAME_ROBOT}{named}",) if same else ()
 

@@ -23,8 +23,8 @@ which of them it takes.
 """
 
 UNPLACED = (
-    *("num_envs", "num_threads", "autoreset_mode", "render_mode", "id", "vectorization_mode"),
-    *("vector_kwargs", "wrappers", "self"),
+    *("num_envs", "num_threads", "autoreset_mode", "render_mode"),
+    *("id", "vectorization_mode", "vector_kwargs", "wrappers", "self"),
 )
 """Arguments of the environments, and of the functions that make them, that have no place in a
 comparison.
@@ -70,7 +70,7 @@ class Column:
 
     @property
     def _shown(self) -> tuple[str, float]:
-        return next(shown for suffix, shown in _UNITS.items() if self.metric.endswith(suffix))
+        return _UNITS[self.metric[self.metric.rindex("_") :]]
 
 
 @dataclass(frozen=True)
@@ -176,15 +176,18 @@ class Environment:
 
     def draws(self, reference: Reference) -> bool:
         """True if episodes of a reference have motions of their own."""
-        return self.make_reference is not None and self.make_reference(reference).is_random
+        make = self.make_reference
+        return make is not None and make(reference).is_random
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition are one and the same."""
-        return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
+        is_random = make_scenario(scenario).is_random
+        return not (self.is_real or is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
         """True if the episodes of a condition are of one robot and one motion."""
-        return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
+        draws_robots = make_scenario(scenario).draws_robots
+        return not (self.is_real or draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
@@ -209,11 +212,12 @@ class _Walker(Environment):
 
     def label(self, reference: Reference) -> str:
         parts = _durations(reference)
-        texts = (f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts)
+        texts = (f"{p:g}" if isinstance(p, int | float) else str(p) for p in parts)
         label = f"{'+'.join(texts)} s"
         steps = reference.get("num_steps") if isinstance(reference, dict) else None
-        usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
-        return label if steps in usual else f"{label} num_steps={steps}"
+        usual = Gait.model_fields["num_steps"].default
+        is_usual = steps in (None, usual, _STEPS_OF_THE_PAPER.get(label))
+        return label if is_usual else f"{label} num_steps={steps}"
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
@@ -251,7 +255,8 @@ def environment(name: str) -> Environment:
     if ":" in name:
         return _of_ones_own(name)
     if name not in ENVIRONMENTS:
-        raise unknown_name("environment", name, [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"])
+        choices = [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"]
+        raise unknown_name("environment", name, choices)
     return ENVIRONMENTS[name]
 
 
@@ -269,7 +274,8 @@ def _of_ones_own(name: str) -> Environment:
 
 def _environments() -> dict[str, Environment]:
     """Environments by their short names, from `environments.toml`."""
-    parts = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    file = Path(__file__).with_suffix(".toml")
+    parts = tomllib.loads(file.read_text(encoding="utf-8"))
 
     def values(name: str) -> dict[str, Any]:
         part = dict(parts.get(name, parts["joints"]))

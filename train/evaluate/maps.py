@@ -57,9 +57,9 @@ class Axis(Model):
     def ticks(self, known: Environment) -> list[str]:
         """Its values as they are shown."""
         if self.is_motion:
-            numbers = [n for value in self.values for n in known.abscissa(value).values()]
             motions = [known.arguments(value)[known.motion] for value in self.values]
-            return [f"{number:g}" for number in numbers] or list(map(known.label, motions))
+            numbers = [n for motion in motions for n in known.abscissa(motion).values()]
+            return [f"{n:g}" for n in numbers] or list(map(known.label, motions))
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
 
@@ -83,7 +83,7 @@ class MapConfig(Model):
     @model_validator(mode="after")
     def _axes_differ(self) -> Self:
         if self.x.what == self.y.what:
-            raise ValueError(f"x and y of a map must vary two things, both vary {self.x.what!r}")
+            raise ValueError(f"x and y of a map must differ, both vary {self.x.what!r}")
         return self
 
     @property
@@ -109,13 +109,13 @@ class MapConfig(Model):
                 )
             for value in axis.values:
                 if axis.values.count(value) > 1:
-                    raise ConfigurationError(f"the value {quote(value)} of map.{name} stands twice")
+                    problem = f"the value {quote(value)} of map.{name} stands twice"
+                    raise ConfigurationError(problem)
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
-                    raise ConfigurationError(
-                        f"values of map.{name} must be numbers, got {quote(value)}"
-                    )
+                    got = quote(value)
+                    raise ConfigurationError(f"values of map.{name} must be numbers, got {got}")
                 vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
@@ -130,9 +130,10 @@ class MapConfig(Model):
 
 def _choices(what: str, known: Environment) -> str:
     """Names that an axis can have."""
-    is_option = what in PolicyOptions.model_fields
-    hint = "; an option of the policies is varied by sweep, not by a map" if is_option else ""
-    return choices_listed(what, [known.motion, *scenario_fields()]) + hint
+    choices = choices_listed(what, [known.motion, *scenario_fields()])
+    if what not in PolicyOptions.model_fields:
+        return choices
+    return f"{choices}; an option of the policies is varied by sweep, not by a map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +194,9 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        motion = e.condition.environment.title(e.condition.reference_name)
-        return e.condition.scenario if config.motion else f"{motion}, {e.condition.scenario}"
+        own = e.condition
+        motion = own.environment.title(own.reference_name)
+        return own.scenario if config.motion else f"{motion}, {own.scenario}"
 
     return [
         heat_map
@@ -232,7 +234,8 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
         (config.y.place(condition), config.x.place(condition)): cell
         for (_, cell), condition in table.conditions.items()
     }
-    rows = [[cells[y, x] for x in range(len(config.x.values))] for y in range(len(config.y.values))]
+    across = range(len(config.x.values))
+    rows = [[cells[y, x] for x in across] for y in range(len(config.y.values))]
     return [
         HeatMap(
             title=title,
@@ -242,7 +245,7 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
             known=table.environment,
             policies=tuple(table.policies),
             families=tuple(table.members),
-            cells=tuple(tuple(_cell(table, cell, column) for cell in row) for row in rows),
+            cells=tuple(tuple(_cell(table, n, column) for n in row) for row in rows),
         )
         for column in table.environment.judged
     ]

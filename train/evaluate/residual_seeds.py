@@ -21,6 +21,9 @@ from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
 
+Options = dict[str, object]
+"""Options of a policy by name."""
+
 _WILD = re.compile(r"[*?\[]")
 _NEAREST = 5
 """Names that the error for a pattern without folders lists."""
@@ -120,12 +123,13 @@ def origin(members: Sequence[Member]) -> Origin:
     scenarios = config.scenarios
     wanted = set(config.seeds)
     had = {member.training_seed for member in members}
+    commits = [description.origin.commit or "unknown" for description in descriptions]
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
         reference=config.reference,
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),
-        commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
+        commits=tuple(dict.fromkeys(commits)),
         ranges=descriptions[0].training.get("config", {}).get("ranges") or {},
     )
 
@@ -150,10 +154,12 @@ def _members(pattern: str) -> list[_Folder]:
     """Folders of a pattern in natural order; shipped ones where none lie there."""
     if not _WILD.search(pattern):
         return [_Folder(Path(pattern), read_description(Path(pattern)))]
-    folders = _matching(pattern) or map(Path, fnmatch.filter(shipped_names(), pattern))
-    members = [_Folder(own, read_description(own)) for own in sorted(folders, key=_natural)]
+    shipped = map(Path, fnmatch.filter(shipped_names(), pattern))
+    folders = sorted(_matching(pattern) or shipped, key=_natural)
+    members = [_Folder(own, read_description(own)) for own in folders]
     if not members:
-        raise ConfigurationError(f"no folder matches {quote(pattern)}; {_nearest(Path(pattern))}")
+        near = _nearest(Path(pattern))
+        raise ConfigurationError(f"no folder matches {quote(pattern)}; {near}")
     _require_one_family(pattern, members)
     return members
 
@@ -187,7 +193,8 @@ def _require_motion(member: _Folder) -> None:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
         file = shorten(member.folder / DESCRIPTION)
-        raise ConfigurationError(f"{file}: training.config.reference: {error}") from None
+        problem = f"{file}: training.config.reference: {error}"
+        raise ConfigurationError(problem) from None
 
 
 def _nearest(pattern: Path) -> str:
@@ -243,7 +250,7 @@ _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_ev
 def _kin(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
-    trained = {f"the trained {name}": config[name] for name in config if name not in _OWN}
+    trained = {f"the trained {key}": config[key] for key in config if key not in _OWN}
     names = ("robot", "base", "base_options", "settings")
     return trained | {name: getattr(description, name) for name in names}
 
@@ -267,7 +274,8 @@ class _Opponents:
         for known in beside:
             if _set_options(known.options) == self._options:
                 return known
-        return self._new(name, f"base of {self.residual.title}", self._options, taken)
+        role = f"base of {self.residual.title}"
+        return self._new(name, role, self._options, taken)
 
     def rival(self, taken: Sequence[PolicySpec]) -> PolicySpec | None:
         """The best policy without learning that has the same sensors; None where that is the base.
@@ -289,7 +297,7 @@ class _Opponents:
         return None if is_base else self._new(name, "best analytic", assumed, taken)
 
     @property
-    def _options(self) -> dict[str, object]:
+    def _options(self) -> Options:
         return _set_options({**self.description.base_options, **self.residual.options})
 
     def _is_beside(self, known: PolicySpec, name: str) -> bool:
@@ -298,19 +306,20 @@ class _Opponents:
         return mine == (name, self.residual.env_options, self.residual.level)
 
     def _new(
-        self, name: str, role: str, options: dict[str, object], taken: Sequence[PolicySpec]
+        self, name: str, role: str, options: Options, taken: Sequence[PolicySpec]
     ) -> PolicySpec:
         """A policy under its name or, where a policy is called so, under one that says its role."""
         is_taken = name in {policy.title for policy in taken}
         label = f"{name} ({role})" if is_taken else None
-        return self.residual.replace(name=name, label=label, options=options, track=None)
+        own = {"name": name, "label": label, "options": options, "track": None}
+        return self.residual.replace(**own)
 
 
-def _assumed(options: dict[str, object]) -> dict[str, object]:
+def _assumed(options: Options) -> Options:
     return {name: value for name, value in options.items() if name in ASSUMED_OPTIONS}
 
 
-def _set_options(options: dict[str, object]) -> dict[str, object]:
+def _set_options(options: Options) -> Options:
     return {name: value for name, value in options.items() if value is not None}
 
 

@@ -47,6 +47,16 @@ class RobotScores:
     better: dict[str, Estimate]
     failure: str
 
+    @property
+    def cell(self) -> tuple[str, str]:
+        """Motion and scenario."""
+        return self.reference, self.scenario
+
+    @property
+    def scores(self) -> tuple[Estimate, Estimate, Estimate]:
+        """The three figures over the robots."""
+        return self.mean, self.middle, self.worst
+
 
 def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     """A row per cell and judged metric, of the cells that draw robots and have enough of them.
@@ -65,9 +75,12 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                 continue
             against = [other for other in others if (other, cell) in table.conditions]
             failed, episodes = failures(rows)
+            beside = {title: table.of(title, cell) for title in against}
             for column in table.environment.judged:
-                metric = column.metric
-                shares = {t: share_better(rows, table.of(t, cell), metric) for t in against}
+                better = {}
+                for title, theirs in beside.items():
+                    share = share_better(rows, theirs, column.metric)
+                    better[title] = estimate(rows, share)
                 scores = RobotScores(
                     policy=policy,
                     reference=condition.reference_name,
@@ -78,7 +91,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     worst=score(rows, column, worst_share_mean),
                     failed=failed,
                     episodes=episodes,
-                    better={title: estimate(rows, share) for title, share in shares.items()},
+                    better=better,
                     failure=table.environment.failures,
                 )
                 found.append(scores)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from baselines.catalogue import Track
 from train.evaluate.changes import change_of
@@ -84,16 +85,17 @@ def standings(
         step_us: Time per step of every policy, by its title.
     """
     table = EpisodeTable(evaluations)
-    order = table.references.index
-    scopes = [scope for title in table.policies for scope in table.scopes(title, groups)]
-    scopes.sort(key=lambda s: (table.policies.index(s.policy), order(s.reference), not s.is_group))
+    scopes = [s for title in table.policies for s in table.scopes(title, groups)]
+    parts_of = group_by(scopes, lambda scope: (scope.policy, scope.reference))
+    for own in parts_of.values():
+        own.sort(key=lambda scope: not scope.is_group)
+    scopes = list(chain(*parts_of.values()))
     standard = [scope for scope in scopes if scope.first.track is Track.STANDARD]
     rivals = group_by(standard, lambda scope: scope.place)
-    grouped = group_by((s for s in scopes if s.is_group), lambda s: (s.policy, s.reference))
     found = []
     for scope in scopes:
-        parts = grouped.get((scope.policy, scope.reference), ())
-        pooled = {condition.scenario for part in parts for condition in part.conditions}
+        parts = parts_of[scope.policy, scope.reference]
+        pooled = {c.scenario for part in parts if part.is_group for c in part.conditions}
         rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
@@ -133,5 +135,8 @@ def _paired(table: EpisodeTable, scope: Scope, to: str | None, column: Column) -
 
 def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str | None:
     """The best of some policies; None where none has a score."""
-    played = {scope.policy: table.of(scope.policy, *scope.cells) for scope in scopes}
-    return best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
+    scores = {}
+    for scope in scopes:
+        rows = table.of(scope.policy, *scope.cells)
+        scores[scope.policy] = score(rows, column), failures(rows)
+    return best_of(scores)

@@ -143,12 +143,10 @@ def improvement(won: Array, played: Array) -> Estimate:
         `change`, seeds count that have pairs in every scenario.
     """
     whole = (played > 0).all(axis=1)
-    both = sorted(
-        zip(won[whole].sum(axis=1).tolist(), played[whole].sum(axis=1).tolist(), strict=True)
-    )
-    if not both:
+    both = np.column_stack([won[whole].sum(axis=1), played[whole].sum(axis=1)])
+    if not len(both):
         return Estimate(float("nan"))
-    samples = np.array(both, dtype=np.float64).T
+    samples = np.array(sorted(both.tolist())).T
     share = float(_share(*samples))
     if len(both) < 2:
         return Estimate(share)

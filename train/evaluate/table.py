@@ -124,12 +124,13 @@ class EpisodeTable:
     @cached_property
     def swept(self) -> list[str]:
         """Names of what a sweep or a map varies."""
-        return list(dict.fromkeys(name for c in self.conditions.values() for name in c.swept))
+        conditions = self.conditions.values()
+        return list(dict.fromkeys(name for c in conditions for name in c.swept))
 
     @cached_property
     def families(self) -> dict[str, Origin]:
         """Residuals by title, with how they were trained."""
-        return {title: origin(list(members.values())) for title, members in self.members.items()}
+        return {title: origin([*own.values()]) for title, own in self.members.items()}
 
     def condition(self, policy: str) -> Condition:
         """The first condition of a policy."""
@@ -150,7 +151,8 @@ class EpisodeTable:
     def scope(self, policy: str, *cells: int, group: str = "") -> Scope:
         """A policy in a cell, or in those of a group."""
         conditions = tuple(self.conditions[policy, cell] for cell in cells)
-        return Scope(policy, group or conditions[0].scenario, bool(group), cells, conditions)
+        name = group or conditions[0].scenario
+        return Scope(policy, name, bool(group), cells, conditions)
 
     def scopes(self, policy: str, groups: Groups) -> Iterator[Scope]:
         """Every cell of a policy, and every whole group behind the last of its cells."""
@@ -168,7 +170,8 @@ class EpisodeTable:
                 own = {self.conditions[policy, each].scenario: each for each in block}
                 for name, scenarios in groups.items():
                     if own.keys() >= set(scenarios):
-                        yield self.scope(policy, *(own[each] for each in scenarios), group=name)
+                        members = [own[each] for each in scenarios]
+                        yield self.scope(policy, *members, group=name)
 
     def cells_of_base(self, scope: Scope, base: str) -> list[int]:
         """Numbers of the base's cells beside those of a scope; fewer where it does not play all.
@@ -177,8 +180,8 @@ class EpisodeTable:
         """
         found = []
         for own in scope.conditions:
-            numbers = [self.cells.get(place) for place in (own.cell, own.cell[:2])]
-            found += [n for n in numbers if n is not None and (base, n) in self.conditions][:1]
+            numbers = [self.cells.get(place, -1) for place in (own.cell, own.cell[:2])]
+            found += [n for n in numbers if (base, n) in self.conditions][:1]
         return found
 
     def of(self, policy: str, *cells: int) -> pd.DataFrame:
@@ -198,10 +201,10 @@ def per_seed(
     """A statistic for each training seed and cell, (seeds, cells); nan without a figure."""
     parts: Any = rows.groupby(["member", "cell"])[metric]
     known = {key: own.dropna().to_numpy() for key, own in parts}
-    found = {key: float(statistic(values)) for key, values in known.items() if len(values)}
-    members = rows["member"].unique()
+    found = {key: float(statistic(own)) for key, own in known.items() if len(own)}
     cells = rows["cell"].unique()
-    return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
+    members = rows["member"].unique()
+    return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])
 
 
 def score(

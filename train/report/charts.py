@@ -75,8 +75,9 @@ def _dot_plot(
             "cliponaxis": False,
         }
         data.append(texts)
-        side_by_side = {"domain": specs.domain(number, len(panels), gap=0.03), "anchor": "y"}
-        layout[f"xaxis{specs.nth(number)}"] = {**axis, **side_by_side, "side": "top"}
+        domain = specs.domain(number, len(panels), gap=0.03)
+        place = {"domain": domain, "anchor": "y", "side": "top"}
+        layout[f"xaxis{specs.nth(number)}"] = {**axis, **place}
     layout["yaxis"] = base_axis(
         range=[max(rows, default=0.0) + 0.7, -0.7],
         tickvals=list(rows),
@@ -141,7 +142,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> P
         top=34,
     )
     layout = chart.spec["layout"]
-    layout["annotations"] = [_heading(scenario, place) for scenario, place in headings.items()]
+    layout["annotations"] = [_heading(*heading) for heading in headings.items()]
     layout["shapes"] = [_rule(place - 0.6) for place in list(headings.values())[1:]]
     return chart
 
@@ -159,7 +160,8 @@ def _level_axis(column: Column, levels: Sequence[Estimate]) -> Spec:
     room = math.log10(max(high / low, 1.3))
     left = math.log10(low) - 0.04 * room - 0.02
     right = math.log10(max(high, low)) + 0.34 * room + 0.1
-    numbers = [d * 10.0**e for e in range(math.floor(left), math.ceil(right)) for d in (1, 2, 5)]
+    decades = [10.0**power for power in range(math.floor(left), math.ceil(right))]
+    numbers = [digit * decade for decade in decades for digit in (1, 2, 5)]
     ticks = [number for number in numbers if left <= math.log10(number) <= right]
     return base_axis(
         column.label,
@@ -192,7 +194,9 @@ def forest(rows: Sequence[Change]) -> PageChart:
     """Changes of one residual against its base, in every cell, with intervals."""
     lines = by_line(rows)
     several = len({row.reference for row in rows}) > 1
-    names = [f"{own[0].reference} · {own[0].scope}" if several else own[0].scope for own in lines]
+    names = []
+    for row, *_ in lines:
+        names.append(f"{row.reference} · {row.scope}" if several else row.scope)
     panels = []
     for own in group_by(rows, lambda row: row.column).values():
         changes = [row.relative.times(100.0) for row in own]

@@ -1,13 +1,18 @@
 """A report as sections of texts, tables and charts, written as an HTML page and as Markdown."""
 
+import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
 from typing import Any, Literal
 
 from train.figures.map_plots import Panel, panel_rows
 from train.report.table_formats import Table, load_template, to_markdown
 from train.runs.escaping import markdown_text
 
+TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
+"""Paragraphs by section or table."""
 Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]
 
 
@@ -38,7 +43,7 @@ class Part:
         if self.kind == "table":
             return [*blocks, to_markdown(self.content)]
         if self.kind == "map":
-            return [*blocks, *(block for panel in self.content for block in _panel(panel))]
+            return [*blocks, *chain(*map(_panel, self.content))]
         if self.kind == "text":
             return [*blocks, markdown_text(self.content)]
         texts = self.content

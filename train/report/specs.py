@@ -43,8 +43,8 @@ def page_chart(chart: Chart) -> PageChart:
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
     legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
-    widest = max((len(shorten(row)) for panel in chart.panels for row in panel.rows), default=0)
-    left = max(76, 7.4 * widest + 20)
+    rows = [shorten(row) for panel in chart.panels for row in panel.rows]
+    left = max(76, 7.4 * max(map(len, rows), default=0) + 20)
     layout = base_layout(left=left, top=28 + 20 * legend_rows, bottom=50)
     total = sum(panel.height for panel in chart.panels)
     scale = (1.0 - _GAP * (len(chart.panels) - 1)) / total
@@ -61,8 +61,8 @@ def page_chart(chart: Chart) -> PageChart:
         top = low - _GAP
     ticks: Spec = {"showgrid": False}
     if chart.ticks is not None:
-        values = list(chart.ticks)
-        ticks = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
+        texts = [f"{value:g}" for value in chart.ticks]
+        ticks = {"type": "log", "tickvals": list(chart.ticks), "ticktext": texts}
     last = nth(len(chart.panels) - 1)
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{last}", **ticks)
     layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0}
@@ -74,10 +74,13 @@ def page_chart(chart: Chart) -> PageChart:
 
 
 def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
-    options: Spec = {"type": "log", "dtick": "D2", "tickformat": "~r"} if panel.is_log else {}
+    options: Spec = {}
+    if panel.is_log:
+        options = {"type": "log", "dtick": "D2", "tickformat": "~r"}
     if panel.rows:
         titles = [chart_text(shorten(row)) for row in panel.rows]
-        options = {"tickvals": list(range(len(titles))), "ticktext": titles, "showgrid": False}
+        places = list(range(len(titles)))
+        options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
         options["range"] = [digits(end) for end in panel.limits]
     label = "" if panel.rows else panel.label
@@ -124,8 +127,10 @@ def _abscissa(x: Array) -> Spec:
 
 
 def _shade(begin: float, end: float) -> Spec:
-    place = {"xref": "x", "yref": "paper", "x0": digits(begin), "x1": digits(end), "y0": 0, "y1": 1}
-    return {"type": "rect", **place, "fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+    x = {"xref": "x", "x0": digits(begin), "x1": digits(end)}
+    y = {"yref": "paper", "y0": 0, "y1": 1}
+    look = {"fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+    return {"type": "rect", **x, **y, **look}
 
 
 def shorten(name: str) -> str:
