@@ -82,8 +82,9 @@ class MapConfig(Model):
 
     @model_validator(mode="after")
     def _axes_differ(self) -> Self:
-        if self.x.what == self.y.what:
-            raise ValueError(f"x and y of a map must differ, both vary {self.x.what!r}")
+        what = self.x.what
+        if what == self.y.what:
+            raise ValueError(f"x and y of a map must vary two things, both vary {what!r}")
         return self
 
     @property
