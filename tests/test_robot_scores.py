@@ -100,7 +100,7 @@ def test_rows_are_of_cells_that_draw_robots_against_base_and_first() -> None:
     base = cell("base", {"all": [4.0, 4.0, 4.0, 4.0, 8.0, None]}, "spread")
     learned = family([[1.0, 5.0, 3.0, 3.0, 9.0, 1.0], [1.0, 1.0, 1.0, 1.0, 1.0, None]], "spread")
     rows = robot_scores([base, cell("base", {"all": [1.0] * 6}, "nominal"), *learned])
-    assert {row.scenario for row in rows} == {"spread"}
+    assert {row.scope for row in rows} == {"spread"}
     ours, theirs = (
         next(r for r in rows if r.policy == p and r.column.metric == METRIC)
         for p in ("learned", "base")

@@ -56,16 +56,11 @@ Verdict = Literal["lower", "higher", "none", "unclear"]
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class Change(Scope):
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
     Attributes:
-        policy, base: Titles.
-        is_family: Whether the policy is a residual, so that it has training seeds.
-        reference: Label of the motion.
-        scope: Scenario, or name of the group.
-        is_group: Whether it is a group.
-        swept: Options that a sweep varies, and their values.
+        base: Title of the base.
         marks: What the reader has to know of the row: a ceiling, something held out.
         column: The metric.
         is_judged: Whether policies are judged by it; else it stands in tables alone.
@@ -78,18 +73,11 @@ class Change:
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
-        failure: What failing is called, in the plural.
         is_rival: Whether `base` is not the base of the residual but the best policy without
             learning.
     """
 
-    policy: str
     base: str
-    is_family: bool
-    reference: str
-    scope: str
-    is_group: bool
-    swept: dict[str, float]
     marks: tuple[str, ...]
     column: Column
     is_judged: bool
@@ -103,13 +91,7 @@ class Change:
     episodes: int
     base_falls: int
     base_episodes: int
-    failure: str
     is_rival: bool = False
-
-    @property
-    def line(self) -> tuple[object, ...]:
-        """Key of the rows that have policy, base and cell in common."""
-        return (self.policy, self.base, self.reference, self.scope, *self.swept.items())
 
     @property
     def num_seeds(self) -> int:
@@ -270,8 +252,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     Raises:
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
-    policy = scope.policy
-    own = table.of(policy, *scope.cells)
+    own = table.of(scope.policy, *scope.cells)
     cells = table.cells_of_base(scope, base)
     beside = zip(cells, scope.cells, strict=True)
     theirs = pd.concat(table.of(base, there).assign(cell=cell) for there, cell in beside)
@@ -284,14 +265,9 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     base_falls, base_episodes = failures(theirs)
     member = scope.first.member
     return Change(
-        policy=policy,
+        **vars(scope),
         base=base,
-        is_family=member is not None,
-        reference=scope.reference,
-        scope=scope.name,
-        is_group=scope.is_group,
-        swept=scope.first.swept,
-        marks=_marks(table.families.get(policy), scope.conditions),
+        marks=_marks(table.families.get(scope.policy), scope.conditions),
         column=column,
         is_judged=column in table.environment.judged,
         per_seed=relative,
@@ -304,7 +280,6 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         episodes=episodes,
         base_falls=base_falls,
         base_episodes=base_episodes,
-        failure=table.environment.failures,
         is_rival=member is not None and base == member.rival,
     )
 
@@ -369,5 +344,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(rows, lambda row: row.line)
+    lines = group_by(rows, lambda row: (row.policy, row.base, row.place))
     return list(lines.values())

@@ -164,21 +164,22 @@ class HeatMap:
     Attributes:
         title: Scenario and motion.
         column: The metric.
-        x, y: The axes.
-        known: The environment.
-        policies: Titles of all policies.
-        families: Those that are residuals.
+        axes: The axes.
+        table: All episodes.
         cells: (len(y.values), len(x.values)).
     """
 
     title: str
     column: Column
-    x: Axis
-    y: Axis
-    known: Environment
-    policies: tuple[str, ...]
-    families: tuple[str, ...]
-    cells: tuple[tuple[MapCell, ...], ...]
+    axes: MapConfig
+    table: EpisodeTable
+    cells: list[list[MapCell]]
+
+    @property
+    def ticks(self) -> tuple[list[str], list[str]]:
+        """Values of x and y as they are shown."""
+        known = self.table.environment
+        return self.axes.x.ticks(known), self.axes.y.ticks(known)
 
     @property
     def flat(self) -> list[MapCell]:
@@ -237,19 +238,11 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
     }
     across = range(len(config.x.values))
     rows = [[cells[y, x] for x in across] for y in range(len(config.y.values))]
-    return [
-        HeatMap(
-            title=title,
-            column=column,
-            x=config.x,
-            y=config.y,
-            known=table.environment,
-            policies=tuple(table.policies),
-            families=tuple(table.members),
-            cells=tuple(tuple(_cell(table, n, column) for n in row) for row in rows),
-        )
-        for column in table.environment.judged
-    ]
+    maps = []
+    for column in table.environment.judged:
+        found = [[_cell(table, number, column) for number in row] for row in rows]
+        maps.append(HeatMap(title, column, config, table, found))
+    return maps
 
 
 def _cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:

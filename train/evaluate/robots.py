@@ -13,18 +13,25 @@ from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate, interquartile_mean, worst_share_mean
-from train.evaluate.table import EpisodeTable, estimate, failures, pair, per_seed, score
+from train.evaluate.table import (
+    EpisodeTable,
+    Scope,
+    estimate,
+    failures,
+    pair,
+    per_seed,
+    score,
+)
 
 FEWEST_ROBOTS = 4
 """Episodes from which on there is a middle half."""
 
 
-@dataclass(frozen=True)
-class RobotScores:
+@dataclass(frozen=True, eq=False)
+class RobotScores(Scope):
     """A policy in one metric over the drawn robots of a cell; of residuals with intervals.
 
     Attributes:
-        policy, reference, scenario: Titles of the cell.
         column: The metric.
         mean: Mean over the robots [SI].
         middle: Interquartile mean over the robots [SI].
@@ -32,12 +39,8 @@ class RobotScores:
         failed, episodes: Episodes that failed, and all. The figures are of the others.
         better: Share of the robots for which the policy is better than another one, by its title;
             ties count half, and to fail is worse than any value.
-        failure: What failing is called, in the plural.
     """
 
-    policy: str
-    reference: str
-    scenario: str
     column: Column
     mean: Estimate
     middle: Estimate
@@ -45,12 +48,6 @@ class RobotScores:
     failed: int
     episodes: int
     better: dict[str, Estimate]
-    failure: str
-
-    @property
-    def cell(self) -> tuple[str, str]:
-        """Motion and scenario."""
-        return self.reference, self.scenario
 
     @property
     def scores(self) -> tuple[Estimate, Estimate, Estimate]:
@@ -67,11 +64,11 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     table = EpisodeTable(evaluations)
     found = []
     for policy, others in opponents(table).items():
-        for cell in table.cells_of(policy):
-            condition = table.conditions[policy, cell]
+        for scope in table.scopes(policy, {}):
+            (cell,) = scope.cells
             rows = table.of(policy, cell)
             is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
-            if condition.swept or is_small or not _draws_robots(condition):
+            if scope.swept or is_small or not _draws_robots(scope.first):
                 continue
             against = [other for other in others if (other, cell) in table.conditions]
             failed, episodes = failures(rows)
@@ -82,9 +79,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     share = share_better(rows, theirs, column.metric)
                     better[title] = estimate(rows, share)
                 scores = RobotScores(
-                    policy=policy,
-                    reference=condition.reference_name,
-                    scenario=condition.scenario,
+                    **vars(scope),
                     column=column,
                     mean=score(rows, column),
                     middle=score(rows, column, interquartile_mean),
@@ -92,7 +87,6 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
                     failed=failed,
                     episodes=episodes,
                     better=better,
-                    failure=table.environment.failures,
                 )
                 found.append(scores)
     return found

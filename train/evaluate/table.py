@@ -19,20 +19,20 @@ Groups = Mapping[str, Sequence[str]]
 """Scenarios to pool over, by the name of the group."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scope:
     """A policy in one cell, or in the cells of a group of scenarios that are pooled.
 
     Attributes:
         policy: Its title.
-        name: Scenario, or name of the group.
+        scope: Scenario, or name of the group.
         is_group: Whether it is a group.
         cells: Numbers of its cells.
         conditions: Their conditions.
     """
 
     policy: str
-    name: str
+    scope: str
     is_group: bool
     cells: tuple[int, ...]
     conditions: tuple[Condition, ...]
@@ -48,9 +48,24 @@ class Scope:
         return self.first.reference_name
 
     @property
+    def swept(self) -> dict[str, float]:
+        """Options that a sweep or a map varies, and their values."""
+        return self.first.swept
+
+    @property
+    def is_family(self) -> bool:
+        """True if the policy is a residual, so that it has training seeds."""
+        return self.first.member is not None
+
+    @property
+    def failure(self) -> str:
+        """Name of failures, in the plural."""
+        return self.first.environment.failures
+
+    @property
     def place(self) -> tuple[object, ...]:
         """Name that scopes of several policies share."""
-        return self.reference, self.name, self.is_group, *self.first.swept.items()
+        return self.reference, self.scope, self.is_group, *self.swept.items()
 
 
 class EpisodeTable:

@@ -6,6 +6,7 @@ Pictures and the page of a report draw the same charts.
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
 from train.figures.colours import REFERENCE, dash_of
 
+Colours = Mapping[str, str]
+"""Colour of every policy."""
 Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
 
@@ -97,7 +100,7 @@ class Chart:
 def time_chart(
     policies: Mapping[str, Sequence[Evaluation]],
     signals: Sequence[TracedSignal],
-    colours: Mapping[str, str],
+    colours: Colours,
     most_points: int | None = None,
 ) -> Chart:
     """Signals of the first episodes over time; over training seeds the median with its band.
@@ -118,11 +121,12 @@ def time_chart(
     for signal in signals:
         curves = []
         for title, own in policies.items():
-            curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
+            times = time_s[::stride]
+            curves.append(_median_curve(title, colours[title], own, signal, times, stride))
         if signal.reference is not None:
-            reference = signal.scale * longest[signal.reference][::stride]
-            style = {"dash": "dash", "width": 1.1}
-            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, **style))
+            y = signal.scale * longest[signal.reference][::stride]
+            look = (REFERENCE, time_s[::stride], y, "dash")
+            curves.append(Curve("reference", *look, width=1.1))
         limits = _limits([e for own in policies.values() for e in own], signal)
         panels.append(Panel(signal.label, curves, limits))
     single = longest.get("single_support", np.zeros(len(time_s)))
@@ -135,7 +139,7 @@ def _median_curve(
     colour: str,
     own: Sequence[Evaluation],
     signal: TracedSignal,
-    time_s: Array,
+    times: Array,
     stride: int,
 ) -> Curve:
     length = max(len(e.trace["time_s"]) for e in own)
@@ -146,7 +150,7 @@ def _median_curve(
     return Curve(
         title,
         colour,
-        time_s[:length:stride],
+        times[: len(middle)],
         middle,
         dash=dash_of(title),
         band=(low, high) if len(own) > 1 else None,
@@ -157,7 +161,8 @@ def _median_curve(
 def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[float, float]:
     """Range of a signal and its reference, shortly before a fall left out, with a margin."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
-    values = np.concatenate([e.trace[name][e.is_steady] for e in evaluations for name in names])
+    parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
+    values = np.concatenate(parts)
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:
         return -1.0, 1.0
@@ -176,7 +181,8 @@ def spread(values: Array) -> tuple[Array, Array, Array]:
     """Least, median and most over the first axis, nan where there is nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
-        return np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0)
+        low, middle, high = np.nanquantile(values, [0.0, 0.5, 1.0], axis=0)
+    return low, middle, high
 
 
 def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
@@ -189,7 +195,7 @@ def sweep_chart(
     cells: Cells,
     columns: Sequence[Column],
     label: str,
-    colours: Mapping[str, str],
+    colours: Colours,
     statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
 ) -> Chart:
     """Scores over a swept value, a curve or a level per policy; on top, who fails where.
@@ -201,13 +207,16 @@ def sweep_chart(
         colours: Of the policies.
         statistic: Over the episodes of a cell [SI].
     """
-    values = sorted({value for own in cells.values() for value in own if value is not None})
+    swept = {*chain(*cells.values())}
+    values = sorted(value for value in swept if value is not None)
     panels = _failures(cells, values, colours)
     for column in columns:
         curves = []
         for title, own in cells.items():
             is_level = None in own
-            x = [values[0], values[-1]] if is_level else [value for value in values if value in own]
+            x = [value for value in values if value in own]
+            if is_level:
+                x = [values[0], values[-1]]
             found = [statistic(own[None if is_level else key], column) for key in x]
             shown = [estimate.times(column.scale) for estimate in found]
             low, high = np.array([estimate.ends for estimate in shown]).T
@@ -227,7 +236,7 @@ def sweep_chart(
     return Chart("", label, panels, ticks=values, width=8.0)
 
 
-def _failures(cells: Cells, values: Sequence[float], colours: Mapping[str, str]) -> list[Panel]:
+def _failures(cells: Cells, values: Sequence[float], colours: Colours) -> list[Panel]:
     """A panel with a row for each policy that fails somewhere; none where nobody does."""
     rows = []
     curves = []
@@ -241,9 +250,10 @@ def _failures(cells: Cells, values: Sequence[float], colours: Mapping[str, str])
         if shares:
             y = np.full(len(shares), float(len(rows)))
             x = np.array(list(shares))
-            curves.append(Curve("", colours[title], x, y, crosses=list(shares.values())))
+            crosses = list(shares.values())
+            curves.append(Curve("", colours[title], x, y, crosses=crosses))
             rows.append(title)
-    first = next(e for own in cells.values() for cell in own.values() for e in cell).condition
+    first = next(e for own in cells.values() for e in chain(*own.values())).condition
     limits = (len(rows) - 0.4, -0.6)
     height = 0.2 * len(rows) + 0.2
     panel = Panel(first.environment.failure, curves, limits, height=height, rows=rows)
@@ -251,7 +261,7 @@ def _failures(cells: Cells, values: Sequence[float], colours: Mapping[str, str])
 
 
 def learning_chart(
-    learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]
+    learning: Mapping[str, Curves], columns: Sequence[Column], colours: Colours
 ) -> Chart:
     """Share of the base's score during a training: median over training seeds with its band."""
     panels = []
@@ -289,9 +299,11 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
         values = column.scale * np.array(found)
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
-        means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
+        sums = np.nansum(values, axis=1)
+        means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
-        curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
+        look = {"width": 2.0, "has_points": True}
+        curves.append(Curve("mean", "#2a6f97", numbers, means, **look))
         limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
         panels.append(Panel(column.label, curves, limits))
     return Chart(title, "trials learned from", panels, width=7.0)

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from train.evaluate.rollout import make_vector_env
 from train.figures.chart import Cells, Curve, Panel, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
-from train.figures.plots import draw_chart, draw_overview
+from train.figures.plots import Evaluations, draw_chart, draw_overview
 from train.figures.testbed_plots import draw_static_errors
 
 _MIN_SWEPT_REFERENCES = 3
@@ -29,7 +30,7 @@ _SUBJECTS = {"pelvis": "Pelvis error, ", "zmp": "Zero moment point, "}
 
 
 def draw_figures(
-    evaluations: Sequence[Evaluation],
+    evaluations: Evaluations,
     folder: Path,
     policies: Sequence[str] = (),
     swept: str | None = None,
@@ -44,8 +45,9 @@ def draw_figures(
     """
     cells = cells_together(evaluations)
     if swept is not None:
-        paths = {folder / f"sweep_{_stem(own[0])}.png": own for own in cells}
-        return [draw_sweep(own, by_option(own), swept, path) for path, own in paths.items()]
+        paths = [folder / f"sweep_{_stem(own[0])}.png" for own in cells]
+        parts = zip(cells, paths, strict=True)
+        return [draw_sweep(own, by_option(own), swept, path) for own, path in parts]
     known = evaluations[0].condition.environment
     files = [draw_overview(evaluations, known.swept[0], folder / "overview.png")]
     for scenario in swept_scenarios(evaluations):
@@ -53,18 +55,22 @@ def draw_figures(
         path = folder / f"sweep_{_safe(scenario)}.png"
         files.append(draw_sweep(own, by_reference(own), f"{known.quantity} [s]", path))
     for group in cells:
-        shown = [e for e in group if not policies or e.condition.policy.title in policies]
-        files += draw_signals(shown, folder) if shown else []
+        by_policy = group_by(group, lambda e: e.condition.policy.title)
+        shown = [own for t, own in by_policy.items() if not policies or t in policies]
+        files += draw_signals(list(chain(*shown)), folder) if shown else []
     return files
 
 
 def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    names = [_safe(f"{found.title}_{found.column.metric}") for found in maps]
-    return [draw_map(m, folder / f"map_{name}.png") for m, name in zip(maps, names, strict=True)]
+    files = []
+    for found in maps:
+        name = _safe(f"{found.title}_{found.column.metric}")
+        files.append(draw_map(found, folder / f"map_{name}.png"))
+    return files
 
 
-def draw_signals(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
+def draw_signals(evaluations: Evaluations, folder: Path) -> list[Path]:
     """Draw the signals of one motion and scenario over time, and what it shows at rest.
 
     Args:
@@ -73,11 +79,11 @@ def draw_signals(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
     """
     first = evaluations[0]
     known = first.condition.environment
-    pictures = group_by((s for s in known.curves if s.picture), lambda signal: signal.picture)
-    files = [
-        draw_picture(name, signals, evaluations, folder / f"{figure_name(name, first)}.png")
-        for name, signals in pictures.items()
-    ]
+    files = []
+    for name, signals in group_by(known.curves, lambda signal: signal.picture).items():
+        if name:
+            path = folder / f"{figure_name(name, first)}.png"
+            files.append(draw_picture(name, signals, evaluations, path))
     if first.points is not None:
         path = folder / f"{figure_name('static', first)}.png"
         model = make_vector_env(first.condition, 1).unwrapped.assumed_model
@@ -86,7 +92,7 @@ def draw_signals(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
 
 
 def draw_picture(
-    name: str, signals: Sequence[TracedSignal], evaluations: Sequence[Evaluation], path: Path
+    name: str, signals: Sequence[TracedSignal], evaluations: Evaluations, path: Path
 ) -> Path:
     """Draw signals of several policies over time, as Figs. 7 to 10 of the paper."""
     condition = evaluations[0].condition
@@ -129,51 +135,50 @@ def paper_figure(name: str, condition: Condition) -> int | None:
     return numbers.get(condition.reference_name)
 
 
-def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+def cells_together(evaluations: Evaluations) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    cells = group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario))
+    cells = group_by(evaluations, lambda e: e.condition.cell[:2])
     return list(cells.values())
 
 
-def by_option(evaluations: Sequence[Evaluation]) -> Cells:
+def by_option(evaluations: Evaluations) -> Cells:
     """Evaluations of every policy by the swept value; None for a policy that was not swept."""
     return _by_policy(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
-def by_reference(evaluations: Sequence[Evaluation]) -> Cells:
+def by_reference(evaluations: Evaluations) -> Cells:
     """Evaluations of every policy by the number of the reference, such as the step period [s]."""
     numbered = [e for e in evaluations if e.condition.number is not None]
     return _by_policy(numbered, lambda e: e.condition.number)
 
 
-def _by_policy(
-    evaluations: Sequence[Evaluation], key: Callable[[Evaluation], float | None]
-) -> Cells:
+def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], float | None]) -> Cells:
     policies = group_by(evaluations, lambda e: e.condition.policy.title)
     return {title: group_by(own, key) for title, own in policies.items()}
 
 
-def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
+def swept_scenarios(evaluations: Evaluations) -> list[str]:
     """Scenarios in which the references that are played are points of one axis."""
-    by_scenario = group_by(evaluations, lambda e: e.condition.scenario)
-    return [scenario for scenario, own in by_scenario.items() if has_swept_references(own)]
+    scenarios = group_by(evaluations, lambda e: e.condition.scenario).items()
+    return [scenario for scenario, own in scenarios if has_swept_references(own)]
 
 
-def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
+def has_swept_references(evaluations: Evaluations) -> bool:
     """True if enough references have a number, and each one of its own: points of one axis."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
 
 
-def draw_sweep(evaluations: Sequence[Evaluation], cells: Cells, label: str, path: Path) -> Path:
+def draw_sweep(evaluations: Evaluations, cells: Cells, label: str, path: Path) -> Path:
     """Medians against a swept value, a curve per policy; on top, who fails where."""
     condition = evaluations[0].condition
     references = {e.condition.reference_name for e in evaluations}
     title = f"scenario {condition.scenario}"
     if len(references) == 1:
         title = f"{condition.environment.title(*references)}, {title}"
-    chart = sweep_chart(cells, condition.environment.swept, label, policy_colours(list(cells)))
+    colours = policy_colours(list(cells))
+    chart = sweep_chart(cells, condition.environment.swept, label, colours)
     return draw_chart(replace(chart, title=title[0].upper() + title[1:]), path)
 
 

@@ -1,7 +1,7 @@
 """Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
 from train.runs.escaping import visible
 
+Evaluations = Sequence[Evaluation]
 MRAD = 1e3
 """Factor from rad to what figures show."""
 
@@ -34,6 +35,14 @@ def require_matplotlib() -> Any:
 
     plt.style.use(Path(__file__).with_name("pictures.mplstyle"))
     return plt
+
+
+def new_figure(rows: int, columns: int, size: tuple[float, float], **shape: Any) -> Any:
+    """A figure of a size [in], and its axes row by row."""
+    plt = require_matplotlib()
+    shape |= {"figsize": size, "squeeze": False, "layout": "constrained"}
+    figure, axes = plt.subplots(rows, columns, **shape)
+    return figure, list(axes.flat)
 
 
 def label_text(name: str) -> str:
@@ -64,15 +73,14 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 
     A filled cross on top stands where all episodes of a policy failed, an open one where some did.
     """
-    plt = require_matplotlib()
     heights = [panel.height for panel in chart.panels]
-    shape = {"sharex": True, "squeeze": False, "height_ratios": heights, "layout": "constrained"}
     size = (chart.width, sum(heights) + 1.2)
-    figure, axes = plt.subplots(len(heights), 1, figsize=size, **shape)
-    axes = list(axes[:, 0])
+    shape = {"sharex": True, "height_ratios": heights}
+    figure, axes = new_figure(len(heights), 1, size, **shape)
     for axis, panel in zip(axes, chart.panels, strict=True):
+        shade = {"color": "#e9ebee", "lw": 0, "zorder": 0, "label": chart.shade_name}
         for begin, end in chart.shaded:
-            axis.axvspan(begin, end, color="#e9ebee", lw=0, zorder=0, label=chart.shade_name)
+            axis.axvspan(begin, end, **shade)
         for curve in panel.curves:
             _draw_curve(axis, curve, panel.limits)
         axis.set_ylabel(panel.label)
@@ -111,22 +119,26 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 
 
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
+    colour = curve.colour
     if curve.crosses:
-        faces = [curve.colour if is_filled else "none" for is_filled in curve.crosses]
-        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": curve.colour}
+        faces = [colour if is_filled else "none" for is_filled in curve.crosses]
+        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": colour}
         axis.scatter(curve.x, curve.y, lw=1.0, **style)
         return
-    style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
-    marker = {"marker": "o", "ms": 4} if curve.has_points else {}
-    name = label_text(curve.name) or "_"  # without a name Matplotlib has it in no legend
-    axis.plot(curve.x, curve.y, color=curve.colour, lw=curve.width, ls=style, label=name, **marker)
+    style = {"marker": "o", "ms": 4} if curve.has_points else {}
+    style |= {"color": colour, "lw": curve.width, "ls": _DASHES[curve.dash]}
+    # without a name Matplotlib has it in no legend
+    axis.plot(curve.x, curve.y, label=label_text(curve.name) or "_", **style)
     if curve.band is not None:
-        axis.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.18, lw=0)
+        axis.fill_between(curve.x, *curve.band, color=colour, alpha=0.18, lw=0)
     if curve.fails:
         last = curve.y[np.isfinite(curve.y)][-1:]
         y = last if limits is None else np.clip(last, *limits)
         cross = {"marker": "X", "s": 70, "edgecolors": "white", "lw": 0.8, "zorder": 6}
-        axis.scatter(curve.x[-1:], y, color=curve.colour, clip_on=False, **cross)
+        axis.scatter(curve.x[-1:], y, color=colour, clip_on=False, **cross)
+
+
+_DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 
 
 def show_numbers(axis: Any, numticks: int | None = None) -> None:
@@ -138,13 +150,12 @@ def show_numbers(axis: Any, numticks: int | None = None) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
+def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
     """A metric of every policy: a panel per reference, or of one scenario one with all of them.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
     failed.
     """
-    plt = require_matplotlib()
     known = evaluations[0].condition.environment
     titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
     shades = policy_colours(titles)
@@ -162,29 +173,20 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
-        sharey=True,
-        sharex=stacked,
-        squeeze=False,
-        layout="constrained",
-    )
-    for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
+    size = (min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows)
+    figure, axes = new_figure(rows, columns, size, sharey=True, sharex=stacked)
+    for axis, (title, groups) in zip(axes, panels.items(), strict=True):
         _draw_bars(axis, groups, column, shades)
         axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
     if is_one_scenario and known.quantity:
-        axes[-1][0].set_xlabel(known.quantity)
-    bar = axes.flat[0].bar
-    labels = [label_text(title) for title in shades]
-    bars = zip(shades.values(), labels, strict=True)
-    handles = [bar(np.nan, 0.0, color=shade, label=label) for shade, label in bars]
+        axes[-columns].set_xlabel(known.quantity)
+    bar = axes[0].bar
+    handles = [bar(np.nan, 0.0, color=c, label=label_text(t)) for t, c in shades.items()]
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
-        handles.append(axes.flat[0].scatter([], [], **cross))
+        handles.append(axes[0].scatter([], [], **cross))
     ncols = columns_of(len(handles), max(int(columns * width / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
@@ -197,7 +199,10 @@ _ROOMY = 7
 
 
 def _draw_bars(
-    axis: Any, groups: dict[str, list[Evaluation]], column: Column, shades: dict[str, str]
+    axis: Any,
+    groups: Mapping[str, Evaluations],
+    column: Column,
+    shades: Mapping[str, str],
 ) -> None:
     """A bar per policy in every group."""
     policies = list(shades)
@@ -214,12 +219,12 @@ def _draw_bars(
                 dots = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
                 axis.scatter(np.full(len(values), x), values, **dots)
             if e.num_failed:
-                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5, "zorder": 4}
-                colour = FAILED if len(values) else shade
+                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5}
+                cross["color"] = FAILED if len(values) else shade
                 bottom = axis.get_xaxis_transform()
-                axis.scatter(x, 0.035, color=colour, transform=bottom, **cross)
+                axis.scatter(x, 0.035, transform=bottom, zorder=4, **cross)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
-    axis.set_xticks(range(len(groups)), [label_text(name) for name in groups], **slanted)
+    axis.set_xticks(range(len(groups)), list(map(label_text, groups)), **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)

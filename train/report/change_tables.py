@@ -131,7 +131,8 @@ def _means(row: Change) -> str:
     column = row.column
     if not np.isfinite(row.mine):
         return "-"
-    before, after = (number_interval(Estimate(v), column) for v in (row.theirs, row.mine))
+    means = (Estimate(row.theirs), Estimate(row.mine))
+    before, after = (number_interval(mean, column) for mean in means)
     return f"{before} → {after} {column.unit}"
 
 
@@ -205,8 +206,8 @@ _AGAINST = (*Estimate(0.0).record("change"), "verdict")
 
 
 def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
-    x_ticks = found.x.ticks(found.known)
-    for y, row in zip(found.y.ticks(found.known), found.cells, strict=True):
+    x_ticks, y_ticks = found.ticks
+    for y, row in zip(y_ticks, found.cells, strict=True):
         for x, cell in zip(x_ticks, row, strict=True):
             for title, estimate in cell.levels.items():
                 change = cell.learned.get(title)
@@ -217,9 +218,9 @@ def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
                 failed, episodes = cell.failed[title]
                 yield {
                     "map": found.title,
-                    "x_is": found.x.title,
+                    "x_is": found.axes.x.title,
                     "x": x,
-                    "y_is": found.y.title,
+                    "y_is": found.axes.y.title,
                     "y": y,
                     "metric": found.column.metric,
                     "policy": title,

@@ -161,7 +161,8 @@ def _learning_sentence(results: Results) -> str:
     if not rows:
         return ""
     row = next((row for row in rows if row.is_group), rows[0])
-    subject = f"{row.policy} changes the {row.column.title} of {row.base} in {row.scope}"
+    metric = f"the {row.column.title} of {row.base}"
+    subject = f"{row.policy} changes {metric} in {row.scope}"
     if row.num_seeds >= FEWEST_SEEDS:
         return f"{subject} by {percent_interval(row.relative)}."
     few = f"{_count(row.num_seeds, 'training seed')} cannot tell that from chance"
@@ -207,15 +208,16 @@ def in_short(results: Results) -> list[str]:
     """Gains by learning in a sentence each; then how many cells are better or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)]
     found += claims(results)
-    for rows in group_by(results.judged, lambda row: (row.policy, row.is_rival)).values():
+    pairs = group_by(results.judged, lambda row: (row.policy, row.is_rival))
+    for rows in pairs.values():
         for own in group_by(rows, lambda row: row.column).values():
             found += _of_a_metric(results, own)
         worse = [row for row in rows if row.falls_more and not row.is_group]
         if worse:
             places = [f"{row.scope}{_at(results, row)}" for row in worse]
+            than = f"more {rows[0].failure} than {rows[0].base}"
             where = ", ".join(dict.fromkeys(places))
-            first = rows[0]
-            found.append(f"{first.policy}: more {first.failure} than {first.base} in {where}.")
+            found.append(f"{rows[0].policy}: {than} in {where}.")
     return found or [
         "No residual takes part: there are no training seeds, and differences are differences of"
         " means."
@@ -227,10 +229,10 @@ def of_a_map(heat_map: HeatMap) -> list[str]:
     where = f"{heat_map.column.title}, {heat_map.title}"
     cells = heat_map.flat
     wins = Counter(cell.best for cell in cells)
-    ranked = sorted(heat_map.policies, key=lambda title: -wins[title])
+    ranked = sorted(heat_map.table.policies, key=lambda title: -wins[title])
     best = ", ".join(f"{title} in {wins[title]}" for title in ranked if wins[title])
     found = [f"{where}: best of {len(cells)} cells: {best}."]
-    for title in heat_map.families:
+    for title in heat_map.table.members:
         rows = [cell.learned[title] for cell in cells if title in cell.learned]
         values = [row.relative.value for row in rows if row.relative.is_known]
         if values:
@@ -261,13 +263,13 @@ def claims(results: Results) -> list[str]:
     Scopes are the groups; without groups the scenarios, where there are few.
     """
     rivals = [row for row in results.judged if row.is_rival]
-    bases = {_place(row): row for row in reversed(results.judged) if not row.is_rival}
+    bases = {(r.policy, r.place, r.column): r for r in results.judged[::-1] if not r.is_rival}
     shown = [row for row in rivals if row.is_group]
-    if not shown and len({_place(row)[:-1] for row in rivals}) <= _MOST_CLAIMS:
+    if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
         shown = rivals
     found = []
     for rival in shown:
-        base = bases[_place(rival)]
+        base = bases[rival.policy, rival.place, rival.column]
         pooled = "pooled over " if rival.is_group else ""
         where = f"{pooled}{rival.scope}{_at(results, rival)}{marks_text(rival)}"
         subject = f"{rival.policy}, {rival.column.title}, {where}"
@@ -275,11 +277,6 @@ def claims(results: Results) -> list[str]:
         best = f"{rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}"
         found.append(f"{subject}: {to_base}; {_comparison(rival)} than {best}.")
     return found
-
-
-def _place(row: Change) -> tuple[object, ...]:
-    swept = tuple(row.swept.items())
-    return (row.policy, row.reference, row.scope, row.is_group, swept, row.column)
 
 
 _MOST_CLAIMS = 4

@@ -32,7 +32,8 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
             for policy in table.policies:
                 for cell in table.cells_of(policy, reference, scenario):
                     own = table.of(policy, cell)
-                    values = swept_values(table.conditions[policy, cell].swept, table.swept)
+                    swept = table.conditions[policy, cell].swept
+                    values = swept_values(swept, table.swept)
                     figures = [number_interval(score(own, c), c) for c in columns]
                     rows.append([reference, scenario, policy, *values, *figures])
     labels = [column.label for column in columns]
@@ -59,7 +60,7 @@ def robots_table(found: Sequence[RobotScores]) -> Table:
     head = ["reference", "scenario", "policy", "metric", *figures]
     rows = []
     for row in found:
-        names = (row.reference, row.scenario, row.policy, row.column.label)
+        names = (row.reference, row.scope, row.policy, row.column.label)
         scores = [number_interval(own, row.column) for own in row.scores]
         better = [
             f"{title}: {percent_interval(share, signed=False)}"
@@ -79,7 +80,7 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
     heads = [Head(column.title, column.unit, leaves=1) for column in columns]
     heads = [Head("policy", is_number=False), *heads, Head(found[0].failure)]
     rows = []
-    for names, cell in group_by(found, lambda row: row.cell).items():
+    for names, cell in group_by(found, lambda row: (row.reference, row.scope)).items():
         rows.append(Row((", ".join(names),), kind="heading"))
         for policy, own in group_by(cell, lambda row: row.policy).items():
             figures = {row.column: _three(row) for row in own}
@@ -103,13 +104,14 @@ def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
 
 
 def _records(row: RobotScores) -> Iterator[dict[str, object]]:
-    shares = {other: share.record("better_share") for other, share in row.better.items()}
-    names = Estimate(0.0).record("better_share")
-    for other, share in shares.items() or [("", dict.fromkeys(names, ""))]:
+    for other, better in row.better.items() or [("", Estimate(0.0))]:
+        share = better.record("better_share")
+        if not other:
+            share = dict.fromkeys(share, "")
         yield {
             "policy": row.policy,
             "reference": row.reference,
-            "scenario": row.scenario,
+            "scenario": row.scope,
             "metric": row.column.metric,
             **row.mean.record("mean"),
             **row.middle.record("interquartile_mean"),
