@@ -41,9 +41,9 @@ from train.figures.comparison_figures import (
     by_option,
     by_reference,
     draw_signals,
-    draw_sweep,
     figure_name,
 )
+from train.figures.plots import draw_chart
 from train.learn.train_config import TrainConfig
 from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
@@ -469,9 +469,7 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     (failing,) = failing_panel.curves
     assert (failing.x.tolist(), failing.crosses) == ([0.5, 1.0], [True, False])
     assert failing_panel.rows == ["input"]
-    with Image.open(
-        draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))
-    ) as image:
+    with Image.open(draw_chart(chart, Path("s.png"))) as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
 

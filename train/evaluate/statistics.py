@@ -19,6 +19,10 @@ from elastic_env.core.signals import Array
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
+_BOOTSTRAP: dict[str, Any] = {
+    **{"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE},
+    **{"method": "percentile", "paired": True, "vectorized": True},
+}
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
 _CUT = 0.25
@@ -158,17 +162,9 @@ def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]
     # here: it takes half a second to load, and most programs need none of it
     from scipy import stats
 
-    found = stats.bootstrap(
-        samples,
-        statistic,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        paired=True,
-        vectorized=True,
-        rng=np.random.default_rng(_BOOTSTRAP_SEED),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    rng = np.random.default_rng(_BOOTSTRAP_SEED)
+    low, high = stats.bootstrap(samples, statistic, rng=rng, **_BOOTSTRAP).confidence_interval
+    return float(low), float(high)
 
 
 def _share(won: Array, played: Array, axis: int = -1) -> Any:

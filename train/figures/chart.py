@@ -191,12 +191,15 @@ def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
     return Estimate(float(np.median(values)) if len(values) else float("nan"))
 
 
+Statistic = Callable[[Sequence[Evaluation], Column], Estimate]
+
+
 def sweep_chart(
     cells: Cells,
     columns: Sequence[Column],
     label: str,
     colours: Colours,
-    statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
+    statistic: Statistic = median,
 ) -> Chart:
     """Scores over a swept value, a curve or a level per policy; on top, who fails where.
 

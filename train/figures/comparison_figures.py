@@ -5,15 +5,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from train.evaluate.conditions import Condition
-from train.evaluate.environments import TracedSignal
+from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.rollout import make_vector_env
-from train.figures.chart import Cells, Curve, Panel, sweep_chart, time_chart
+from train.figures.chart import Cells, Curve, Panel, median, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
 from train.figures.plots import Evaluations, draw_chart, draw_overview
@@ -25,7 +26,7 @@ _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
 _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
-_SUBJECTS = {"pelvis": "Pelvis error, ", "zmp": "Zero moment point, "}
+_SUBJECTS = {"pelvis": "Pelvis error. ", "zmp": "Zero moment point. "}
 """Beginnings of the titles of pictures of a walk."""
 
 
@@ -43,18 +44,13 @@ def draw_figures(
         policies: Policies of the time series, all if empty.
         swept: Title of the axis of swept options; None without a sweep.
     """
-    cells = cells_together(evaluations)
-    if swept is not None:
-        paths = [folder / f"sweep_{_stem(own[0])}.png" for own in cells]
-        parts = zip(cells, paths, strict=True)
-        return [draw_sweep(own, by_option(own), swept, path) for own, path in parts]
     known = evaluations[0].condition.environment
-    files = [draw_overview(evaluations, known.swept[0], folder / "overview.png")]
-    for scenario in swept_scenarios(evaluations):
-        own = [e for e in evaluations if e.condition.scenario == scenario]
-        path = folder / f"sweep_{_safe(scenario)}.png"
-        files.append(draw_sweep(own, by_reference(own), f"{known.quantity} [s]", path))
-    for group in cells:
+    sweeps = sweep_charts(evaluations, swept, known.swept)
+    files = [draw_chart(chart, folder / f"sweep_{name}.png") for name, chart in sweeps.items()]
+    if swept is not None:
+        return files
+    files.insert(0, draw_overview(evaluations, known.swept[0], folder / "overview.png"))
+    for group in cells_together(evaluations):
         by_policy = group_by(group, lambda e: e.condition.policy.title)
         shown = [own for t, own in by_policy.items() if not policies or t in policies]
         files += draw_signals(list(chain(*shown)), folder) if shown else []
@@ -99,8 +95,7 @@ def draw_picture(
     policies = {e.condition.policy.title: [e] for e in evaluations}
     chart = time_chart(policies, signals, policy_colours(list(policies)))
     number = paper_figure(name, condition)
-    motion = condition.environment.title(condition.reference_name)
-    title = f"{_SUBJECTS.get(name, '')}{motion}, scenario {condition.scenario}"
+    title = f"{_SUBJECTS.get(name, '')}{_title(condition)}"
     if number is not None:
         title = f"{title} (cf. Fig. {number} of the paper)"
         if name == "pelvis":
@@ -157,10 +152,42 @@ def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], float | Non
     return {title: group_by(own, key) for title, own in policies.items()}
 
 
-def swept_scenarios(evaluations: Evaluations) -> list[str]:
-    """Scenarios in which the references that are played are points of one axis."""
-    scenarios = group_by(evaluations, lambda e: e.condition.scenario).items()
-    return [scenario for scenario, own in scenarios if has_swept_references(own)]
+def sweep_charts(
+    evaluations: Evaluations,
+    swept: str | None,
+    columns: Sequence[Column],
+    statistic: Any = median,
+) -> dict[str, Any]:
+    """Scores over a swept option, or over what the references differ in.
+
+    Args:
+        evaluations: All cells.
+        swept: Title of the axis of swept options; None without a sweep.
+        columns: A panel for each.
+        statistic: See `sweep_chart`.
+
+    Returns:
+        Charts by the ends of the names of their files.
+    """
+    known = evaluations[0].condition.environment
+    colours = policy_colours([e.condition.policy.title for e in evaluations])
+    found = {}
+    if swept is not None:
+        for own in cells_together(evaluations):
+            chart = sweep_chart(by_option(own), columns, swept, colours, statistic)
+            found[_stem(own[0])] = replace(chart, title=_title(own[0].condition))
+        return found
+    for scenario, own in group_by(evaluations, lambda e: e.condition.scenario).items():
+        if has_swept_references(own):
+            label = f"{known.quantity} [s]"
+            chart = sweep_chart(by_reference(own), columns, label, colours, statistic)
+            found[_safe(scenario)] = replace(chart, title=f"Scenario {scenario}")
+    return found
+
+
+def _title(condition: Condition) -> str:
+    motion = condition.environment.title(condition.reference_name)
+    return f"{motion[:1].upper()}{motion[1:]}, scenario {condition.scenario}"
 
 
 def has_swept_references(evaluations: Evaluations) -> bool:
@@ -168,18 +195,6 @@ def has_swept_references(evaluations: Evaluations) -> bool:
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
-
-
-def draw_sweep(evaluations: Evaluations, cells: Cells, label: str, path: Path) -> Path:
-    """Medians against a swept value, a curve per policy; on top, who fails where."""
-    condition = evaluations[0].condition
-    references = {e.condition.reference_name for e in evaluations}
-    title = f"scenario {condition.scenario}"
-    if len(references) == 1:
-        title = f"{condition.environment.title(*references)}, {title}"
-    colours = policy_colours(list(cells))
-    chart = sweep_chart(cells, condition.environment.swept, label, colours)
-    return draw_chart(replace(chart, title=title[0].upper() + title[1:]), path)
 
 
 def _stem(evaluation: Evaluation) -> str:

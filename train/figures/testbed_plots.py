@@ -76,7 +76,7 @@ def draw_identification(
 
 def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) -> Path:
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
-    figure, (axis,) = new_figure(1, 1, (7.6, 4.4))
+    figure, (axis,) = new_figure(1, 1, (7.6, 5.2))
     gravity = [make_gravity(model)]
     shades = policy_colours([e.condition.policy.title for e in evaluations])
     for index, evaluation in enumerate(evaluations):

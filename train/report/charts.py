@@ -12,7 +12,7 @@ from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures, score
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
-from train.report.specs import LONGEST_NAME, PageChart, Spec, base_axis
+from train.report.specs import LONGEST_NAME, Spec, base_axis
 from train.report.table_formats import number_interval
 from train.runs.escaping import chart_text
 
@@ -45,7 +45,7 @@ def _dot_plot(
     left: float,
     height: float,
     top: int = 40,
-) -> PageChart:
+) -> Spec:
     """Panels side by side whose rows have names, plain or as HTML.
 
     Args:
@@ -85,7 +85,7 @@ def _dot_plot(
         showgrid=False,
     )
     layout["showlegend"] = False
-    return PageChart({"data": data, "layout": layout}, int(height))
+    return {"data": data, "layout": {**layout, "height": int(height)}}
 
 
 def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
@@ -105,7 +105,7 @@ def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
     }
 
 
-def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> PageChart:
+def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> Spec:
     """Every policy in every scenario: its mean over the episodes that did not fail."""
     rungs: list[tuple[float, str, Any]] = []
     headings: dict[str, float] = {}
@@ -141,7 +141,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> P
         height=70 + (24 if len(rungs) < 40 else 19) * (place + 1.0),
         top=34,
     )
-    layout = chart.spec["layout"]
+    layout = chart["layout"]
     layout["annotations"] = [_heading(*heading) for heading in headings.items()]
     layout["shapes"] = [_rule(place - 0.6) for place in list(headings.values())[1:]]
     return chart
@@ -190,7 +190,7 @@ def _rule(place: float) -> Spec:
     return {"type": "line", **where, "line": {"color": LINE, "width": 1}}
 
 
-def forest(rows: Sequence[Change]) -> PageChart:
+def forest(rows: Sequence[Change]) -> Spec:
     """Changes of one residual against its base, in every cell, with intervals."""
     lines = by_line(rows)
     several = len({row.reference for row in rows}) > 1

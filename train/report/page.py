@@ -22,7 +22,7 @@ class Part:
 
     Attributes:
         kind: What it is; captions and charts stand on the page alone.
-        content: A text, texts, pairs of texts, a `Table`, a `PageChart`, or the panels of a map.
+        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, or the panels of a map.
         title: Above it; empty for none.
         is_folded: Whether it is folded away under its title. A chart is drawn when it is unfolded.
         is_open: Whether it is unfolded at first.

@@ -1,7 +1,6 @@
 """Charts of the report as plain specifications for plotly.js: lists, numbers and colours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,22 +22,10 @@ _GAP = 0.05
 """Share of the height between panels."""
 
 Spec = dict[str, Any]
+"""A chart, with its height in the layout [px], or a part of it."""
 
 
-@dataclass(frozen=True)
-class PageChart:
-    """A chart on a page.
-
-    Attributes:
-        spec: `data` and `layout` for plotly.js.
-        height: Height [px].
-    """
-
-    spec: Spec
-    height: int
-
-
-def page_chart(chart: Chart) -> PageChart:
+def page_chart(chart: Chart) -> Spec:
     """The panels of a chart one below the other, with a legend on top."""
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
@@ -70,7 +57,7 @@ def page_chart(chart: Chart) -> PageChart:
     is_small = len({curve.name for curve in curves if curve.name}) < 7
     layout["hovermode"] = "x unified" if is_small else "closest"
     layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
-    return PageChart({"data": data, "layout": layout}, round(130 + _PIXELS * total))
+    return {"data": data, "layout": {**layout, "height": round(130 + _PIXELS * total)}}
 
 
 def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:

@@ -10,12 +10,10 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import Cells, learning_chart, sweep_chart, time_chart
+from train.figures.chart import learning_chart, time_chart
 from train.figures.comparison_figures import (
-    by_option,
-    by_reference,
     cells_together,
-    swept_scenarios,
+    sweep_charts,
 )
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
@@ -178,24 +176,13 @@ def _add_curves(page: Page, results: Results) -> None:
 
 def _add_sweeps(page: Page, results: Results) -> None:
     """Scores over the swept option, or over what the references differ in."""
-    known = results.environment
-    charts: list[tuple[str, Cells]] = []
-    label = f"{known.quantity} [s]" if results.swept is None else results.swept
-    if results.swept is not None:
-        for own in cells_together(results.evaluations):
-            first = own[0].condition
-            title = f"{known.title(first.reference_name)}, {first.scenario}"
-            charts.append((title, by_option(own)))
-    else:
-        for scenario in swept_scenarios(results.evaluations):
-            own = [e for e in results.evaluations if e.condition.scenario == scenario]
-            charts.append((f"scenario {scenario}", by_reference(own)))
+    columns = results.environment.judged
+    charts = sweep_charts(results.evaluations, results.swept, columns, _cell_score)
     if charts:
         page.section("Sweeps", _text(results, "sweeps"))
-    for number, (title, cells) in enumerate(charts):
-        chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)
+    for number, chart in enumerate(charts.values()):
         is_open = number == 0
-        page.add("chart", page_chart(chart), capital(title), is_folded=True, is_open=is_open)
+        page.add("chart", page_chart(chart), chart.title, is_folded=True, is_open=is_open)
 
 
 def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:
