@@ -140,8 +140,9 @@ class Change(Scope):
     def _size(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "in one of the scenarios there is" if self.is_group else "there is"
-            return f"nothing to compare: {where} no episode in which both got to the end"
+            where = "in one of the scenarios " if self.is_group else ""
+            no = "there is no episode in which both reached the end"
+            return f"nothing to compare: {where}{no}"
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:
             size = "no change"
@@ -255,7 +256,8 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     own = table.of(scope.policy, *scope.cells)
     cells = table.cells_of_base(scope, base)
     beside = zip(cells, scope.cells, strict=True)
-    theirs = pd.concat(table.of(base, there).assign(cell=cell) for there, cell in beside)
+    parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
+    theirs = pd.concat(parts)
     both = pair(own, theirs, column.metric)
     means = per_seed(both, "mine")
     base_means = per_seed(both, "base")

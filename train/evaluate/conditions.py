@@ -1,6 +1,6 @@
 """Cells of a comparison: which policy plays which motion in which environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -154,6 +154,10 @@ class Condition(Model):
     """Seed of the first episode; the next ones follow [1]."""
 
     _checked = field_validator("env_options")(_options)
+
+    def swept_values(self, names: Iterable[str]) -> list[str]:
+        """Varied values as tables show them; - of what does not vary here."""
+        return [f"{self.swept[n]:g}" if n in self.swept else "-" for n in names]
 
     @property
     def environment(self) -> Environment:

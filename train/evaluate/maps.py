@@ -84,7 +84,8 @@ class MapConfig(Model):
     def _axes_differ(self) -> Self:
         what = self.x.what
         if what == self.y.what:
-            raise ValueError(f"x and y of a map must vary two things, both vary {what!r}")
+            problem = "x and y of a map must vary two things"
+            raise ValueError(f"{problem}, both vary {what!r}")
         return self
 
     @property
@@ -115,8 +116,8 @@ class MapConfig(Model):
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
-                    got = quote(value)
-                    raise ConfigurationError(f"values of map.{name} must be numbers, got {got}")
+                    problem = f"values of map.{name} must be numbers"
+                    raise ConfigurationError(f"{problem}, got {quote(value)}")
                 vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:

@@ -95,7 +95,8 @@ def standings(
     found = []
     for scope in scopes:
         parts = parts_of[scope.policy, scope.reference]
-        pooled = {c.scenario for part in parts if part.is_group for c in part.conditions}
+        groups_of = [part.conditions for part in parts if part.is_group]
+        pooled = {condition.scenario for condition in chain(*groups_of)}
         rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
@@ -125,18 +126,18 @@ def standings(
     return found
 
 
-def _paired(table: EpisodeTable, scope: Scope, to: str | None, column: Column) -> Paired | None:
+def _paired(table: EpisodeTable, scope: Scope, to: str, column: Column) -> Paired | None:
     """A policy against another one; None where that does not play the same cells."""
-    if to is None or len(table.cells_of_base(scope, to)) < len(scope.cells):
+    if len(table.cells_of_base(scope, to)) < len(scope.cells):
         return None
     row = change_of(table, scope, to, column)
     return Paired(to, row.relative, row.verdict)
 
 
-def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str | None:
-    """The best of some policies; None where none has a score."""
+def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str:
+    """The best of some policies; empty where none has a score."""
     scores = {}
     for scope in scopes:
         rows = table.of(scope.policy, *scope.cells)
         scores[scope.policy] = score(rows, column), failures(rows)
-    return best_of(scores)
+    return best_of(scores) or ""

@@ -163,7 +163,8 @@ def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]
     from scipy import stats
 
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    low, high = stats.bootstrap(samples, statistic, rng=rng, **_BOOTSTRAP).confidence_interval
+    found = stats.bootstrap(samples, statistic, rng=rng, **_BOOTSTRAP)
+    low, high = found.confidence_interval
     return float(low), float(high)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -113,13 +114,10 @@ class EpisodeTable:
             ]
         self.rows = pd.DataFrame(records)
         known = self.environment
-        columns = [*known.columns, *known.judged, *known.also]
-        columns += [column for split in known.splits.values() for column in split]
-        for metric in {column.metric for column in columns}:
-            values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
-            self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(
-                ~self.rows["failed"]
-            )
+        columns = chain(known.columns, known.judged, known.also, *known.splits.values())
+        metrics = list(dict.fromkeys(column.metric for column in columns))
+        figures = self.rows.reindex(columns=metrics).apply(pd.to_numeric)
+        self.rows[metrics] = figures.astype(np.float64).where(~self.rows["failed"])
 
     @cached_property
     def policies(self) -> list[str]:

@@ -122,7 +122,8 @@ def time_chart(
         curves = []
         for title, own in policies.items():
             times = time_s[::stride]
-            curves.append(_median_curve(title, colours[title], own, signal, times, stride))
+            curve = _median_curve(title, colours[title], own, signal, times, stride)
+            curves.append(curve)
         if signal.reference is not None:
             y = signal.scale * longest[signal.reference][::stride]
             look = (REFERENCE, time_s[::stride], y, "dash")

@@ -45,8 +45,9 @@ def draw_figures(
         swept: Title of the axis of swept options; None without a sweep.
     """
     known = evaluations[0].condition.environment
-    sweeps = sweep_charts(evaluations, swept, known.swept)
-    files = [draw_chart(chart, folder / f"sweep_{name}.png") for name, chart in sweeps.items()]
+    files = []
+    for name, chart in sweep_charts(evaluations, swept, known.swept).items():
+        files.append(draw_chart(chart, folder / f"sweep_{name}.png"))
     if swept is not None:
         return files
     files.insert(0, draw_overview(evaluations, known.swept[0], folder / "overview.png"))
@@ -147,7 +148,7 @@ def by_reference(evaluations: Evaluations) -> Cells:
     return _by_policy(numbered, lambda e: e.condition.number)
 
 
-def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], float | None]) -> Cells:
+def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
     policies = group_by(evaluations, lambda e: e.condition.policy.title)
     return {title: group_by(own, key) for title, own in policies.items()}
 

@@ -28,6 +28,9 @@ _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
 
 
+Ends = tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Square:
     """A cell of a panel.
@@ -147,7 +150,7 @@ def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Squ
     return Square(text, f"{small}{falls}".strip(), colour)
 
 
-def _score_square(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
+def _score_square(cell: MapCell, title: str, column: Column, ends: Ends) -> Square:
     falls = _falls(cell.failed.get(title, (0, 0))).strip()
     if title not in cell.levels or not cell.levels[title].is_known:
         return Square("-", falls, _EMPTY)

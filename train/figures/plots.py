@@ -183,7 +183,8 @@ def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
     if is_one_scenario and known.quantity:
         axes[-columns].set_xlabel(known.quantity)
     bar = axes[0].bar
-    handles = [bar(np.nan, 0.0, color=c, label=label_text(t)) for t, c in shades.items()]
+    names = {label_text(title): shade for title, shade in shades.items()}
+    handles = [bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
         handles.append(axes[0].scatter([], [], **cross))

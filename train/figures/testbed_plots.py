@@ -87,7 +87,8 @@ def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) 
         error = MRAD * static_errors(evaluation)
         shade = shades[policy]
         style = {"marker": "xosDv^"[index % 6], "linewidths": 1.3, "zorder": 3}
-        style |= {"facecolors": "none", "edgecolors": shade} if index else {"color": shade}
+        open_dots = {"facecolors": "none", "edgecolors": shade}
+        style |= open_dots if index else {"color": shade}
         low = error.min()
         high = error.max()
         label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"

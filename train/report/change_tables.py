@@ -7,34 +7,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from train.evaluate.changes import (
-    BEST_ANALYTIC,
-    CEILING,
-    HELD_OUT,
-    PARTLY,
-    SAME_ROBOT,
-    SIGNS_ARE,
-    Change,
-    by_line,
-    percent_interval,
-    signed_interval,
-)
+from train.evaluate import changes as terms
+from train.evaluate.changes import Change, by_line, percent_interval, signed_interval
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate
-from train.report.table_formats import (
-    Cell,
-    Head,
-    Part,
-    Row,
-    Table,
-    number_interval,
-    print_table,
-    swept_values,
-)
+from train.report.table_formats import Cell, Head, Part, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
-_SIGNS = {"°": HELD_OUT, "(°)": PARTLY, "†": CEILING, "‡": SAME_ROBOT}
+_SIGNS = {
+    **{"°": terms.HELD_OUT, "(°)": terms.PARTLY},
+    **{"†": terms.CEILING, "‡": terms.SAME_ROBOT},
+}
 """Marks by their signs, where there is little room."""
 
 
@@ -69,7 +53,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
         scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
         own = [*([] if is_one else [first.policy]), first.reference, scope]
         figures = [signed_interval(row.relative, row.verdict) for row in line]
-        cells = [*own, *swept_values(first.swept, swept), *figures]
+        cells = [*own, *first.first.swept_values(swept), *figures]
         kind = "group" if first.is_group else ""
         lines.append(Row((*cells, failed_and_base(first)), kind))
     signs = _signs([mark for row in rows for mark in row.marks])
@@ -79,7 +63,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
         keys=len(names),
         title=f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}",
         subjects=policies if is_one else (),
-        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), SIGNS_ARE]),
+        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), terms.SIGNS_ARE]),
     )
 
 
@@ -108,7 +92,7 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
         for row in (row for line in by_line(own) for row in line):
             failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
             cells: list[Cell] = [row.reference, _scope(row)]
-            cells += [*swept_values(row.swept, swept), row.column.title, _means(row)]
+            cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
             cells += [percent_interval(row.improvement, signed=False), (failed,)]
             cells += [row.sentence] if is_family else []
@@ -122,7 +106,7 @@ def _scope(row: Change) -> tuple[Part, ...]:
     if row.is_group:
         parts.append(Part("pooled", "pooled", before=" "))
     for mark in row.marks:
-        parts.append(Part(mark, "ceiling" if mark == CEILING else "badge", before=" "))
+        parts.append(Part(mark, "ceiling" if mark == terms.CEILING else "badge", before=" "))
     return tuple(parts)
 
 
@@ -147,7 +131,7 @@ def _opponent(rows: Sequence[Change]) -> str:
     """The policy that a table compares residuals with."""
     if not rows[0].is_rival:
         return "the base"
-    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({BEST_ANALYTIC})"
+    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({terms.BEST_ANALYTIC})"
 
 
 def _signs(marks: Sequence[str]) -> list[str]:
@@ -169,7 +153,7 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
 
 
 def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
-    of_residual = BEST_ANALYTIC if row.is_rival else "base of the residual"
+    of_residual = terms.BEST_ANALYTIC if row.is_rival else "base of the residual"
     return {
         "policy": row.policy,
         "base": row.base,

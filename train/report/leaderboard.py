@@ -59,7 +59,8 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
             rows.append(Row((str(track),), kind="heading"))
         places = {(s.policy, s.scope, s.reference, s.metric): s for s in own}
         best = {}
-        for key, some in group_by(own, lambda s: (s.scope, s.reference, s.metric)).items():
+        entries = group_by(own, lambda s: (s.scope, s.reference, s.metric))
+        for key, some in entries.items():
             scores = {s.policy: (s.score, (s.failed, s.episodes)) for s in some}
             best[key] = best_of(scores)
         first = (*columns[0], metrics[0])

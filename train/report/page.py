@@ -11,7 +11,8 @@ from train.figures.map_plots import Panel, panel_rows
 from train.report.table_formats import Table, load_template, to_markdown
 from train.runs.escaping import markdown_text
 
-TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
+_FILE = Path(__file__).with_name("texts.toml")
+TEXTS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 """Paragraphs by section or table."""
 Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]
 

@@ -263,7 +263,8 @@ def claims(results: Results) -> list[str]:
     Scopes are the groups; without groups the scenarios, where there are few.
     """
     rivals = [row for row in results.judged if row.is_rival]
-    bases = {(r.policy, r.place, r.column): r for r in results.judged[::-1] if not r.is_rival}
+    others = [row for row in results.judged if not row.is_rival]
+    bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
     shown = [row for row in rivals if row.is_group]
     if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
         shown = rivals

@@ -13,14 +13,7 @@ from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
 from train.figures.chart import spread
-from train.report.table_formats import (
-    Head,
-    Row,
-    Table,
-    number_interval,
-    print_table,
-    swept_values,
-)
+from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
 
@@ -32,8 +25,8 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
             for policy in table.policies:
                 for cell in table.cells_of(policy, reference, scenario):
                     own = table.of(policy, cell)
-                    swept = table.conditions[policy, cell].swept
-                    values = swept_values(swept, table.swept)
+                    condition = table.conditions[policy, cell]
+                    values = condition.swept_values(table.swept)
                     figures = [number_interval(score(own, c), c) for c in columns]
                     rows.append([reference, scenario, policy, *values, *figures])
     labels = [column.label for column in columns]

@@ -15,15 +15,7 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.report.page import bullets
 from train.report.report_text import capital
-from train.report.table_formats import (
-    Head,
-    Row,
-    Table,
-    column_notes,
-    print_table,
-    swept_values,
-    to_markdown,
-)
+from train.report.table_formats import Head, Row, Table, column_notes, print_table, to_markdown
 from train.runs.escaping import write_records
 
 
@@ -61,7 +53,7 @@ def summary_table(
     for e in evaluations:
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
-        values = swept_values(condition.swept, swept)
+        values = condition.swept_values(swept)
         figures = [_median(e, column, worst) for column in columns]
         failed = f"{e.num_failed}/{len(e.episodes)}"
         rows.append(Row((*names, *values, *figures, failed)))

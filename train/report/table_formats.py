@@ -4,10 +4,10 @@ Texts of a table are plain. Each of these escapes them, see `train.runs.escaping
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from rich import box
 from rich.cells import cell_len
@@ -133,7 +133,7 @@ class Table:
     kind: str = ""
 
     @classmethod
-    def plain(cls, head: Texts, rows: Iterable[Texts], words: int = 1, **more: Any) -> "Table":
+    def plain(cls, head: Texts, rows: Iterable[Texts], words: int = 1, **more: Any) -> Self:
         """A table of texts whose first columns hold words and the others figures."""
         heads = tuple(Head(text, is_number=n >= words) for n, text in enumerate(head))
         return cls(heads, tuple(Row(tuple(row)) for row in rows), keys=words, **more)
@@ -323,11 +323,6 @@ def load_template(name: str = "page.html.j2") -> "Template":
     environment.filters.update(script_json=script_json)
     environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)
     return environment.get_template(name)
-
-
-def swept_values(swept: Mapping[str, float], names: Iterable[str]) -> list[str]:
-    """Values of what a sweep or a map varies; - of what is not varied."""
-    return [f"{swept[name]:g}" if name in swept else "-" for name in names]
 
 
 def number_interval(estimate: Estimate, column: Column) -> str:

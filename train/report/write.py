@@ -11,10 +11,7 @@ from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
 from train.figures.chart import learning_chart, time_chart
-from train.figures.comparison_figures import (
-    cells_together,
-    sweep_charts,
-)
+from train.figures.comparison_figures import cells_together, sweep_charts
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
@@ -181,8 +178,8 @@ def _add_sweeps(page: Page, results: Results) -> None:
     if charts:
         page.section("Sweeps", _text(results, "sweeps"))
     for number, chart in enumerate(charts.values()):
-        is_open = number == 0
-        page.add("chart", page_chart(chart), chart.title, is_folded=True, is_open=is_open)
+        folding = {"is_folded": True, "is_open": number == 0}
+        page.add("chart", page_chart(chart), chart.title, **folding)
 
 
 def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:
