@@ -141,7 +141,7 @@ class Change(Scope):
         value = self.relative.value
         if not np.isfinite(value):
             where = "in one of the scenarios " if self.is_group else ""
-            no = "there is no episode in which both reached the end"
+            no = "there is no episode in which both stayed up to the end"
             return f"nothing to compare: {where}{no}"
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from pydantic import ImportString, TypeAdapter
+from pydantic import ConfigDict, ImportString, TypeAdapter
 
 from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
@@ -32,6 +32,8 @@ comparison.
 RESERVED = ("scenario", *UNPLACED)
 """These, and the argument that has a key of its own."""
 
+_STRICT = ConfigDict(extra="forbid")
+"""A name in `environments.toml` that nobody knows is a mistake."""
 _UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
 
 
@@ -47,6 +49,7 @@ class Column:
         note: What the title leaves open, for the legend; empty where it says it all.
     """
 
+    __pydantic_config__ = _STRICT
     title: str
     metric: str
     on_console: bool = True
@@ -85,6 +88,7 @@ class TracedSignal:
         picture: Name of the picture that shows it; empty where it stands on the page alone.
     """
 
+    __pydantic_config__ = _STRICT
     title: str
     name: str
     unit: str
@@ -137,6 +141,7 @@ class Environment:
         walks: Whether its policies are those of the walker.
     """
 
+    __pydantic_config__ = _STRICT
     id: str
     robot: str
     motion: str

@@ -155,9 +155,8 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
         raise _not_a_policy(spec, str(error)) from error
     attribute = spec.name.rpartition(":")[2]
     if not callable(function):
-        raise _not_a_policy(
-            spec, f"{attribute} is no function but of type {type(function).__name__}"
-        )
+        kind = type(function).__name__
+        raise _not_a_policy(spec, f"{attribute} is no function but of type {kind}")
     try:
         return function(env, **options)
     except ElasticError:

@@ -113,26 +113,29 @@ def time_chart(
         colours: Of the policies.
         most_points: Points of a curve, about; None for all.
     """
-    traces = [e.trace for own in policies.values() for e in own]
-    longest = max(traces, key=lambda trace: len(trace["time_s"]))
+    every = list(chain(*policies.values()))
+    longest = _longest(every)
     time_s = longest["time_s"]
     stride = 1 if most_points is None else max(1, -(-len(time_s) // most_points))
     panels = []
     for signal in signals:
-        curves = []
-        for title, own in policies.items():
-            times = time_s[::stride]
-            curve = _median_curve(title, colours[title], own, signal, times, stride)
-            curves.append(curve)
+        curves = [
+            _median_curve(title, colours[title], own, signal, stride)
+            for title, own in policies.items()
+        ]
         if signal.reference is not None:
             y = signal.scale * longest[signal.reference][::stride]
             look = (REFERENCE, time_s[::stride], y, "dash")
             curves.append(Curve("reference", *look, width=1.1))
-        limits = _limits([e for own in policies.values() for e in own], signal)
-        panels.append(Panel(signal.label, curves, limits))
+        panels.append(Panel(signal.label, curves, _limits(every, signal)))
     single = longest.get("single_support", np.zeros(len(time_s)))
-    shaded = intervals(single, time_s)
-    return Chart("", "time [s]", panels, shaded=shaded)
+    return Chart("", "time [s]", panels, shaded=intervals(single, time_s))
+
+
+def _longest(evaluations: Sequence[Evaluation]) -> Mapping[str, Array]:
+    """The longest trace."""
+    traces = [e.trace for e in evaluations]
+    return max(traces, key=lambda trace: len(trace["time_s"]))
 
 
 def _median_curve(
@@ -140,18 +143,17 @@ def _median_curve(
     colour: str,
     own: Sequence[Evaluation],
     signal: TracedSignal,
-    times: Array,
     stride: int,
 ) -> Curve:
-    length = max(len(e.trace["time_s"]) for e in own)
-    values = np.full((len(own), length), np.nan)
+    time_s = _longest(own)["time_s"]
+    values = np.full((len(own), len(time_s)), np.nan)
     for row, e in zip(values, own, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
     low, middle, high = spread(values[:, ::stride])
     return Curve(
         title,
         colour,
-        times[: len(middle)],
+        time_s[::stride],
         middle,
         dash=dash_of(title),
         band=(low, high) if len(own) > 1 else None,

@@ -75,13 +75,10 @@ class Results:
     @cached_property
     def learning(self) -> dict[str, Curves]:
         """Learning curves of the families whose folders lie in a training run."""
-        columns = self.environment.judged
-        found = {}
-        for title, origin in self.table.families.items():
-            curves = learning_curves(origin.folders, columns)
-            if curves is not None:
-                found[title] = curves
-        return found
+        families = self.table.families.items()
+        judged = self.environment.judged
+        found = [(title, learning_curves(own.folders, judged)) for title, own in families]
+        return {title: curves for title, curves in found if curves is not None}
 
     @cached_property
     def metadata(self) -> Mapping[str, Any]:
