@@ -169,11 +169,15 @@ class Table:
         return found
 
 
+def parts_of(cell: Cell) -> tuple[Part, ...]:
+    """A cell as parts."""
+    return (Part(cell),) if isinstance(cell, str) else cell
+
+
 def plain_text(cell: Cell) -> str:
     """The text of a cell without looks; what is small is left out."""
-    if isinstance(cell, str):
-        return cell
-    return "".join(part.before + part.text for part in cell if part.style != "small")
+    shown = [part for part in parts_of(cell) if part.style != "small"]
+    return "".join(part.before + part.text for part in shown)
 
 
 def print_table(table: Table, console: Console, file: str) -> None:
@@ -265,10 +269,8 @@ def column_notes(columns: Iterable[Head | Column]) -> list[str]:
 
 
 def _terminal_cell(cell: Cell) -> Text:
-    if isinstance(cell, str):
-        return Text(cell)
     text = Text()
-    for part in cell:
+    for part in parts_of(cell):
         if part.style != "small":
             text.append(part.before)
             text.append(part.text, "bold" if part.style == "bold" else None)
@@ -288,10 +290,8 @@ def to_markdown(table: Table) -> str:
 
 
 def _markdown_cell(cell: Cell) -> str:
-    if isinstance(cell, str):
-        return markdown_text(cell)
     text = ""
-    for part in cell:
+    for part in parts_of(cell):
         look = _MARKDOWN.get(part.style, "{}")
         text += part.before + look.format(markdown_text(part.text))
     return text
