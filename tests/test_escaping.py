@@ -22,9 +22,8 @@ from rich.table import Table
 from rich.text import Text
 
 from train.figures import plots
-from train.figures.chart import Chart, Curve, Failing, Panel
+from train.figures.chart import Chart, Curve, Panel
 from train.report.page import Page
-from train.report.specs import PageChart
 from train.report.table_formats import Table as ReportTable
 from train.report.table_formats import to_markdown
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
@@ -278,8 +277,9 @@ def test_a_picture_shows_a_label_as_it_is(label: str, fails: bool, tmp_path: Pat
     traceback, and one that it leaves out of the legend."""
     x = np.linspace(0.0, 1.0, 3)
     curves = [Curve(label, "#123456", x, x, fails=fails), Curve("", "#123456", x, -x)]
-    failing = [Failing(label, "#123456", [0.5], [True])] if fails else []
-    chart = Chart(label, label, [Panel(label, curves)], failing=failing, failure=label)
+    crosses = [Curve("", "#123456", x, 0.0 * x, crosses=[True] * len(x))]
+    failing = [Panel(label, crosses, rows=[label])] if fails else []
+    chart = Chart(label, label, [*failing, Panel(label, curves)])
     plt = plots.require_matplotlib()
     figure, axis = plt.subplots()
     axis.plot(x, x, label=plots.label_text(label))
@@ -301,7 +301,7 @@ def page_of(text: str) -> str:
     page.add("bullets", [text], text)
     page.add("definitions", [(text, text)])
     page.add("table", ReportTable.plain([text], [[text]], subjects=(text,)))
-    page.add("chart", PageChart({"name": text}, height=100))
+    page.add("chart", {"name": text, "layout": {"height": 100}})
     return page.html(plotly_js="0")
 
 
@@ -314,7 +314,7 @@ def test_a_page_shows_a_label_as_it_is(label: str) -> None:
     plain.feed(page_of("plain"))
     assert page.tags == plain.tags
     assert html.unescape(page_of(label)).count(f">{label}<") == 14
-    assert json.loads(page.scripts[1]) == {"name": label}
+    assert json.loads(page.scripts[1])["name"] == label
 
 
 def test_a_table_is_escaped_in_every_format(tmp_path: Path) -> None:

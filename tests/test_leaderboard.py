@@ -88,9 +88,7 @@ _ROWS: list[Standing] = []
 
 def _rows() -> list[Standing]:
     found = played()
-    return standings(
-        found, changes(found, GROUPS), GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2}
-    )
+    return standings(found, GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2})
 
 
 def row(policy: str, scope: str, reference: str = "3 s") -> Standing:
@@ -176,7 +174,7 @@ def test_columns_are_whole_groups_and_what_is_in_none() -> None:
     assert single is not None
     assert titles(single) == ["soft, 3 s", "ideal, 3 s", "slope, 3 s"]
     found = [e for e in played() if e.condition.reference == 3]
-    without = standings(found, changes(found), {}, {})
+    without = standings(found, {}, {})
     assert titles(board(without)) == titles(single)
     assert scenarios_board(without) is None
 

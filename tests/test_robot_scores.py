@@ -78,7 +78,7 @@ def test_a_robot_that_falls_is_worse_off_than_any_other() -> None:
     base = episode_rows(records([2.0, 2.0, None, None, 2.0]))
     assert share_better(mine, base, METRIC) == pytest.approx((1.0 + 0.0 + 1.0 + 0.5 + 0.5) / 5.0)
     assert share_better(base, mine, METRIC) == pytest.approx(1.0 - share_better(mine, base, METRIC))
-    assert share_better(mine[::-1], base, METRIC) == share_better(mine, base, METRIC)
+    assert share_better(mine[::-1], base, METRIC).item() == share_better(mine, base, METRIC)
     assert np.isnan(share_better(mine, episode_rows(records([1.0], first=50)), METRIC))
     without = [{**record, METRIC: float("nan")} for record in records([1.0])]
     assert (
@@ -100,7 +100,7 @@ def test_rows_are_of_cells_that_draw_robots_against_base_and_first() -> None:
     base = cell("base", {"all": [4.0, 4.0, 4.0, 4.0, 8.0, None]}, "spread")
     learned = family([[1.0, 5.0, 3.0, 3.0, 9.0, 1.0], [1.0, 1.0, 1.0, 1.0, 1.0, None]], "spread")
     rows = robot_scores([base, cell("base", {"all": [1.0] * 6}, "nominal"), *learned])
-    assert {row.scenario for row in rows} == {"spread"}
+    assert {row.scope for row in rows} == {"spread"}
     ours, theirs = (
         next(r for r in rows if r.policy == p and r.column.metric == METRIC)
         for p in ("learned", "base")

@@ -40,11 +40,10 @@ from train.figures.colours import policy_colours
 from train.figures.comparison_figures import (
     by_option,
     by_reference,
-    draw_pelvis,
-    draw_sweep,
-    draw_zmp,
+    draw_signals,
     figure_name,
 )
+from train.figures.plots import draw_chart
 from train.learn.train_config import TrainConfig
 from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
@@ -72,7 +71,9 @@ def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Conditio
 def made_up(condition: Condition, *episodes: tuple[str, float]) -> Evaluation:
     """An evaluation whose metrics all have one value, with the termination of every episode."""
     names = [column.metric for column in condition.environment.columns]
-    names += [column.metric for _, columns in condition.environment.splits for column in columns]
+    names += [
+        column.metric for columns in condition.environment.splits.values() for column in columns
+    ]
     return Evaluation(
         condition, [{"termination": end, **dict.fromkeys(names, value)} for end, value in episodes]
     )
@@ -391,8 +392,10 @@ def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
     upright = evaluate(
         walk("input_output", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1
     )
-    for draw in (draw_pelvis, draw_zmp):
-        with Image.open(draw([fallen, upright], Path(f"{draw.__name__}.png"))) as image:
+    files = draw_signals([fallen, upright], Path())
+    assert [file.name.partition("_")[0] for file in files] == ["pelvis", "zmp"]
+    for file in files:
+        with Image.open(file) as image:
             pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
         for colour in (
             (0x9C, 0x66, 0x44),
@@ -460,17 +463,17 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
     played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
     points = by_option(played)
-    chart = sweep_chart(points, [cells[0].environment.overview], "", policy_colours(list(points)))
-    input_curve, level = chart.panels[0].curves
+    chart = sweep_chart(points, [cells[0].environment.swept[0]], "", policy_colours(list(points)))
+    failing_panel, panel = chart.panels
+    input_curve, level = panel.curves
     np.testing.assert_array_equal(input_curve.x, [0.5, 1.0, 2.0])
     np.testing.assert_allclose(input_curve.y, [np.nan, 10.0, 30.0])
     np.testing.assert_allclose(level.y, [2.0, 2.0])
     assert (input_curve.dash, level.dash) == ("solid", "dot")
-    (failing,) = chart.failing
-    assert (failing.x, failing.is_all) == ([0.5, 1.0], [True, False])
-    with Image.open(
-        draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))
-    ) as image:
+    (failing,) = failing_panel.curves
+    assert (failing.x.tolist(), failing.crosses) == ([0.5, 1.0], [True, False])
+    assert failing_panel.rows == ["input"]
+    with Image.open(draw_chart(chart, Path("s.png"))) as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
 
@@ -480,7 +483,7 @@ def test_references_are_swept_by_their_step_period() -> None:
     points = by_reference(
         [made_up(walk(reference=reference), ("", 0.01)) for reference in references]
     )
-    chart = sweep_chart(points, [walk().environment.overview], "", policy_colours(list(points)))
+    chart = sweep_chart(points, [walk().environment.swept[0]], "", policy_colours(list(points)))
     (curve,) = chart.panels[0].curves
     np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
 
@@ -549,14 +552,13 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     """Catches files that are lost or not named, and figures with policies that they should not
     show."""
     drawn: list[list[str]] = []
-    for name in ("pelvis", "zmp"):
-        draw = train.figures.comparison_figures._FIGURES[name]
+    draw = train.figures.comparison_figures.draw_picture
 
-        def record(evaluations: Sequence[Evaluation], path: Path, draw: Any = draw) -> Path:
-            drawn.append([e.condition.policy.title for e in evaluations])
-            return draw(evaluations, path)
+    def record(name: str, signals: Any, evaluations: Sequence[Evaluation], path: Path) -> Path:
+        drawn.append([e.condition.policy.title for e in evaluations])
+        return draw(name, signals, evaluations, path)
 
-        monkeypatch.setitem(train.figures.comparison_figures._FIGURES, name, record)
+    monkeypatch.setattr(train.figures.comparison_figures, "draw_picture", record)
     content = {
         "name": "walks",
         "env": "walker",

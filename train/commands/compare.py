@@ -308,7 +308,7 @@ def compare(
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")
-            board = standings(evaluations, rows, config.groups, step_times(conditions))
+            board = standings(evaluations, config.groups, step_times(conditions))
         if robots:
             files.append(write_robots(robots, folder / "robots.csv"))
         files.append(write_summary(cells, folder / "summary.md"))

@@ -16,7 +16,7 @@ from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.rollout import make_vector_env
 from train.figures import plots
-from train.figures.comparison_figures import cells_together, draw_figure, draw_time_series
+from train.figures.comparison_figures import cells_together, draw_picture, draw_signals
 from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.console import make_table, print_files
@@ -92,14 +92,14 @@ class Demo(Model):
             assert points is not None
             result = identification.identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
+            known = static[0].condition.environment
             files = [
                 draw_identification(result, points, [model], folder / "fig5_identification.png"),
                 draw_static_errors(static, model, folder / "fig6_static_errors.png"),
-                draw_time_series(motion, folder / "sine.png"),
+                draw_picture("time", known.curves, motion, folder / "sine.png"),
             ]
-            for name in ("pelvis", "zmp"):
-                for walk in cells_together(walks):
-                    files += draw_figure(name, walk, folder)
+            for walk in cells_together(walks):
+                files += draw_signals(walk, folder)
             files += [
                 folder / "identification.json",
                 write_episodes(scored, folder / "episodes.csv"),

@@ -4,7 +4,7 @@ A residual is compared with its base and with the best policy without learning. 
 compared with the base of the residuals, or without residuals with the first policy.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,9 +23,8 @@ from train.evaluate.statistics import (
     improvement,
     interquartile_mean,
     over_seeds,
-    wins,
 )
-from train.evaluate.table import EpisodeTable, failures
+from train.evaluate.table import EpisodeTable, Groups, Scope, failures, pair, per_seed
 
 CEILING = "ceiling on the training condition"
 SAME_ROBOT = "trained robot"
@@ -54,20 +53,14 @@ _LEAST = 0.005
 """Below it a bound would look like zero without one."""
 
 Verdict = Literal["lower", "higher", "none", "unclear"]
-Groups = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class Change(Scope):
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
     Attributes:
-        policy, base: Titles.
-        is_family: Whether the policy is a residual, so that it has training seeds.
-        reference: Label of the motion.
-        scope: Scenario, or name of the group.
-        is_group: Whether it is a group.
-        swept: Options that a sweep varies, and their values.
+        base: Title of the base.
         marks: What the reader has to know of the row: a ceiling, something held out.
         column: The metric.
         is_judged: Whether policies are judged by it; else it stands in tables alone.
@@ -80,18 +73,11 @@ class Change:
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
-        failure: What failing is called, in the plural.
         is_rival: Whether `base` is not the base of the residual but the best policy without
             learning.
     """
 
-    policy: str
     base: str
-    is_family: bool
-    reference: str
-    scope: str
-    is_group: bool
-    swept: dict[str, float]
     marks: tuple[str, ...]
     column: Column
     is_judged: bool
@@ -105,13 +91,7 @@ class Change:
     episodes: int
     base_falls: int
     base_episodes: int
-    failure: str
     is_rival: bool = False
-
-    @property
-    def line(self) -> tuple[object, ...]:
-        """Key of the rows that have policy, base and cell in common."""
-        return (self.policy, self.base, self.reference, self.scope, *self.swept.items())
 
     @property
     def num_seeds(self) -> int:
@@ -160,10 +140,9 @@ class Change:
     def _size(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "in no episode did both stay"
-            if self.is_group:
-                where = "in one of the scenarios there is no episode in which both stayed"
-            return f"nothing to compare: {where} up to the end"
+            where = "in one of the scenarios " if self.is_group else ""
+            no = "there is no episode in which both stayed up to the end"
+            return f"nothing to compare: {where}{no}"
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:
             size = "no change"
@@ -195,7 +174,8 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     if not estimate.has_interval:
         return percent(estimate.value, signed)
     shares = (estimate.value, *estimate.ends)
-    is_fine = 0.0 < max(map(abs, shares)) < _SMALL or any(0.0 < abs(s) < _LEAST for s in shares)
+    sizes = [abs(share) for share in shares]
+    is_fine = 0.0 < max(sizes) < _SMALL or any(0.0 < size < _LEAST for size in sizes)
     value, low, high = (_hundredths(share, signed, is_fine) for share in shares)
     return f"{value} % [{low}, {high}]"
 
@@ -230,13 +210,14 @@ def opponents(table: EpisodeTable) -> dict[str, list[str]]:
     policy.
     """
     found = {}
-    bases = dict.fromkeys(m.base for own in table.members.values() for m in own.values())
+    families = table.members.values()
+    bases = dict.fromkeys(member.base for own in families for member in own.values())
     for title in table.policies:
+        others: Iterable[str | None] = bases or table.policies[:1]
         if title in table.members:
             member = next(reversed(table.members[title].values()))
-            found[title] = [other for other in (member.base, member.rival) if other is not None]
-        else:
-            found[title] = [base for base in bases or table.policies[:1] if base != title]
+            others = (member.base, member.rival)
+        found[title] = [other for other in others if other not in (title, None)]
     return found
 
 
@@ -247,163 +228,62 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
         evaluations: All cells, one per training seed.
         groups: Scenarios to pool over, by name.
     """
-    pairings = Pairings(EpisodeTable(evaluations))
+    table = EpisodeTable(evaluations)
+    known = table.environment
     return [
-        row
-        for title, others in opponents(pairings.table).items()
+        change_of(table, scope, base, column)
+        for title, others in opponents(table).items()
         for base in others
-        if base in pairings.table.policies
-        for row in _against(pairings, title, base, groups or {})
+        if base in table.policies
+        for scope in table.scopes(title, groups or {})
+        if len(table.cells_of_base(scope, base)) == len(scope.cells)
+        for column in (*known.judged, *known.also)
     ]
 
 
-class Pairings:
-    """Policies of a table beside one another on the same episodes, each pair made once.
+def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> Change:
+    """The change of a policy against another one in one metric.
 
     Args:
         table: All episodes.
-    """
-
-    def __init__(self, table: EpisodeTable) -> None:
-        self.table = table
-        self._pairs: dict[tuple[str, str, int, str], Array] = {}
-
-    def cells(self, policy: str, base: str) -> dict[int, int]:
-        """Number of the base's cell, by that of the policy's.
-
-        A base that is not swept has one cell for all values, its level.
-        """
-        found = {}
-        for own in self.table.cells_of(policy):
-            condition = self.table.conditions[policy, own]
-            for place in (condition.cell[:2], condition.cell):
-                number = self.table.cells.get(place, -1)
-                if (base, number) in self.table.conditions:
-                    found[own] = number
-        return found
-
-    def change(
-        self,
-        policy: str,
-        base: str,
-        column: Column,
-        cells: Sequence[int],
-        scope: str,
-        is_group: bool = False,
-        marks: tuple[str, ...] = (),
-    ) -> Change:
-        """The change of one metric, over one cell or pooled over several.
-
-        Args:
-            policy: Title of the policy.
-            base: Title of the other one.
-            column: The metric.
-            cells: Numbers of the policy's cells.
-            scope: Scenario, or name of the group.
-            is_group: Whether it is a group.
-            marks: See `Change`.
-
-        Raises:
-            ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
-        """
-        table = self.table
-        base_cells = self.cells(policy, base)
-        figures = np.stack([self._figures(policy, base, cell, column.metric) for cell in cells])
-        mine, theirs, played, won = map(np.ascontiguousarray, figures.transpose(1, 2, 0))
-        relative = change(mine, theirs)
-        condition = table.conditions[policy, cells[0]]
-        falls, episodes = failures(table.of(policy, *cells))
-        base_falls, base_episodes = failures(table.of(base, *(base_cells[cell] for cell in cells)))
-        return Change(
-            policy=policy,
-            base=base,
-            is_family=condition.member is not None,
-            reference=condition.reference_name,
-            scope=scope,
-            is_group=is_group,
-            swept=condition.swept,
-            marks=marks,
-            column=column,
-            is_judged=column in table.environment.judged,
-            per_seed=relative,
-            relative=over_seeds(relative),
-            improvement=improvement(won, played),
-            mine=_mean(mine),
-            theirs=_mean(theirs),
-            num_pairs=int(played.sum()),
-            falls=falls,
-            episodes=episodes,
-            base_falls=base_falls,
-            base_episodes=base_episodes,
-            failure=table.environment.failures,
-            is_rival=condition.member is not None and base == condition.member.rival,
-        )
-
-    def _figures(self, policy: str, base: str, cell: int, metric: str) -> Array:
-        """Figures of a cell: means of policy and base, number of pairs, number won, (4, seeds)."""
-        key = (policy, base, cell, metric)
-        if key not in self._pairs:
-            mine = self.table.of(policy, cell)
-            theirs = self.table.of(base, self.cells(policy, base)[cell])
-            both = pair(mine, theirs, metric)
-            figures = []
-            for member in mine["member"].unique():
-                own = both[both["member"] == member]
-                x = np.asarray(own["mine"])
-                y = np.asarray(own["base"])
-                means = (x.mean(), y.mean()) if len(own) else (np.nan, np.nan)
-                figures.append((*means, len(own), wins(x, y)))
-            self._pairs[key] = np.array(figures).T
-        return self._pairs[key]
-
-
-def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Episodes of two policies with equal seeds, in which neither failed.
-
-    Args:
-        mine: Rows of a policy, with `member`, `seed`, `failed` and the metric.
-        base: Rows of the base, with a row per seed.
-        metric: Name of the metric.
+        scope: Policy and cells; over several the means are pooled.
+        base: Title of the other policy, which plays in all of these cells.
+        column: The metric.
 
     Raises:
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
-    for rows in (mine, base):
-        if len(set(zip(rows["member"], rows["seed"], strict=True))) < len(rows):
-            raise ValueError(
-                f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
-            )
-    own = mine.sort_values("seed", kind="stable")[["member", "seed", metric]]
-    both = own.merge(base[["seed", metric]], on="seed", suffixes=("", "_base")).dropna()
-    return both.rename(columns={metric: "mine", f"{metric}_base": "base"})
-
-
-def _against(pairings: Pairings, policy: str, base: str, groups: Groups) -> list[Change]:
-    """Rows of a policy and a base: every cell, and every group behind the last of its scenarios."""
-    table = pairings.table
-    cells = list(pairings.cells(policy, base))
-    conditions = {cell: table.conditions[policy, cell] for cell in cells}
-    rows = []
-
-    def add(scope: str, own: Sequence[int], is_group: bool) -> None:
-        marks = _marks(table.families.get(policy), [conditions[cell] for cell in own])
-        for column in (*table.environment.judged, *table.environment.also):
-            rows.append(pairings.change(policy, base, column, own, scope, is_group, marks))
-
-    blocks = group_by(cells, lambda cell: _apart_from_scenario(conditions[cell]))
-    for cell in cells:
-        add(conditions[cell].scenario, [cell], is_group=False)
-        block = blocks[_apart_from_scenario(conditions[cell])]
-        own = {conditions[each].scenario: each for each in block}
-        if cell == block[-1]:
-            for name, scenarios in groups.items():
-                if all(scenario in own for scenario in scenarios):
-                    add(name, [own[scenario] for scenario in scenarios], is_group=True)
-    return rows
-
-
-def _apart_from_scenario(condition: Condition) -> tuple[object, ...]:
-    return (condition.reference_name, *condition.swept.items())
+    own = table.of(scope.policy, *scope.cells)
+    cells = table.cells_of_base(scope, base)
+    beside = zip(cells, scope.cells, strict=True)
+    parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
+    theirs = pd.concat(parts)
+    both = pair(own, theirs, column.metric)
+    means = per_seed(both, "mine")
+    base_means = per_seed(both, "base")
+    played = np.nan_to_num(per_seed(both, "won", len))
+    relative = change(means, base_means)
+    falls, episodes = failures(own)
+    base_falls, base_episodes = failures(theirs)
+    member = scope.first.member
+    return Change(
+        **vars(scope),
+        base=base,
+        marks=_marks(table.families.get(scope.policy), scope.conditions),
+        column=column,
+        is_judged=column in table.environment.judged,
+        per_seed=relative,
+        relative=over_seeds(relative),
+        improvement=improvement(np.nan_to_num(per_seed(both, "won", np.sum)), played),
+        mine=_mean(means),
+        theirs=_mean(base_means),
+        num_pairs=int(played.sum()),
+        falls=falls,
+        episodes=episodes,
+        base_falls=base_falls,
+        base_episodes=base_episodes,
+        is_rival=member is not None and base == member.rival,
+    )
 
 
 def _mean(values: Array) -> float:
@@ -438,7 +318,7 @@ def _marks(trained: Origin | None, conditions: Sequence[Condition]) -> tuple[str
         return ()
     if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
         return (CEILING,)
-    same = [scenario for scenario in scenarios if known.differs_by_noise_alone(scenario, motion)]
+    same = [s for s in scenarios if known.differs_by_noise_alone(s, motion)]
     named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
     return (f"{SAME_ROBOT}{named}",) if same else ()
 
@@ -466,5 +346,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = group_by(rows, lambda row: row.line)
+    lines = group_by(rows, lambda row: (row.policy, row.base, row.place))
     return list(lines.values())

@@ -1,6 +1,6 @@
 """Cells of a comparison: which policy plays which motion in which environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -35,7 +35,8 @@ def _options(value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reference(value: Any) -> Reference:
-    if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
+    kinds = str | int | float | list | tuple | dict
+    if isinstance(value, bool) or not isinstance(value, kinds):
         raise ValueError(
             "a reference is a name, a step period [s], three durations [s] or a mapping of"
             f" parameters, got {quote(value)}"
@@ -78,7 +79,8 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     Raises:
         ConfigurationError: There are ranges, and no scenario draws robots from one set of them.
     """
-    if ranges and not any(len(make_scenario(scenario).ranges) == 1 for scenario in scenarios):
+    sets = [len(make_scenario(scenario).ranges) for scenario in scenarios]
+    if ranges and 1 not in sets:
         raise ConfigurationError(
             "ranges need a scenario whose robots are drawn from them, such as 'drawn', got"
             f" {quote(list(scenarios))}"
@@ -153,6 +155,10 @@ class Condition(Model):
 
     _checked = field_validator("env_options")(_options)
 
+    def swept_values(self, names: Iterable[str]) -> list[str]:
+        """Varied values as tables show them; - of what does not vary here."""
+        return [f"{self.swept[n]:g}" if n in self.swept else "-" for n in names]
+
     @property
     def environment(self) -> Environment:
         """The environment, as the commands know it."""
@@ -184,23 +190,27 @@ class Condition(Model):
         found = {"scenario": self.scenario_played, **options}
         given = found.get("sensors", [])
         needed = sensors_needed(self.policy.name)
-        if needed and isinstance(given, list | tuple):  # else the environment says what they are
-            found["sensors"] = [*given, *(name for name in needed if name not in given)]
+        # else the environment says what they are
+        if needed and isinstance(given, list | tuple):
+            found["sensors"] = list(dict.fromkeys([*given, *needed]))
         return found
 
     @property
     def scenario_played(self) -> str | Scenario:
         """The scenario with its own ranges and varied fields; its name where it has neither."""
-        fields = {name: self.swept[name] for name in self.swept if name.startswith(SCENARIO)}
+        swept = self.swept.items()
+        fields = {name: v for name, v in swept if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
-        return vary_scenario(make_scenario(self.scenario).with_ranges(self.ranges), fields)
+        scenario = make_scenario(self.scenario).with_ranges(self.ranges)
+        return vary_scenario(scenario, fields)
 
     @property
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy with the swept one."""
-        names = [name for name in self.swept if not name.startswith(SCENARIO)]
-        return {**self.policy.options, **{name: self.swept[name] for name in names}}
+        swept = self.swept.items()
+        own = {name: v for name, v in swept if not name.startswith(SCENARIO)}
+        return {**self.policy.options, **own}
 
     @property
     def track(self) -> Track:

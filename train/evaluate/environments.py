@@ -1,15 +1,17 @@
 """The environments as the commands know them: their arguments, figures and tables."""
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeAlias
+
+from pydantic import ConfigDict, ImportString, TypeAdapter
 
 from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.motion.arm_references import make_arm_reference
 from elastic_env.motion.gait import Gait
-from elastic_env.motion.references import make_reference
 from elastic_env.robots.joint_robot import JointRobot
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.robot_file import ENDINGS, read_robot_file
@@ -21,15 +23,8 @@ which of them it takes.
 """
 
 UNPLACED = (
-    "num_envs",
-    "num_threads",
-    "autoreset_mode",
-    "render_mode",
-    "id",
-    "vectorization_mode",
-    "vector_kwargs",
-    "wrappers",
-    "self",
+    *("num_envs", "num_threads", "autoreset_mode", "render_mode"),
+    *("id", "vectorization_mode", "vector_kwargs", "wrappers", "self"),
 )
 """Arguments of the environments, and of the functions that make them, that have no place in a
 comparison.
@@ -37,6 +32,8 @@ comparison.
 RESERVED = ("scenario", *UNPLACED)
 """These, and the argument that has a key of its own."""
 
+_STRICT = ConfigDict(extra="forbid")
+"""A name in `environments.toml` that nobody knows is a mistake."""
 _UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
 
 
@@ -52,6 +49,7 @@ class Column:
         note: What the title leaves open, for the legend; empty where it says it all.
     """
 
+    __pydantic_config__ = _STRICT
     title: str
     metric: str
     on_console: bool = True
@@ -75,7 +73,7 @@ class Column:
 
     @property
     def _shown(self) -> tuple[str, float]:
-        return next(shown for suffix, shown in _UNITS.items() if self.metric.endswith(suffix))
+        return _UNITS[self.metric[self.metric.rindex("_") :]]
 
 
 @dataclass(frozen=True)
@@ -87,12 +85,15 @@ class TracedSignal:
         name: Its name in the trace.
         unit: Unit in which it is shown.
         reference: Name of what it should be in the trace; None where that is zero.
+        picture: Name of the picture that shows it; empty where it stands on the page alone.
     """
 
+    __pydantic_config__ = _STRICT
     title: str
     name: str
     unit: str
     reference: str | None = None
+    picture: str = ""
 
     @property
     def scale(self) -> float:
@@ -124,17 +125,15 @@ class Environment:
         given: Further arguments of `gymnasium.make`.
         traced: Signals of the first episode that are kept.
         columns: The summary table.
-        splits: Further tables of the summary, title and columns.
+        splits: Further tables of the summary: columns by title.
         subject: What the summary table is about.
         note: What its reader has to know beside the legend of the columns.
-        figures: Names of the time series to draw, see `train.figures.comparison_figures`.
-        overview: Column of the bar chart.
-        swept: Columns drawn against a swept value.
+        swept: Columns drawn against a swept value; the first is that of the bar chart.
         learned_from: Further arguments of worlds that are learned from, which keep them apart from
             those of evaluation.
         judged: Columns that policies are compared by, pair by pair.
         also: Columns whose paired changes stand in the tables too.
-        curves: Signals over time in the report.
+        curves: Signals over time in the report and in pictures.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
         is_real: Whether it is hardware: one world at a time, in this process, without a truth to
@@ -142,6 +141,7 @@ class Environment:
         walks: Whether its policies are those of the walker.
     """
 
+    __pydantic_config__ = _STRICT
     id: str
     robot: str
     motion: str
@@ -149,13 +149,11 @@ class Environment:
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
     subject: str
-    figures: tuple[str, ...]
-    overview: Column
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
     curves: tuple[TracedSignal, ...]
     also: tuple[Column, ...] = ()
-    splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+    splits: dict[str, tuple[Column, ...]] = field(default_factory=dict)
     learned_from: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     quantity: str = ""
@@ -166,7 +164,7 @@ class Environment:
     looped_policy: str = "zero"
     live_policy: str | None = None
     on_hardware: str = ""
-    make_reference: Callable[[Any], Any] | None = None
+    make_reference: ImportString[Callable[[Any], Any]] | None = None
     given: dict[str, Any] = field(default_factory=dict)
 
     def arguments(self, reference: Reference) -> dict[str, Any]:
@@ -183,15 +181,18 @@ class Environment:
 
     def draws(self, reference: Reference) -> bool:
         """True if episodes of a reference have motions of their own."""
-        return self.make_reference is not None and self.make_reference(reference).is_random
+        make = self.make_reference
+        return make is not None and make(reference).is_random
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition are one and the same."""
-        return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
+        is_random = make_scenario(scenario).is_random
+        return not (self.is_real or is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
         """True if the episodes of a condition are of one robot and one motion."""
-        return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
+        draws_robots = make_scenario(scenario).draws_robots
+        return not (self.is_real or draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
@@ -216,11 +217,12 @@ class _Walker(Environment):
 
     def label(self, reference: Reference) -> str:
         parts = _durations(reference)
-        texts = (f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts)
+        texts = (f"{p:g}" if isinstance(p, int | float) else str(p) for p in parts)
         label = f"{'+'.join(texts)} s"
         steps = reference.get("num_steps") if isinstance(reference, dict) else None
-        usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
-        return label if steps in usual else f"{label} num_steps={steps}"
+        usual = Gait.model_fields["num_steps"].default
+        is_usual = steps in (None, usual, _STEPS_OF_THE_PAPER.get(label))
+        return label if is_usual else f"{label} num_steps={steps}"
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
@@ -258,7 +260,8 @@ def environment(name: str) -> Environment:
     if ":" in name:
         return _of_ones_own(name)
     if name not in ENVIRONMENTS:
-        raise unknown_name("environment", name, [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"])
+        choices = [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"]
+        raise unknown_name("environment", name, choices)
     return ENVIRONMENTS[name]
 
 
@@ -270,170 +273,32 @@ def _of_ones_own(name: str) -> Environment:
             f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}"
         )
     robot.register()
-    known = _JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR
+    known = _EVERY["joints" if robot.end_effector is None else "end_effector"]
     return replace(known, id=robot.id, robot=robot.name)
 
 
-_LINK = Column("link error rms", "link_error_rms_rad")
-_TESTBED = Environment(
-    id=IDS["testbed"],
-    robot="testbed",
-    motion="reference",
-    default_reference="hold",
-    make_reference=make_reference,
-    traced=(
-        "time_s",
-        "reference_angle",
-        "link_angle",
-        "link_angle_imu",
-        "deflection",
-        "link_error",
-        "link_error_imu",
-        "joint_torque",
-    ),
-    columns=(
-        Column("rms", "link_error_rms_rad"),
-        Column("peak", "link_error_peak_rad"),
-        Column("IMU-", "link_error_imu_min_rad", note="least error by the link's IMU"),
-        Column("IMU+", "link_error_imu_max_rad", note="greatest error by it"),
-        Column("est.", "link_estimate_error_rms_rad", note="rms error of the estimated link angle"),
-    ),
-    subject="link error",
-    figures=("time", "static"),
-    overview=_LINK,
-    swept=(_LINK, Column("peak", "link_error_peak_rad")),
-    judged=(_LINK,),
-    curves=(
-        TracedSignal("link angle", "link_angle", "rad", reference="reference_angle"),
-        TracedSignal("link error", "link_error", "mrad"),
-    ),
-    watched_reference="sine",
-    looped_policy="input",
-    on_hardware="hardware",
-)
+def _environments() -> dict[str, Environment]:
+    """Environments by their short names, from `environments.toml`."""
+    file = Path(__file__).with_suffix(".toml")
+    parts = tomllib.loads(file.read_text(encoding="utf-8"))
 
-_JOINTS = replace(
-    _TESTBED,
-    default_reference="multisine",
-    make_reference=make_arm_reference,
-    columns=tuple(column for column in _TESTBED.columns if not column.title.startswith("IMU")),
-    traced=("time_s", "link_error", "deflection", "joint_torque", "command_rate"),
-    figures=(),
-    curves=(_TESTBED.curves[1], TracedSignal("deflection", "deflection", "mrad")),
-    watched_reference=None,
-    on_hardware="",
-)
-"""Several joints on a fixed base: the figures are those of all joints together."""
+    def values(name: str) -> dict[str, Any]:
+        part = dict(parts.get(name, parts["joints"]))
+        like = part.pop("like", None)
+        return part if like is None else {**values(like), **part}
 
-_TOOL = Column("end effector error rms", "end_effector_error_rms_m")
-_DISTANCE = "rms distance from where the reference has it"
-_ANGLE = "rms angle of the end effector from the reference"
-_WITH_END_EFFECTOR = replace(
-    _JOINTS,
-    columns=(
-        Column("end effector", "end_effector_error_rms_m", note=_DISTANCE),
-        Column("tilt", "end_effector_tilt_rms_rad", note=_ANGLE),
-        *_JOINTS.columns,
-    ),
-    traced=("time_s", "end_effector_error", "end_effector_tilt", *_JOINTS.traced[1:]),
-    subject="end effector and link error",
-    overview=_TOOL,
-    swept=(_TOOL, *_JOINTS.swept),
-    judged=(_TOOL,),
-    also=_JOINTS.judged,
-    curves=(TracedSignal("end effector error", "end_effector_error", "mm"), *_JOINTS.curves),
-)
-"""The same robots where what counts is the place of an end effector."""
+    plain = TypeAdapter(Environment)
+    walking = TypeAdapter(_Walker)
+    found = {}
+    for name in [*IDS, *_KINDS]:
+        content = {"id": IDS.get(name, ""), "robot": name, **values(name)}
+        kind = walking if content.get("walks") else plain
+        found[name] = kind.validate_python(content)
+    return found
 
-_ROLL = Column("pelvis roll rms", "pelvis_roll_rms_rad")
-_ZMP = Column("ZMP deviation rms", "zmp_deviation_rms_m")
-_EARLY = "swing foot down before its time"
-_TILT = "error of its attitude, roll and pitch together"
-_BY_PHASE = tuple(
-    Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
-    for title, metric, unit in (
-        ("roll", "pelvis_roll", "rad"),
-        ("pitch", "pelvis_pitch", "rad"),
-        ("ZMP", "zmp_deviation", "m"),
-    )
-    for phase in ("double", "single", "transition")
-)
 
-_WALKER = _Walker(
-    id=IDS["walker"],
-    robot="walker",
-    motion="step_period",
-    default_reference=3,
-    traced=(
-        "time_s",
-        "pelvis_roll",
-        "pelvis_pitch",
-        "zmp_x",
-        "zmp_y",
-        "zmp_reference_x",
-        "zmp_reference_y",
-        "single_support",
-        "support",
-        "load_share",
-        "force_left",
-        "force_right",
-    ),
-    columns=(
-        Column("roll rms", "pelvis_roll_rms_rad"),
-        Column("roll peak", "pelvis_roll_peak_rad"),
-        Column("pitch rms", "pelvis_pitch_rms_rad"),
-        Column("pitch peak", "pelvis_pitch_peak_rad", on_console=False),
-        Column("ZMP rms", "zmp_deviation_rms_m", decimals=1),
-        Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
-        Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
-        Column("IMU", "imu_error_rms_rad", on_console=False, note=_TILT),
-        Column(
-            "early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"
-        ),
-        Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
-        Column("COM jump", "com_jump_mean_m", decimals=1),
-    ),
-    splits=(("By phase, rms", _BY_PHASE),),
-    subject="pelvis and ZMP of the walk",
-    figures=("pelvis", "zmp"),
-    overview=_ROLL,
-    swept=(_ROLL, _ZMP),
-    judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), _ZMP),
-    learned_from={"bank": 1},
-    also=(_ROLL, Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
-    curves=(
-        TracedSignal("pelvis roll", "pelvis_roll", "mrad"),
-        TracedSignal("pelvis pitch", "pelvis_pitch", "mrad"),
-        TracedSignal("ZMP to the left", "zmp_y", "mm", reference="zmp_reference_y"),
-    ),
-    quantity="step period",
-    failure="falls",
-    walks=True,
-    looped_policy="input_wrench",
-    live_policy="adaptive_posture",
-)
-
-_HARDWARE = replace(
-    _TESTBED,
-    id=IDS["hardware"],
-    columns=tuple(
-        column for column in _TESTBED.columns if column.title not in ("est.", "peak")
-    ),  # IMU- or IMU+ is it
-    traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
-    subject="link error by the IMU",
-    note="On hardware there is no truth to score an estimate by.",
-    is_real=True,
-)
-
-_OWN = {
-    "testbed": _TESTBED,
-    "walker": _WALKER,
-    "hardware": _HARDWARE,
-    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], robot="robot", default_reference="poses"),
-}
-ENVIRONMENTS = {
-    name: _OWN.get(name) or replace(_JOINTS, id=known, robot=name) for name, known in IDS.items()
-}
-"""Environments by their short names: those with figures of their own, and other robots of
-elastic joints.
-"""
+_KINDS = ("joints", "end_effector")
+"""Descriptions of robots that are no environments of ours."""
+_EVERY = _environments()
+ENVIRONMENTS = {name: known for name, known in _EVERY.items() if name not in _KINDS}
+"""Environments by their short names."""

@@ -70,6 +70,10 @@ class Evaluation:
         return time_s <= max(end, 0.0)
 
 
+Episodes = Sequence[tuple[Evaluation, int]]
+"""Numbered episodes, each with the evaluation that it belongs to."""
+
+
 def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
     """Items by a key, in the order in which it first occurs."""
     groups: dict[KeyT, list[ItemT]] = {}
@@ -110,7 +114,7 @@ def evaluate_together(
         num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
-    episodes = [(own, number) for own in results for number in range(own.condition.episodes)]
+    episodes = [(own, n) for own in results for n in range(own.condition.episodes)]
     at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
     for first in range(0, len(episodes), at_once):
         batch = episodes[first : first + at_once]
@@ -120,7 +124,7 @@ def evaluate_together(
     return results
 
 
-def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress) -> None:
+def _play(env: Any, episodes: Episodes, progress: Progress) -> None:
     """Play numbered episodes of conditions, a world each; the first episode of a world counts."""
     condition = episodes[0][0].condition
     seeds = [result.condition.seed + number for result, number in episodes]
@@ -173,16 +177,17 @@ def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
 class _Observers:
     """Figures that no environment keeps: of the IMU, of a policy's estimate, and traces."""
 
-    def __init__(self, env: Any, policy: Any, episodes: Sequence[tuple[Evaluation, int]]) -> None:
+    def __init__(self, env: Any, policy: Any, episodes: Episodes) -> None:
         task = env.unwrapped.task
         environment = episodes[0][0].condition.environment
+        model = task.assumed_model
         has_estimate = hasattr(policy, "link_estimate") and not environment.is_real
-        walks = isinstance(task.assumed_model, WalkerModel)
+        walks = isinstance(model, WalkerModel)
         self._env = env
         self._policy = policy
         self._task = task
         self._estimate = _Rms(task, len(episodes)) if has_estimate else None
-        self._changes = SupportChanges(task.assumed_model) if has_estimate and walks else None
+        self._changes = SupportChanges(model) if has_estimate and walks else None
         self._imu = _Rms(task, len(episodes)) if walks else None
         self._traces = {
             world: _Trace(task, environment.traced, world)
@@ -191,7 +196,7 @@ class _Observers:
         }
         self._ended = set[int]()
 
-    def watch(self, step: int, observation: Array, info: dict[str, Any], memory: Any) -> None:
+    def watch(self, step: int, observation: Array, info: Any, memory: Any) -> None:
         """Take a control step, between the command and its effect."""
         for world, trace in self._traces.items():
             if world not in self._ended:
@@ -269,12 +274,13 @@ class _Trace:
         if visits is not None and "link_angle_imu" in traced:
             self.references, directions = visits
             self._recorder = HoldRecorder(directions)
-        self._rows: list[tuple[float, ...]] = []
+        self._rows: list[list[float]] = []
 
     def take(self, observation: Array, info: dict[str, Any]) -> None:
         """Take a sample."""
         own = slice(self._world, self._world + 1)
-        self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
+        signals = [info[name] for name in self._traced]
+        self._rows.append([float(signal[self._world]) for signal in signals])
         if self._recorder is not None:
             encoder = observation[own, self._encoder][:, 0]
             rest = int(info["rest"][self._world])

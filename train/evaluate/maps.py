@@ -15,7 +15,7 @@ from baselines.options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
-from train.evaluate.changes import Change, Pairings
+from train.evaluate.changes import Change, change_of
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, vary_scenario
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
@@ -57,9 +57,9 @@ class Axis(Model):
     def ticks(self, known: Environment) -> list[str]:
         """Its values as they are shown."""
         if self.is_motion:
-            numbers = [n for value in self.values for n in known.abscissa(value).values()]
             motions = [known.arguments(value)[known.motion] for value in self.values]
-            return [f"{number:g}" for number in numbers] or list(map(known.label, motions))
+            numbers = [n for motion in motions for n in known.abscissa(motion).values()]
+            return [f"{n:g}" for n in numbers] or list(map(known.label, motions))
         factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
         return [f"{factor * value:.4g}" for value in self.values]
 
@@ -82,8 +82,10 @@ class MapConfig(Model):
 
     @model_validator(mode="after")
     def _axes_differ(self) -> Self:
-        if self.x.what == self.y.what:
-            raise ValueError(f"x and y of a map must vary two things, both vary {self.x.what!r}")
+        what = self.x.what
+        if what == self.y.what:
+            problem = "x and y of a map must vary two things"
+            raise ValueError(f"{problem}, both vary {what!r}")
         return self
 
     @property
@@ -109,13 +111,13 @@ class MapConfig(Model):
                 )
             for value in axis.values:
                 if axis.values.count(value) > 1:
-                    raise ConfigurationError(f"the value {quote(value)} of map.{name} stands twice")
+                    problem = f"the value {quote(value)} of map.{name} stands twice"
+                    raise ConfigurationError(problem)
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):
-                    raise ConfigurationError(
-                        f"values of map.{name} must be numbers, got {quote(value)}"
-                    )
+                    problem = f"values of map.{name} must be numbers"
+                    raise ConfigurationError(f"{problem}, got {quote(value)}")
                 vary_scenario(GROUNDS["nominal"], {axis.what: value})
 
     def coordinates(self) -> list[dict[str, float]]:
@@ -130,9 +132,10 @@ class MapConfig(Model):
 
 def _choices(what: str, known: Environment) -> str:
     """Names that an axis can have."""
-    is_option = what in PolicyOptions.model_fields
-    hint = "; an option of the policies is varied by sweep, not by a map" if is_option else ""
-    return choices_listed(what, [known.motion, *scenario_fields()]) + hint
+    choices = choices_listed(what, [known.motion, *scenario_fields()])
+    if what not in PolicyOptions.model_fields:
+        return choices
+    return f"{choices}; an option of the policies is varied by sweep, not by a map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,21 +165,22 @@ class HeatMap:
     Attributes:
         title: Scenario and motion.
         column: The metric.
-        x, y: The axes.
-        known: The environment.
-        policies: Titles of all policies.
-        families: Those that are residuals.
+        axes: The axes.
+        table: All episodes.
         cells: (len(y.values), len(x.values)).
     """
 
     title: str
     column: Column
-    x: Axis
-    y: Axis
-    known: Environment
-    policies: tuple[str, ...]
-    families: tuple[str, ...]
-    cells: tuple[tuple[MapCell, ...], ...]
+    axes: MapConfig
+    table: EpisodeTable
+    cells: list[list[MapCell]]
+
+    @property
+    def ticks(self) -> tuple[list[str], list[str]]:
+        """Values of x and y as they are shown."""
+        known = self.table.environment
+        return self.axes.x.ticks(known), self.axes.y.ticks(known)
 
     @property
     def flat(self) -> list[MapCell]:
@@ -193,8 +197,9 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
     """
 
     def title_of(e: Evaluation) -> str:
-        motion = e.condition.environment.title(e.condition.reference_name)
-        return e.condition.scenario if config.motion else f"{motion}, {e.condition.scenario}"
+        own = e.condition
+        motion = own.environment.title(own.reference_name)
+        return own.scenario if config.motion else f"{motion}, {own.scenario}"
 
     return [
         heat_map
@@ -232,26 +237,17 @@ def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatM
         (config.y.place(condition), config.x.place(condition)): cell
         for (_, cell), condition in table.conditions.items()
     }
-    rows = [[cells[y, x] for x in range(len(config.x.values))] for y in range(len(config.y.values))]
-    pairings = Pairings(table)
-    return [
-        HeatMap(
-            title=title,
-            column=column,
-            x=config.x,
-            y=config.y,
-            known=table.environment,
-            policies=tuple(table.policies),
-            families=tuple(table.members),
-            cells=tuple(tuple(_cell(pairings, cell, column) for cell in row) for row in rows),
-        )
-        for column in table.environment.judged
-    ]
+    across = range(len(config.x.values))
+    rows = [[cells[y, x] for x in across] for y in range(len(config.y.values))]
+    maps = []
+    for column in table.environment.judged:
+        found = [[_cell(table, number, column) for number in row] for row in rows]
+        maps.append(HeatMap(title, column, config, table, found))
+    return maps
 
 
-def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
+def _cell(table: EpisodeTable, cell: int, column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
-    table = pairings.table
     played = [title for title in table.policies if (title, cell) in table.conditions]
     rows = {title: table.of(title, cell) for title in played}
     scores = {title: (score(own, column), failures(own)) for title, own in rows.items()}
@@ -260,14 +256,13 @@ def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
     without_truth = [title for title in played if tracks[title] is not Track.TRUTH]
     analytic = best_of({title: scores[title] for title in standard})
     learned = [title for title in played if title in table.members] if analytic else []
-    scenario = table.conditions[played[0], cell].scenario
     return MapCell(
         levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},
         best=best_of({title: scores[title] for title in without_truth}),
         best_analytic=analytic,
         learned={
-            title: pairings.change(title, str(analytic), column, [cell], scenario)
+            title: change_of(table, table.scope(title, cell), str(analytic), column)
             for title in learned
         },
     )

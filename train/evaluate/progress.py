@@ -46,7 +46,8 @@ def read_progress(
         ConfigurationError: The file is missing, is no such table, or lacks a score.
     """
     path = folder / PROGRESS
-    columns = ["decisions", *metrics, *(f"base_{metric}" for metric in metrics), *further]
+    bases = [f"base_{metric}" for metric in metrics]
+    columns = ["decisions", *metrics, *bases, *further]
     try:
         text = read_bounded(path, MOST_BYTES).decode("utf-8")
         rows = [_evaluation(row, columns) for row in csv.DictReader(text.splitlines())]
@@ -84,14 +85,14 @@ def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves
         tables = [read_progress(run, metrics) for run in runs]
     except ConfigurationError:
         return None
-    common = set.intersection(*({row["decisions"] for row in table} for table in tables))
-    decisions = sorted(common)
+    reached = [{row["decisions"] for row in table} for table in tables]
+    decisions = sorted(set.intersection(*reached))
     if not decisions:
         return None
-    ratios = {
-        metric: np.array([[_ratio(table, at, metric) for at in decisions] for table in tables])
-        for metric in metrics
-    }
+    ratios = {}
+    for metric in metrics:
+        found = [[_ratio(table, at, metric) for at in decisions] for table in tables]
+        ratios[metric] = np.array(found)
     return Curves(np.array(decisions), ratios)
 
 

@@ -21,6 +21,9 @@ from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
 
+Options = dict[str, object]
+"""Options of a policy by name."""
+
 _WILD = re.compile(r"[*?\[]")
 _NEAREST = 5
 """Names that the error for a pattern without folders lists."""
@@ -87,10 +90,9 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
         members = _members(policy.name.removeprefix(RESIDUAL))
         for member in members:
             _require_motion(member)
-        pairing = _Opponents(members[0].description, policy)
-        base = pairing.base([*policies, *bases])
+        taken = [*policies, *bases]
+        base, rival = _opponents(members[0].description, policy, taken)
         add(base)
-        rival = pairing.rival([*policies, *bases])
         if rival is not None:
             add(rival)
         entrants += [
@@ -120,12 +122,13 @@ def origin(members: Sequence[Member]) -> Origin:
     scenarios = config.scenarios
     wanted = set(config.seeds)
     had = {member.training_seed for member in members}
+    commits = [description.origin.commit or "unknown" for description in descriptions]
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
         reference=config.reference,
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),
-        commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
+        commits=tuple(dict.fromkeys(commits)),
         ranges=descriptions[0].training.get("config", {}).get("ranges") or {},
     )
 
@@ -150,10 +153,12 @@ def _members(pattern: str) -> list[_Folder]:
     """Folders of a pattern in natural order; shipped ones where none lie there."""
     if not _WILD.search(pattern):
         return [_Folder(Path(pattern), read_description(Path(pattern)))]
-    folders = _matching(pattern) or map(Path, fnmatch.filter(shipped_names(), pattern))
-    members = [_Folder(own, read_description(own)) for own in sorted(folders, key=_natural)]
+    shipped = map(Path, fnmatch.filter(shipped_names(), pattern))
+    folders = sorted(_matching(pattern) or shipped, key=_natural)
+    members = [_Folder(own, read_description(own)) for own in folders]
     if not members:
-        raise ConfigurationError(f"no folder matches {quote(pattern)}; {_nearest(Path(pattern))}")
+        near = _nearest(Path(pattern))
+        raise ConfigurationError(f"no folder matches {quote(pattern)}; {near}")
     _require_one_family(pattern, members)
     return members
 
@@ -187,7 +192,8 @@ def _require_motion(member: _Folder) -> None:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
         file = shorten(member.folder / DESCRIPTION)
-        raise ConfigurationError(f"{file}: training.config.reference: {error}") from None
+        problem = f"{file}: training.config.reference: {error}"
+        raise ConfigurationError(problem) from None
 
 
 def _nearest(pattern: Path) -> str:
@@ -243,74 +249,61 @@ _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_ev
 def _kin(description: ResidualDescription) -> dict[str, object]:
     """Settings that the members of a family share."""
     config = description.training.get("config", {})
-    trained = {f"the trained {name}": config[name] for name in config if name not in _OWN}
+    trained = {f"the trained {key}": config[key] for key in config if key not in _OWN}
     names = ("robot", "base", "base_options", "settings")
     return trained | {name: getattr(description, name) for name in names}
 
 
-@dataclass(frozen=True)
-class _Opponents:
-    """The policies that a residual is compared with.
+def _opponents(
+    description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]
+) -> tuple[PolicySpec, PolicySpec | None]:
+    """The policies that a residual is compared with, of those that play or new ones.
 
-    Attributes:
+    The base is one with the same options. The other is the best policy without learning that has
+    the same sensors; None where that is the base. One that is among the policies counts if it
+    assumes the same stiffness, whatever its other options. Where the base is that policy with
+    options, the residual is compared with the plain one if that is among the policies.
+
+    Args:
         description: Of the residual.
         residual: Its entry in the comparison, whose options go over those of its base.
+        taken: Policies that play.
     """
+    options = _set_options({**description.base_options, **residual.options})
+    assumed = _assumed(options)
 
-    description: ResidualDescription
-    residual: PolicySpec
+    def beside(name: str) -> list[PolicySpec]:
+        """Policies of a name in the environment of the residual."""
+        mine = (name, residual.env_options, residual.level)
+        return [own for own in taken if (own.name, own.env_options, own.level) == mine]
 
-    def base(self, taken: Sequence[PolicySpec]) -> PolicySpec:
-        """The base: one of the policies with the same options, or one of its own."""
-        name = self.description.base
-        beside = [known for known in taken if self._is_beside(known, name)]
-        for known in beside:
-            if _set_options(known.options) == self._options:
-                return known
-        return self._new(name, f"base of {self.residual.title}", self._options, taken)
-
-    def rival(self, taken: Sequence[PolicySpec]) -> PolicySpec | None:
-        """The best policy without learning that has the same sensors; None where that is the base.
-
-        One that is among the policies counts if it assumes the same stiffness, whatever its other
-        options. Where the base is that policy with options, it is compared with the plain one if
-        that is among the policies.
-        """
-        environment = ENVIRONMENTS.get(self.description.robot)
-        name = best_analytic(environment is not None and environment.walks)
-        if name is None:
-            return None
-        is_base = name == self.description.base
-        assumed = _assumed(self._options)
-        for known in (known for known in taken if self._is_beside(known, name)):
-            own = _set_options(known.options)
-            if (own if is_base else _assumed(own)) == assumed:
-                return None if is_base and self._options == assumed else known
-        return None if is_base else self._new(name, "best analytic", assumed, taken)
-
-    @property
-    def _options(self) -> dict[str, object]:
-        return _set_options({**self.description.base_options, **self.residual.options})
-
-    def _is_beside(self, known: PolicySpec, name: str) -> bool:
-        """True if a policy has a name and plays in the environment of the residual."""
-        mine = (known.name, known.env_options, known.level)
-        return mine == (name, self.residual.env_options, self.residual.level)
-
-    def _new(
-        self, name: str, role: str, options: dict[str, object], taken: Sequence[PolicySpec]
-    ) -> PolicySpec:
-        """A policy under its name or, where a policy is called so, under one that says its role."""
+    def new(name: str, role: str, options: Options) -> PolicySpec:
+        """A policy under its name or, where one is called so, under one with its role."""
         is_taken = name in {policy.title for policy in taken}
         label = f"{name} ({role})" if is_taken else None
-        return self.residual.replace(name=name, label=label, options=options, track=None)
+        own = {"name": name, "label": label, "options": options, "track": None}
+        return residual.replace(**own)
+
+    same = [own for own in beside(description.base) if _set_options(own.options) == options]
+    base = same[0] if same else new(description.base, f"base of {residual.title}", options)
+    taken = [*taken, base]
+    environment = ENVIRONMENTS.get(description.robot)
+    best = best_analytic(environment is not None and environment.walks)
+    if best is None:
+        return base, None
+    is_base = best == description.base
+    for known in beside(best):
+        own = _set_options(known.options)
+        if (own if is_base else _assumed(own)) == assumed:
+            return base, None if is_base and options == assumed else known
+    return base, None if is_base else new(best, "best analytic", assumed)
 
 
-def _assumed(options: dict[str, object]) -> dict[str, object]:
+def _assumed(options: Options) -> Options:
     return {name: value for name, value in options.items() if name in ASSUMED_OPTIONS}
 
 
-def _set_options(options: dict[str, object]) -> dict[str, object]:
+def _set_options(options: Options) -> Options:
     return {name: value for name, value in options.items() if value is not None}
 
 

@@ -7,7 +7,7 @@
 Files that it names are looked for beside it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +36,9 @@ class RobotFile(Model):
 
     def arguments(self, folder: Path) -> dict[str, Any]:
         """Arguments of the environment; files are those of a folder."""
-        given = {name: value for name, value in self.model_dump().items() if value is not None}
-        return {
-            **given,
-            **{
-                name: str(folder / given[name])
-                for name in ("model", "joints")
-                if _is_path(given[name])
-            },
-        }
+        given = self.model_dump(exclude_none=True)
+        files = {name: str(folder / path) for name, path in _files(given)}
+        return {**given, **files}
 
 
 def read_robot_file(name: str) -> dict[str, Any]:
@@ -69,8 +63,10 @@ def files_of_robot(name: str) -> Iterator[Path]:
             arguments = read_robot_file(name)
         except ConfigurationError:
             return  # another file
-        yield from (Path(arguments[key]) for key in ("model", "joints") if _is_path(arguments[key]))
+        yield from (Path(path) for _, path in _files(arguments))
 
 
-def _is_path(value: Any) -> bool:
-    return isinstance(value, str)
+def _files(arguments: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Arguments that name a file."""
+    given = [(name, arguments[name]) for name in ("model", "joints")]
+    return [(name, value) for name, value in given if isinstance(value, str)]

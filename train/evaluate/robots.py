@@ -6,24 +6,32 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from elastic_env.core.signals import Array
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.changes import opponents
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.statistics import Estimate, interquartile_mean, wins, worst_share_mean
-from train.evaluate.table import EpisodeTable, estimate, failures, score
+from train.evaluate.statistics import Estimate, interquartile_mean, worst_share_mean
+from train.evaluate.table import (
+    EpisodeTable,
+    Scope,
+    estimate,
+    failures,
+    pair,
+    per_seed,
+    score,
+)
 
 FEWEST_ROBOTS = 4
 """Episodes from which on there is a middle half."""
 
 
-@dataclass(frozen=True)
-class RobotScores:
+@dataclass(frozen=True, eq=False)
+class RobotScores(Scope):
     """A policy in one metric over the drawn robots of a cell; of residuals with intervals.
 
     Attributes:
-        policy, reference, scenario: Titles of the cell.
         column: The metric.
         mean: Mean over the robots [SI].
         middle: Interquartile mean over the robots [SI].
@@ -31,12 +39,8 @@ class RobotScores:
         failed, episodes: Episodes that failed, and all. The figures are of the others.
         better: Share of the robots for which the policy is better than another one, by its title;
             ties count half, and to fail is worse than any value.
-        failure: What failing is called, in the plural.
     """
 
-    policy: str
-    reference: str
-    scenario: str
     column: Column
     mean: Estimate
     middle: Estimate
@@ -44,7 +48,11 @@ class RobotScores:
     failed: int
     episodes: int
     better: dict[str, Estimate]
-    failure: str
+
+    @property
+    def scores(self) -> tuple[Estimate, Estimate, Estimate]:
+        """The three figures over the robots."""
+        return self.mean, self.middle, self.worst
 
 
 def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
@@ -56,64 +64,51 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     table = EpisodeTable(evaluations)
     found = []
     for policy, others in opponents(table).items():
-        for cell in table.cells_of(policy):
-            condition = table.conditions[policy, cell]
+        for scope in table.scopes(policy, {}):
+            (cell,) = scope.cells
             rows = table.of(policy, cell)
             is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
-            if condition.swept or is_small or not _draws_robots(condition):
+            if scope.swept or is_small or not _draws_robots(scope.first):
                 continue
             against = [other for other in others if (other, cell) in table.conditions]
-            found += [
-                _robot_scores(table, cell, policy, against, column)
-                for column in table.environment.judged
-            ]
+            failed, episodes = failures(rows)
+            beside = {title: table.of(title, cell) for title in against}
+            for column in table.environment.judged:
+                better = {}
+                for title, theirs in beside.items():
+                    share = share_better(rows, theirs, column.metric)
+                    better[title] = estimate(rows, share)
+                scores = RobotScores(
+                    **vars(scope),
+                    column=column,
+                    mean=score(rows, column),
+                    middle=score(rows, column, interquartile_mean),
+                    worst=score(rows, column, worst_share_mean),
+                    failed=failed,
+                    episodes=episodes,
+                    better=better,
+                )
+                found.append(scores)
     return found
 
 
-def _robot_scores(
-    table: EpisodeTable, cell: int, policy: str, others: Sequence[str], column: Column
-) -> RobotScores:
-    condition = table.conditions[policy, cell]
-    rows = table.of(policy, cell)
-    failed, episodes = failures(rows)
-    return RobotScores(
-        policy=policy,
-        reference=condition.reference_name,
-        scenario=condition.scenario,
-        column=column,
-        mean=score(rows, column),
-        middle=score(rows, column, interquartile_mean),
-        worst=score(rows, column, worst_share_mean),
-        failed=failed,
-        episodes=episodes,
-        better={other: _better(rows, table.of(other, cell), column) for other in others},
-        failure=table.environment.failures,
-    )
+def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Array:
+    """Share of common episodes in which a policy is better (lower), by training seed.
 
-
-def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
-    """Share of the robots for which a policy is better than another one."""
-    members = mine.groupby("member", sort=False)
-    shares = [share_better(own, base, column.metric) for _, own in members]
-    return estimate(mine, np.array(shares))
-
-
-def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
-    """Share of common episodes in which the policy is better (lower); ties count half.
-
-    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
-    in common. An episode that reached its end without a figure, such as a ZMP of feet that never
-    carried anything, is left out.
+    Ties count half. To fail is worse than any value, and where both fail it is a tie. nan where
+    they have no episode in common. An episode that reached its end without a figure, such as a ZMP
+    of feet that never carried anything, is left out.
 
     Args:
-        mine: Episodes of one cell with `seed`, `failed` and the metric.
+        mine: Episodes of one cell with `member`, `cell`, `seed`, `failed` and the metric.
         base: The same of the base.
         metric: Name of the metric.
     """
-    both = mine.merge(base, on="seed", suffixes=("", "_base"))
-    ranks = [both[f"{metric}{end}"].where(~both[f"failed{end}"], np.inf) for end in ("", "_base")]
-    values = pd.concat(ranks, axis=1).dropna().to_numpy()
-    return wins(*values.T) / len(values) if len(values) else float("nan")
+    mine, base = (
+        rows.assign(**{metric: rows[metric].where(~rows["failed"], np.inf)})
+        for rows in (mine, base)
+    )
+    return per_seed(pair(mine, base, metric), "won")[:, 0]
 
 
 def _draws_robots(condition: Condition) -> bool:

@@ -95,7 +95,8 @@ def control_steps(
             if watch is not None:
                 watch(number, observation, info, memory)
             after, _, terminated, truncated, info = env.step(action)
-        step = ControlStep(number, observation, action, after, info, terminated, truncated)
+        ends = (terminated, truncated)
+        step = ControlStep(number, observation, action, after, info, *ends)
         yield step
         observation = after
         is_over = step.is_over
@@ -134,13 +135,13 @@ def policy_errors(condition: Condition, step: int | None = None) -> Iterator[Non
         ) from error
 
 
-def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = None) -> Any:
+def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     """The policy of a specification for an environment.
 
     Args:
         spec: The specification.
         env: The environment.
-        options: Options instead of its own.
+        options: Options by name instead of its own.
 
     Raises:
         ConfigurationError: The name is neither a baseline nor an importable function.
@@ -154,9 +155,8 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
         raise _not_a_policy(spec, str(error)) from error
     attribute = spec.name.rpartition(":")[2]
     if not callable(function):
-        raise _not_a_policy(
-            spec, f"{attribute} is no function but of type {type(function).__name__}"
-        )
+        kind = type(function).__name__
+        raise _not_a_policy(spec, f"{attribute} is no function but of type {kind}")
     try:
         return function(env, **options)
     except ElasticError:
@@ -213,11 +213,12 @@ def make_shared_env(
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
     """
-    scenarios: list[Any] = [condition.scenario_played for condition in conditions]
-    is_one = all(scenario == scenarios[0] for scenario in scenarios)
-    scenario = scenarios[0] if is_one else scenarios
-    count = len(conditions)
-    return make_vector_env(conditions[0], count, num_threads, autoreset_mode, scenario=scenario)
+    scenario: Any = [condition.scenario_played for condition in conditions]
+    first = conditions[0]
+    if all(own == scenario[0] for own in scenario):
+        scenario = scenario[0]
+    others = {"autoreset_mode": autoreset_mode, "scenario": scenario}
+    return make_vector_env(first, len(conditions), num_threads, **others)
 
 
 def shared_settings(condition: Condition) -> str:

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from itertools import chain
 
 from baselines.catalogue import Track
-from train.evaluate.changes import Change, Groups, Pairings
+from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, failures, score
+from train.evaluate.table import EpisodeTable, Groups, Scope, failures, score
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,6 @@ class Paired:
     to: str
     change: Estimate
     verdict: str
-
-    @classmethod
-    def of(cls, row: Change) -> Self:
-        """The part of a change that a leaderboard keeps."""
-        return cls(row.base, row.relative, row.verdict)
 
 
 @dataclass(frozen=True)
@@ -77,10 +72,7 @@ class Standing:
 
 
 def standings(
-    evaluations: Sequence[Evaluation],
-    changes: Sequence[Change],
-    groups: Groups,
-    step_us: Mapping[str, float],
+    evaluations: Sequence[Evaluation], groups: Groups, step_us: Mapping[str, float]
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
@@ -89,102 +81,63 @@ def standings(
 
     Args:
         evaluations: All cells, one per training seed.
-        changes: Paired changes of the same.
         groups: Scenarios to pool over, by name.
         step_us: Time per step of every policy, by its title.
     """
     table = EpisodeTable(evaluations)
-    pairings = Pairings(table)
-    scopes = _scopes(table, groups)
-    standard = [scope for scope in scopes if table.condition(scope.policy).track is Track.STANDARD]
-    rivals = group_by(standard, lambda scope: scope.name)
-    against_base = {
-        (row.policy, row.reference, row.scope, row.is_group, row.column): Paired.of(row)
-        for row in reversed(changes)
-        if row.is_family and not row.is_rival
-    }
+    scopes = [s for title in table.policies for s in table.scopes(title, groups)]
+    parts_of = group_by(scopes, lambda scope: (scope.policy, scope.reference))
+    for own in parts_of.values():
+        own.sort(key=lambda scope: not scope.is_group)
+    scopes = list(chain(*parts_of.values()))
+    standard = [scope for scope in scopes if scope.first.track is Track.STANDARD]
+    rivals = group_by(standard, lambda scope: scope.place)
     found = []
     for scope in scopes:
-        members = table.members.get(scope.policy, {})
+        parts = parts_of[scope.policy, scope.reference]
+        groups_of = [part.conditions for part in parts if part.is_group]
+        pooled = {condition.scenario for condition in chain(*groups_of)}
         rows = table.of(scope.policy, *scope.cells)
         failed, episodes = failures(rows)
         for column in table.environment.judged:
-            rival = None
-            if members:
-                rival = _against_the_best(pairings, scope, column, rivals.get(scope.name, []))
-            found.append(
-                Standing(
-                    track=table.condition(scope.policy).track,
-                    policy=scope.policy,
-                    reference=scope.reference,
-                    scope=scope.scope,
-                    is_group=scope.is_group,
-                    is_column=scope.is_column,
-                    title=column.title,
-                    metric=column.metric,
-                    score=score(rows, column),
-                    failed=failed,
-                    episodes=episodes,
-                    training_seeds=len(members),
-                    base=against_base.get((scope.policy, *scope.name, column)),
-                    rival=rival,
-                    step_us=step_us.get(scope.policy, float("nan")),
-                )
+            base = best = None
+            if scope.first.member is not None:
+                base = _paired(table, scope, scope.first.member.base, column)
+                beside = rivals.get(scope.place, [])
+                best = _paired(table, scope, _best(table, beside, column), column)
+            standing = Standing(
+                track=table.condition(scope.policy).track,
+                policy=scope.policy,
+                reference=scope.reference,
+                scope=scope.scope,
+                is_group=scope.is_group,
+                is_column=scope.is_group or scope.scope not in pooled,
+                title=column.title,
+                metric=column.metric,
+                score=score(rows, column),
+                failed=failed,
+                episodes=episodes,
+                training_seeds=len(table.members.get(scope.policy, ())),
+                base=base,
+                rival=best,
+                step_us=step_us.get(scope.policy, float("nan")),
             )
+            found.append(standing)
     return found
 
 
-@dataclass(frozen=True)
-class _Scope:
-    """A policy in one scenario, or in a group of them.
-
-    Attributes:
-        policy: Its title.
-        reference: Label of the motion.
-        scope: Scenario or group.
-        is_group: Whether it is a group.
-        is_column: Whether it is a column of the leaderboard.
-        cells: Numbers of its cells.
-    """
-
-    policy: str
-    reference: str
-    scope: str
-    is_group: bool
-    is_column: bool
-    cells: Sequence[int]
-
-    @property
-    def name(self) -> tuple[str, str, bool]:
-        """Name that scopes of several policies share."""
-        return self.reference, self.scope, self.is_group
-
-
-def _scopes(table: EpisodeTable, groups: Groups) -> list[_Scope]:
-    """Scenarios and whole groups of every policy and motion, in their order."""
-    found = []
-    for policy in table.policies:
-        for reference in table.references:
-            cells = table.cells_of(policy, reference)
-            own = {table.conditions[policy, cell].scenario: cell for cell in cells}
-            grouped = set[str]()
-            for name, parts in groups.items():
-                if all(part in own for part in parts):
-                    grouped.update(parts)
-                    members = [own[part] for part in parts]
-                    found.append(_Scope(policy, reference, name, True, True, members))
-            for name, cell in own.items():
-                found.append(_Scope(policy, reference, name, False, name not in grouped, [cell]))
-    return found
-
-
-def _against_the_best(
-    pairings: Pairings, scope: _Scope, column: Column, rivals: Sequence[_Scope]
-) -> Paired | None:
-    """A residual against the best of some policies; None where none has a score."""
-    played = {rival.policy: pairings.table.of(rival.policy, *rival.cells) for rival in rivals}
-    best = best_of({title: (score(rows, column), failures(rows)) for title, rows in played.items()})
-    if best is None:
+def _paired(table: EpisodeTable, scope: Scope, to: str, column: Column) -> Paired | None:
+    """A policy against another one; None where that does not play the same cells."""
+    if len(table.cells_of_base(scope, to)) < len(scope.cells):
         return None
-    own = (scope.cells, scope.scope, scope.is_group)
-    return Paired.of(pairings.change(scope.policy, best, column, *own))
+    row = change_of(table, scope, to, column)
+    return Paired(to, row.relative, row.verdict)
+
+
+def _best(table: EpisodeTable, scopes: Sequence[Scope], column: Column) -> str:
+    """The best of some policies; empty where none has a score."""
+    scores = {}
+    for scope in scopes:
+        rows = table.of(scope.policy, *scope.cells)
+        scores[scope.policy] = score(rows, column), failures(rows)
+    return best_of(scores) or ""

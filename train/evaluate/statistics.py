@@ -19,6 +19,10 @@ from elastic_env.core.signals import Array
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
+_BOOTSTRAP: dict[str, Any] = {
+    **{"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE},
+    **{"method": "percentile", "paired": True, "vectorized": True},
+}
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
 _CUT = 0.25
@@ -110,9 +114,9 @@ def worst_share_mean(values: Array, share: float = WORST) -> float:
     return float(weights @ np.sort(values)[::-1] / counted)
 
 
-def wins(mine: Array, base: Array) -> float:
-    """Number of pairs in which a policy is better (lower) than its base; ties count half."""
-    return float(np.sum(mine < base) + 0.5 * np.sum(mine == base))
+def beats(mine: Any, base: Any) -> Any:
+    """1 where a policy is better (lower) than its base, one half in a tie, else 0."""
+    return (mine < base) + 0.5 * (mine == base)
 
 
 def over_seeds(values: Sequence[float] | Array) -> Estimate:
@@ -143,12 +147,10 @@ def improvement(won: Array, played: Array) -> Estimate:
         `change`, seeds count that have pairs in every scenario.
     """
     whole = (played > 0).all(axis=1)
-    both = sorted(
-        zip(won[whole].sum(axis=1).tolist(), played[whole].sum(axis=1).tolist(), strict=True)
-    )
-    if not both:
+    both = np.column_stack([won[whole].sum(axis=1), played[whole].sum(axis=1)])
+    if not len(both):
         return Estimate(float("nan"))
-    samples = np.array(both, dtype=np.float64).T
+    samples = np.array(sorted(both.tolist())).T
     share = float(_share(*samples))
     if len(both) < 2:
         return Estimate(share)
@@ -160,17 +162,10 @@ def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]
     # here: it takes half a second to load, and most programs need none of it
     from scipy import stats
 
-    found = stats.bootstrap(
-        samples,
-        statistic,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        paired=True,
-        vectorized=True,
-        rng=np.random.default_rng(_BOOTSTRAP_SEED),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    rng = np.random.default_rng(_BOOTSTRAP_SEED)
+    found = stats.bootstrap(samples, statistic, rng=rng, **_BOOTSTRAP)
+    low, high = found.confidence_interval
+    return float(low), float(high)
 
 
 def _share(won: Array, played: Array, axis: int = -1) -> Any:

@@ -68,18 +68,18 @@ class SupportChanges:
         self._errors: list[Array] = []
         self._jumps: list[Array] = []
 
-    def take(self, step: int, q_estimate: Array, observation: Array, truth: Any) -> None:
+    def take(self, step: int, q_estimate: Array, seen: Array, truth: Any) -> None:
         """Take a control step.
 
         Args:
             step: Its number, 0 at the start of the episodes.
             q_estimate: Joint angles as the policy sees them, (num_worlds, 12) [rad].
-            observation: What it saw, (num_worlds, m).
+            seen: Its observation, (num_worlds, m).
             truth: True state at that time, an `elastic_env.robots.thormang.rows.WalkTruth`.
         """
         if step not in self._changes:
             return
-        estimate = local_frame(self._biped, q_estimate, observation[:, self._attitude])
+        estimate = local_frame(self._biped, q_estimate, seen[:, self._attitude])
         true = local_frame(self._biped, truth.q, tilt(truth.pelvis_R))
         old = int(self._support[step - 1])
         new = int(self._support[step])

@@ -1,7 +1,9 @@
 """The table of all episodes of a comparison, a row each: every statistic groups its rows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,61 @@ import pandas as pd
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.residual_seeds import Origin, origin
-from train.evaluate.statistics import Estimate, over_seeds
+from train.evaluate.statistics import Estimate, beats, over_seeds
+
+Groups = Mapping[str, Sequence[str]]
+"""Scenarios to pool over, by the name of the group."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """A policy in one cell, or in the cells of a group of scenarios that are pooled.
+
+    Attributes:
+        policy: Its title.
+        scope: Scenario, or name of the group.
+        is_group: Whether it is a group.
+        cells: Numbers of its cells.
+        conditions: Their conditions.
+    """
+
+    policy: str
+    scope: str
+    is_group: bool
+    cells: tuple[int, ...]
+    conditions: tuple[Condition, ...]
+
+    @property
+    def first(self) -> Condition:
+        """The first condition: all share motion and swept values."""
+        return self.conditions[0]
+
+    @property
+    def reference(self) -> str:
+        """Label of the motion."""
+        return self.first.reference_name
+
+    @property
+    def swept(self) -> dict[str, float]:
+        """Options that a sweep or a map varies, and their values."""
+        return self.first.swept
+
+    @property
+    def is_family(self) -> bool:
+        """True if the policy is a residual, so that it has training seeds."""
+        return self.first.member is not None
+
+    @property
+    def failure(self) -> str:
+        """Name of failures, in the plural."""
+        return self.first.environment.failures
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """Name that scopes of several policies share."""
+        return self.reference, self.scope, self.is_group, *self.swept.items()
 
 
 class EpisodeTable:
@@ -34,7 +88,6 @@ class EpisodeTable:
     """
 
     def __init__(self, evaluations: Sequence[Evaluation]) -> None:
-        self.evaluations = list(evaluations)
         self.environment = evaluations[0].condition.environment
         self.cells: dict[tuple[object, ...], int] = {}
         self.conditions: dict[tuple[str, int], Condition] = {}
@@ -61,13 +114,10 @@ class EpisodeTable:
             ]
         self.rows = pd.DataFrame(records)
         known = self.environment
-        columns = [*known.columns, *known.judged, *known.also]
-        columns += [column for _, split in known.splits for column in split]
-        for metric in {column.metric for column in columns}:
-            values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
-            self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(
-                ~self.rows["failed"]
-            )
+        columns = chain(known.columns, known.judged, known.also, *known.splits.values())
+        metrics = list(dict.fromkeys(column.metric for column in columns))
+        figures = self.rows.reindex(columns=metrics).apply(pd.to_numeric)
+        self.rows[metrics] = figures.astype(np.float64).where(~self.rows["failed"])
 
     @cached_property
     def policies(self) -> list[str]:
@@ -87,12 +137,13 @@ class EpisodeTable:
     @cached_property
     def swept(self) -> list[str]:
         """Names of what a sweep or a map varies."""
-        return list(dict.fromkeys(name for c in self.conditions.values() for name in c.swept))
+        conditions = self.conditions.values()
+        return list(dict.fromkeys(name for c in conditions for name in c.swept))
 
     @cached_property
     def families(self) -> dict[str, Origin]:
         """Residuals by title, with how they were trained."""
-        return {title: origin(list(members.values())) for title, members in self.members.items()}
+        return {title: origin([*own.values()]) for title, own in self.members.items()}
 
     def condition(self, policy: str) -> Condition:
         """The first condition of a policy."""
@@ -109,6 +160,42 @@ class EpisodeTable:
             and reference in (None, c.reference_name)
             and scenario in (None, c.scenario)
         ]
+
+    def scope(self, policy: str, *cells: int, group: str = "") -> Scope:
+        """A policy in a cell, or in those of a group."""
+        conditions = tuple(self.conditions[policy, cell] for cell in cells)
+        name = group or conditions[0].scenario
+        return Scope(policy, name, bool(group), cells, conditions)
+
+    def scopes(self, policy: str, groups: Groups) -> Iterator[Scope]:
+        """Every cell of a policy, and every whole group behind the last of its cells."""
+
+        def place(cell: int) -> tuple[object, ...]:
+            condition = self.conditions[policy, cell]
+            return condition.reference_name, *condition.swept.items()
+
+        cells = self.cells_of(policy)
+        blocks = group_by(cells, place)
+        for cell in cells:
+            yield self.scope(policy, cell)
+            block = blocks[place(cell)]
+            if cell == block[-1]:
+                own = {self.conditions[policy, each].scenario: each for each in block}
+                for name, scenarios in groups.items():
+                    if own.keys() >= set(scenarios):
+                        members = [own[each] for each in scenarios]
+                        yield self.scope(policy, *members, group=name)
+
+    def cells_of_base(self, scope: Scope, base: str) -> list[int]:
+        """Numbers of the base's cells beside those of a scope; fewer where it does not play all.
+
+        A base that is not swept has one cell for all values, its level.
+        """
+        found = []
+        for own in scope.conditions:
+            numbers = [self.cells.get(place, -1) for place in (own.cell, own.cell[:2])]
+            found += [n for n in numbers if (base, n) in self.conditions][:1]
+        return found
 
     def of(self, policy: str, *cells: int) -> pd.DataFrame:
         """Rows of a policy in some cells."""
@@ -127,10 +214,10 @@ def per_seed(
     """A statistic for each training seed and cell, (seeds, cells); nan without a figure."""
     parts: Any = rows.groupby(["member", "cell"])[metric]
     known = {key: own.dropna().to_numpy() for key, own in parts}
-    found = {key: float(statistic(values)) for key, values in known.items() if len(values)}
-    members = rows["member"].unique()
+    found = {key: float(statistic(own)) for key, own in known.items() if len(own)}
     cells = rows["cell"].unique()
-    return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
+    members = rows["member"].unique()
+    return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])
 
 
 def score(
@@ -149,6 +236,36 @@ def score(
 def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
     """An estimate from one value per training seed; without training the value itself."""
     return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
+
+
+def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Episodes of a policy beside those of its base with the same cell and seed.
+
+    Args:
+        mine: Rows of a policy, with `member`, `cell`, `seed` and the metric.
+        base: Rows of the base, one per cell and seed.
+        metric: Name of the metric.
+
+    Returns:
+        A row for each of the policy's, with `member` and `cell`, the metric as `mine` and `base`,
+        and `won`: 1 where the policy is better (lower), one half in a tie. These three are nan
+        where either has no figure.
+
+    Raises:
+        ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
+    """
+    for rows in (mine, base):
+        if rows.duplicated(["member", "cell", "seed"]).any():
+            raise ValueError(
+                f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
+            )
+    theirs = base[["cell", "seed"]].assign(base=base[metric])
+    both = mine[["member", "cell", "seed"]].assign(mine=mine[metric])
+    both = both.merge(theirs, on=["cell", "seed"], how="left")
+    both = both.assign(won=beats(both["mine"], both["base"]))
+    figures = both[["mine", "base", "won"]]
+    both[["mine", "base", "won"]] = figures.where(figures.notna().all(axis=1))
+    return both
 
 
 def failures(rows: pd.DataFrame) -> tuple[int, int]:

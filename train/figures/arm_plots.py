@@ -9,10 +9,10 @@ from baselines.identification.arm_fit import ArmFit
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.pose_model import measurement_unit
 from elastic_env.core.signals import Array
-from train.figures.plots import MRAD, label_text, require_matplotlib, save
+from train.figures.plots import MRAD, label_text, new_figure, save
 
 _COLUMNS = 4
-_LEAST_LEVER = 0.1  # of the largest: poses that show a joint less are left out of its panel
+_LEAST_LEVER = 0.1  # of the largest: its panel leaves out poses that show a joint less
 _LEAST_SEEN = 0.01  # of the largest of all joints
 _MOST_NAMED = 3  # columns of a measurement that a legend names
 _DOTS = "#2a6f97"
@@ -25,20 +25,19 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
     Measured is the predicted deflection and the part of the residual that a deflection of this
     joint alone explains.
     """
-    plt = require_matplotlib()
-    rows = -(-(len(result.joints) + 1) // _COLUMNS)
-    figure, axes = plt.subplots(rows, _COLUMNS, figsize=(3.1 * _COLUMNS, 2.9 * rows), squeeze=False)
-    panels = list(axes.ravel())
+    count = len(result.joints)
+    rows = -(-(count + 1) // _COLUMNS)
+    figure, panels = new_figure(rows, _COLUMNS, (3.1 * _COLUMNS, 2.9 * rows))
     predicted, measured = deflections(fit)
-    for axis, joint, x, y in zip(panels, result.joints, predicted.T, measured.T, strict=False):
-        _draw_joint(axis, x, y)
+    for number, joint in enumerate(result.joints):
+        axis = panels[number]
+        _draw_joint(axis, predicted[:, number], measured[:, number])
         axis.set_title(f"{joint.joint}\n{_stiffness(joint)}", fontsize=9)
-    _draw_residuals(panels[len(result.joints)], fit)
-    for axis in panels[len(result.joints) + 1 :]:
+    _draw_residuals(panels[count], fit)
+    for axis in panels[count + 1 :]:
         axis.set_visible(False)
     figure.supxlabel("predicted deflection θ − q [mrad]", fontsize=10)
     figure.supylabel("measured deflection [mrad]", fontsize=10)
-    figure.tight_layout()
     return save(figure, path)
 
 
@@ -55,7 +54,8 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
     largest = size.max(axis=0)
     seen = size > np.maximum(_LEAST_LEVER**2 * largest, _LEAST_SEEN**2 * largest.max())
     along = np.sum(lever * fit.residual[..., None], axis=1)
-    return predicted, np.where(seen, predicted + along / np.where(seen, size, 1.0), np.nan)
+    measured = predicted + along / np.where(seen, size, 1.0)
+    return predicted, np.where(seen, measured, np.nan)
 
 
 def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
@@ -78,16 +78,19 @@ def _draw_residuals(axis: Any, fit: ArmFit) -> None:
     spread = f"spread {factor * fit.spread:.3g} {shown}"
     axis.set_title(f"residual [{shown}] by pose\n{spread}", fontsize=9)
     if len(_names(fit)) <= _MOST_NAMED:
-        axis.legend(fontsize=7, ncols=3, handletextpad=0.1, columnspacing=0.6, loc="upper right")
+        close = {"handletextpad": 0.1, "columnspacing": 0.6}
+        axis.legend(fontsize=7, ncols=3, loc="upper right", **close)
     else:
         axis.set_xlabel("a colour per joint, in their order", fontsize=8)
 
 
 def _names(fit: ArmFit) -> tuple[str, ...]:
-    return ("tilt 1", "tilt 2") if fit.model.log.kind == "imu" else fit.model.log.columns
+    log = fit.model.log
+    return ("tilt 1", "tilt 2") if log.kind == "imu" else log.columns
 
 
 def _stiffness(joint: Any) -> str:
     if joint.stiffness_high_nm_per_rad is None:
         return "not told apart"
-    return f"K = {joint.stiffness_nm_per_rad:.4g} N·m/rad ± {100 * joint.half_width:.2g} %"
+    bound = f"± {100 * joint.half_width:.2g} %"
+    return f"K = {joint.stiffness_nm_per_rad:.4g} N·m/rad {bound}"

@@ -6,6 +6,7 @@ Pictures and the page of a report draw the same charts.
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
 from train.figures.colours import REFERENCE, dash_of
 
+Colours = Mapping[str, str]
+"""Colour of every policy."""
 Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
 
@@ -34,6 +37,8 @@ class Curve:
         width: Width of the line.
         has_points: Whether its points are marked.
         fails: Whether a cross marks its end.
+        crosses: Whether each point is a filled cross or an open one, in place of a line; empty for
+            a line.
     """
 
     name: str
@@ -45,6 +50,7 @@ class Curve:
     width: float = 1.4
     has_points: bool = False
     fails: bool = False
+    crosses: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +62,16 @@ class Panel:
         curves: What it shows.
         limits: Ends of its axis; None for those of the curves.
         is_log: Whether its axis is logarithmic.
-        height: Its share of the height.
+        height: Its height in a picture [in].
+        rows: Names of rows in place of numbers, from the top; a curve has the row as its y.
     """
 
     label: str
     curves: Sequence[Curve]
     limits: tuple[float, float] | None = None
     is_log: bool = False
-    height: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Failing:
-    """Values at which a policy fails, each in all or in some of its episodes."""
-
-    name: str
-    colour: str
-    x: Sequence[float]
-    is_all: Sequence[bool]
+    height: float = 1.9
+    rows: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +85,7 @@ class Chart:
         shaded: Beginnings and ends of what is shaded.
         shade_name: Name of that in the legend.
         ticks: Values of a logarithmic axis; None for a linear one.
-        failing: Policies that fail somewhere, each in a row on top.
-        failure: Title of these rows.
-        width, height: Size of a picture [in].
-        panel_height: Height of a panel on a page [px].
+        width: Width of a picture [in].
     """
 
     title: str
@@ -99,17 +94,13 @@ class Chart:
     shaded: Sequence[tuple[float, float]] = ()
     shade_name: str = "single support"
     ticks: Sequence[float] | None = None
-    failing: Sequence[Failing] = ()
-    failure: str = ""
     width: float = 9.0
-    height: float = 5.2
-    panel_height: int = 165
 
 
 def time_chart(
     policies: Mapping[str, Sequence[Evaluation]],
     signals: Sequence[TracedSignal],
-    colours: Mapping[str, str],
+    colours: Colours,
     most_points: int | None = None,
 ) -> Chart:
     """Signals of the first episodes over time; over training seeds the median with its band.
@@ -122,24 +113,29 @@ def time_chart(
         colours: Of the policies.
         most_points: Points of a curve, about; None for all.
     """
-    traces = [e.trace for own in policies.values() for e in own]
-    longest = max(traces, key=lambda trace: len(trace["time_s"]))
+    every = list(chain(*policies.values()))
+    longest = _longest(every)
     time_s = longest["time_s"]
     stride = 1 if most_points is None else max(1, -(-len(time_s) // most_points))
     panels = []
     for signal in signals:
-        curves = []
-        for title, own in policies.items():
-            curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
+        curves = [
+            _median_curve(title, colours[title], own, signal, stride)
+            for title, own in policies.items()
+        ]
         if signal.reference is not None:
-            reference = signal.scale * longest[signal.reference][::stride]
-            style = {"dash": "dash", "width": 1.1}
-            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, **style))
-        limits = _limits([e for own in policies.values() for e in own], signal)
-        panels.append(Panel(signal.label, curves, limits))
+            y = signal.scale * longest[signal.reference][::stride]
+            look = (REFERENCE, time_s[::stride], y, "dash")
+            curves.append(Curve("reference", *look, width=1.1))
+        panels.append(Panel(signal.label, curves, _limits(every, signal)))
     single = longest.get("single_support", np.zeros(len(time_s)))
-    shaded = intervals(single, time_s)
-    return Chart("", "time [s]", panels, shaded=shaded)
+    return Chart("", "time [s]", panels, shaded=intervals(single, time_s))
+
+
+def _longest(evaluations: Sequence[Evaluation]) -> Mapping[str, Array]:
+    """The longest trace."""
+    traces = [e.trace for e in evaluations]
+    return max(traces, key=lambda trace: len(trace["time_s"]))
 
 
 def _median_curve(
@@ -147,18 +143,17 @@ def _median_curve(
     colour: str,
     own: Sequence[Evaluation],
     signal: TracedSignal,
-    time_s: Array,
     stride: int,
 ) -> Curve:
-    length = max(len(e.trace["time_s"]) for e in own)
-    values = np.full((len(own), length), np.nan)
+    time_s = _longest(own)["time_s"]
+    values = np.full((len(own), len(time_s)), np.nan)
     for row, e in zip(values, own, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
     low, middle, high = spread(values[:, ::stride])
     return Curve(
         title,
         colour,
-        time_s[:length:stride],
+        time_s[::stride],
         middle,
         dash=dash_of(title),
         band=(low, high) if len(own) > 1 else None,
@@ -169,7 +164,8 @@ def _median_curve(
 def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[float, float]:
     """Range of a signal and its reference, shortly before a fall left out, with a margin."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
-    values = np.concatenate([e.trace[name][e.is_steady] for e in evaluations for name in names])
+    parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
+    values = np.concatenate(parts)
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:
         return -1.0, 1.0
@@ -188,7 +184,8 @@ def spread(values: Array) -> tuple[Array, Array, Array]:
     """Least, median and most over the first axis, nan where there is nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
-        return np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0)
+        low, middle, high = np.nanquantile(values, [0.0, 0.5, 1.0], axis=0)
+    return low, middle, high
 
 
 def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
@@ -197,12 +194,15 @@ def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
     return Estimate(float(np.median(values)) if len(values) else float("nan"))
 
 
+Statistic = Callable[[Sequence[Evaluation], Column], Estimate]
+
+
 def sweep_chart(
     cells: Cells,
     columns: Sequence[Column],
     label: str,
-    colours: Mapping[str, str],
-    statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
+    colours: Colours,
+    statistic: Statistic = median,
 ) -> Chart:
     """Scores over a swept value, a curve or a level per policy; on top, who fails where.
 
@@ -213,64 +213,61 @@ def sweep_chart(
         colours: Of the policies.
         statistic: Over the episodes of a cell [SI].
     """
-    values = sorted({value for own in cells.values() for value in own if value is not None})
-    panels = []
+    swept = {*chain(*cells.values())}
+    values = sorted(value for value in swept if value is not None)
+    panels = _failures(cells, values, colours)
     for column in columns:
         curves = []
         for title, own in cells.items():
             is_level = None in own
-            x = [values[0], values[-1]] if is_level else [value for value in values if value in own]
-            keys = [None, None] if is_level else x
-            found = [statistic(own[key], column).times(column.scale) for key in keys]
-            low, high = np.array([estimate.ends for estimate in found]).T
-            has_band = not is_level and any(estimate.has_interval for estimate in found)
+            x = [value for value in values if value in own]
+            if is_level:
+                x = [values[0], values[-1]]
+            found = [statistic(own[None if is_level else key], column) for key in x]
+            shown = [estimate.times(column.scale) for estimate in found]
+            low, high = np.array([estimate.ends for estimate in shown]).T
+            has_band = not is_level and any(estimate.has_interval for estimate in shown)
             curve = Curve(
                 title,
                 colours[title],
                 np.array(x),
-                np.array([estimate.value for estimate in found]),
+                np.array([estimate.value for estimate in shown]),
                 dash="dot" if is_level else dash_of(title),
                 band=(low, high) if has_band else None,
                 width=1.6,
                 has_points=not is_level,
             )
             curves.append(curve)
-        panels.append(Panel(column.label, curves, is_log=True, height=2.2))
-    failing = [_failing(title, colours[title], own, values) for title, own in cells.items()]
-    failing = [policy for policy in failing if policy.x]
-    first = next(e for own in cells.values() for cell in own.values() for e in cell).condition
-    height = 2.2 * len(columns) + 1.6 + (0.16 * len(failing) + 0.2 if failing else 0.0)
-    return Chart(
-        "",
-        label,
-        panels,
-        ticks=values,
-        failing=failing,
-        failure=first.environment.failure,
-        width=8.0,
-        height=height,
-        panel_height=300,
-    )
+        panels.append(Panel(column.label, curves, is_log=True, height=2.4))
+    return Chart("", label, panels, ticks=values, width=8.0)
 
 
-def _failing(
-    title: str,
-    colour: str,
-    own: Mapping[float | None, Sequence[Evaluation]],
-    values: Sequence[float],
-) -> Failing:
-    """Values at which a policy fails; a level fails at all of them."""
-    shares = {}
-    for value in values:
-        cell = own.get(value, own.get(None, ()))
-        failed = sum(e.num_failed for e in cell)
-        if failed:
-            shares[value] = failed == sum(len(e.episodes) for e in cell)
-    return Failing(title, colour, list(shares), list(shares.values()))
+def _failures(cells: Cells, values: Sequence[float], colours: Colours) -> list[Panel]:
+    """A panel with a row for each policy that fails somewhere; none where nobody does."""
+    rows = []
+    curves = []
+    for title, own in cells.items():
+        shares = {}
+        for value in values:
+            cell = own.get(value, own.get(None, ()))  # a level fails at all of them
+            failed = sum(e.num_failed for e in cell)
+            if failed:
+                shares[value] = failed == sum(len(e.episodes) for e in cell)
+        if shares:
+            y = np.full(len(shares), float(len(rows)))
+            x = np.array(list(shares))
+            crosses = list(shares.values())
+            curves.append(Curve("", colours[title], x, y, crosses=crosses))
+            rows.append(title)
+    first = next(e for own in cells.values() for e in chain(*own.values())).condition
+    limits = (len(rows) - 0.4, -0.6)
+    height = 0.2 * len(rows) + 0.2
+    panel = Panel(first.environment.failure, curves, limits, height=height, rows=rows)
+    return [panel] if rows else []
 
 
 def learning_chart(
-    learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]
+    learning: Mapping[str, Curves], columns: Sequence[Column], colours: Colours
 ) -> Chart:
     """Share of the base's score during a training: median over training seeds with its band."""
     panels = []
@@ -283,14 +280,13 @@ def learning_chart(
             line = {"band": band, "width": 2.0, "has_points": True}
             curves.append(Curve(title, colours[title], found.decisions, middle, **line))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
-        all_ratios = np.concatenate(
-            [own.ratios[column.metric].ravel() for own in learning.values()]
-        )
-        top = float(np.nanmax(all_ratios, initial=1.0))
+        ratios = [own.ratios[column.metric].ravel() for own in learning.values()]
+        all_ratios = np.concatenate(ratios)
+        top = min(float(np.nanmax(all_ratios, initial=1.0)), 2.0)
         curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
-        limits = (0.0, 1.08 * min(float(top), 2.0))
-        panels.append(Panel(f"{column.title}, share of the base's", curves, limits))
-    return Chart("", "decisions of all worlds", panels, panel_height=260)
+        label = f"{column.title}, share of the base's"
+        panels.append(Panel(label, curves, (0.0, 1.08 * top), height=2.4))
+    return Chart("", "decisions of all worlds", panels)
 
 
 def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
@@ -309,9 +305,11 @@ def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -
         values = column.scale * np.array(found)
         values[failed] = np.nan
         counts = np.isfinite(values).sum(axis=1)
-        means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
+        sums = np.nansum(values, axis=1)
+        means = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
         curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
-        curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
+        look = {"width": 2.0, "has_points": True}
+        curves.append(Curve("mean", "#2a6f97", numbers, means, **look))
         limits = (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))
         panels.append(Panel(column.label, curves, limits))
-    return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))
+    return Chart(title, "trials learned from", panels, width=7.0)

@@ -3,19 +3,21 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from train.evaluate.conditions import Condition
-from train.evaluate.environments import TracedSignal
+from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap
 from train.evaluate.rollout import make_vector_env
-from train.figures.chart import Cells, Chart, Curve, sweep_chart, time_chart
+from train.figures.chart import Cells, Curve, Panel, median, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
-from train.figures.plots import draw_chart, draw_overview
+from train.figures.plots import Evaluations, draw_chart, draw_overview
 from train.figures.testbed_plots import draw_static_errors
 
 _MIN_SWEPT_REFERENCES = 3
@@ -24,19 +26,12 @@ _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
 _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
 _PAPER_SCENARIOS = ("ideal", "nominal")
-_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad") for name in ("roll", "pitch"))
-_ZMP = (
-    TracedSignal("x, forward", "zmp_x", "mm", reference="zmp_reference_x"),
-    TracedSignal("y, to the left", "zmp_y", "mm", reference="zmp_reference_y"),
-)
-_LINK = (
-    TracedSignal("q_ref", "reference_angle", "rad"),
-    TracedSignal("link error q_ref − q", "link_error", "mrad"),
-)
+_SUBJECTS = {"pelvis": "Pelvis error. ", "zmp": "Zero moment point. "}
+"""Beginnings of the titles of pictures of a walk."""
 
 
 def draw_figures(
-    evaluations: Sequence[Evaluation],
+    evaluations: Evaluations,
     folder: Path,
     policies: Sequence[str] = (),
     swept: str | None = None,
@@ -49,41 +44,78 @@ def draw_figures(
         policies: Policies of the time series, all if empty.
         swept: Title of the axis of swept options; None without a sweep.
     """
-    cells = cells_together(evaluations)
-    if swept is not None:
-        paths = {folder / f"sweep_{_stem(own[0])}.png": own for own in cells}
-        return [draw_sweep(own, by_option(own), swept, path) for path, own in paths.items()]
     known = evaluations[0].condition.environment
-    files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
-    for scenario in swept_scenarios(evaluations):
-        own = [e for e in evaluations if e.condition.scenario == scenario]
-        path = folder / f"sweep_{_safe(scenario)}.png"
-        files.append(draw_sweep(own, by_reference(own), f"{known.quantity} [s]", path))
-    for group in cells:
-        shown = [e for e in group if not policies or e.condition.policy.title in policies]
-        for name in known.figures:
-            files += draw_figure(name, shown, folder)
+    files = []
+    for name, chart in sweep_charts(evaluations, swept, known.swept).items():
+        files.append(draw_chart(chart, folder / f"sweep_{name}.png"))
+    if swept is not None:
+        return files
+    files.insert(0, draw_overview(evaluations, known.swept[0], folder / "overview.png"))
+    for group in cells_together(evaluations):
+        by_policy = group_by(group, lambda e: e.condition.policy.title)
+        shown = [own for t, own in by_policy.items() if not policies or t in policies]
+        files += draw_signals(list(chain(*shown)), folder) if shown else []
     return files
 
 
 def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
-    names = [_safe(f"{found.title}_{found.column.metric}") for found in maps]
-    return [draw_map(m, folder / f"map_{name}.png") for m, name in zip(maps, names, strict=True)]
+    files = []
+    for found in maps:
+        name = _safe(f"{found.title}_{found.column.metric}")
+        files.append(draw_map(found, folder / f"map_{name}.png"))
+    return files
 
 
-def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
-    """Draw a figure of one reference and scenario, if there is something to show.
+def draw_signals(evaluations: Evaluations, folder: Path) -> list[Path]:
+    """Draw the signals of one motion and scenario over time, and what it shows at rest.
 
     Args:
-        name: Name in the environment's description.
-        evaluations: The policies.
+        evaluations: The policies, a line each.
         folder: Where to.
     """
-    if not evaluations or (name == "static" and evaluations[0].points is None):
-        return []
-    path = folder / f"{figure_name(name, evaluations[0])}.png"
-    return [_FIGURES[name](evaluations, path)]
+    first = evaluations[0]
+    known = first.condition.environment
+    files = []
+    for name, signals in group_by(known.curves, lambda signal: signal.picture).items():
+        if name:
+            path = folder / f"{figure_name(name, first)}.png"
+            files.append(draw_picture(name, signals, evaluations, path))
+    if first.points is not None:
+        path = folder / f"{figure_name('static', first)}.png"
+        model = make_vector_env(first.condition, 1).unwrapped.assumed_model
+        files.append(draw_static_errors(evaluations, model, path))
+    return files
+
+
+def draw_picture(
+    name: str, signals: Sequence[TracedSignal], evaluations: Evaluations, path: Path
+) -> Path:
+    """Draw signals of several policies over time, as Figs. 7 to 10 of the paper."""
+    condition = evaluations[0].condition
+    policies = {e.condition.policy.title: [e] for e in evaluations}
+    chart = time_chart(policies, signals, policy_colours(list(policies)))
+    number = paper_figure(name, condition)
+    title = f"{_SUBJECTS.get(name, '')}{_title(condition)}"
+    if number is not None:
+        title = f"{title} (cf. Fig. {number} of the paper)"
+        if name == "pelvis":
+            chart = replace(chart, panels=list(map(_with_bounds, chart.panels)))
+    return draw_chart(replace(chart, title=title), path)
+
+
+def _with_bounds(panel: Panel) -> Panel:
+    """A panel of the pelvis error with the bounds that the paper's stays in."""
+    bound = _PAPER_BOUND_MRAD
+    name = f"paper, compensated: ±{bound:.0f} mrad"
+    ends = panel.curves[0].x[[0, -1]]
+    bounds = [
+        Curve(label, "#777777", ends, np.full(2, y), dash="dot", width=0.9)
+        for label, y in ((name, bound), ("", -bound))
+    ]
+    low, high = panel.limits or (0.0, 0.0)
+    limits = (min(low, -1.2 * bound), max(high, 1.2 * bound))
+    return replace(panel, curves=[*panel.curves, *bounds], limits=limits)
 
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
@@ -99,107 +131,71 @@ def paper_figure(name: str, condition: Condition) -> int | None:
     return numbers.get(condition.reference_name)
 
 
-def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+def cells_together(evaluations: Evaluations) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    cells = group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario))
+    cells = group_by(evaluations, lambda e: e.condition.cell[:2])
     return list(cells.values())
 
 
-def by_option(evaluations: Sequence[Evaluation]) -> Cells:
+def by_option(evaluations: Evaluations) -> Cells:
     """Evaluations of every policy by the swept value; None for a policy that was not swept."""
     return _by_policy(evaluations, lambda e: next(iter(e.condition.swept.values()), None))
 
 
-def by_reference(evaluations: Sequence[Evaluation]) -> Cells:
+def by_reference(evaluations: Evaluations) -> Cells:
     """Evaluations of every policy by the number of the reference, such as the step period [s]."""
     numbered = [e for e in evaluations if e.condition.number is not None]
     return _by_policy(numbered, lambda e: e.condition.number)
 
 
-def _by_policy(
-    evaluations: Sequence[Evaluation], key: Callable[[Evaluation], float | None]
-) -> Cells:
+def _by_policy(evaluations: Evaluations, key: Callable[[Evaluation], Any]) -> Cells:
     policies = group_by(evaluations, lambda e: e.condition.policy.title)
     return {title: group_by(own, key) for title, own in policies.items()}
 
 
-def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Scenarios in which the references that are played are points of one axis."""
-    by_scenario = group_by(evaluations, lambda e: e.condition.scenario)
-    return [scenario for scenario, own in by_scenario.items() if has_swept_references(own)]
+def sweep_charts(
+    evaluations: Evaluations,
+    swept: str | None,
+    columns: Sequence[Column],
+    statistic: Any = median,
+) -> dict[str, Any]:
+    """Scores over a swept option, or over what the references differ in.
+
+    Args:
+        evaluations: All cells.
+        swept: Title of the axis of swept options; None without a sweep.
+        columns: A panel for each.
+        statistic: See `sweep_chart`.
+
+    Returns:
+        Charts by the ends of the names of their files.
+    """
+    known = evaluations[0].condition.environment
+    colours = policy_colours([e.condition.policy.title for e in evaluations])
+    found = {}
+    if swept is not None:
+        for own in cells_together(evaluations):
+            chart = sweep_chart(by_option(own), columns, swept, colours, statistic)
+            found[_stem(own[0])] = replace(chart, title=_title(own[0].condition))
+        return found
+    for scenario, own in group_by(evaluations, lambda e: e.condition.scenario).items():
+        if has_swept_references(own):
+            label = f"{known.quantity} [s]"
+            chart = sweep_chart(by_reference(own), columns, label, colours, statistic)
+            found[_safe(scenario)] = replace(chart, title=f"Scenario {scenario}")
+    return found
 
 
-def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
+def _title(condition: Condition) -> str:
+    motion = condition.environment.title(condition.reference_name)
+    return f"{motion[:1].upper()}{motion[1:]}, scenario {condition.scenario}"
+
+
+def has_swept_references(evaluations: Evaluations) -> bool:
     """True if enough references have a number, and each one of its own: points of one axis."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
-
-
-def draw_sweep(evaluations: Sequence[Evaluation], cells: Cells, label: str, path: Path) -> Path:
-    """Medians against a swept value, a curve per policy; on top, who fails where."""
-    condition = evaluations[0].condition
-    references = {e.condition.reference_name for e in evaluations}
-    title = f"scenario {condition.scenario}"
-    if len(references) == 1:
-        title = f"{condition.environment.title(*references)}, {title}"
-    chart = sweep_chart(cells, condition.environment.swept, label, policy_colours(list(cells)))
-    return draw_chart(replace(chart, title=title[0].upper() + title[1:]), path)
-
-
-def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Reference and link error over time, one line per policy."""
-    condition = evaluations[0].condition
-    chart = _over_time(evaluations, _LINK)
-    reference, error = chart.panels
-    once = replace(reference.curves[0], name="", colour="#333333", dash="solid")
-    panels = [replace(reference, curves=[once]), replace(error, height=2.0)]
-    title = f"{condition.reference_name}, scenario {condition.scenario}"
-    return draw_chart(replace(chart, panels=panels, title=title, width=8.0, height=5.0), path)
-
-
-def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Roll and pitch of the pelvis, one line per policy, as Figs. 7 and 8 of the paper."""
-    title = _walk_title(evaluations, "pelvis", "Pelvis error")
-    chart = _over_time(evaluations, _PELVIS, title)
-    if paper_figure("pelvis", evaluations[0].condition) is None:
-        return draw_chart(chart, path)
-    panels = []
-    for panel in chart.panels:
-        ends = panel.curves[0].x[[0, -1]]
-        bounds = [
-            Curve(name, "#777777", ends, np.full(2, bound), dash="dot", width=0.9)
-            for name, bound in (
-                ("paper, compensated: ±10 mrad", _PAPER_BOUND_MRAD),
-                ("", -_PAPER_BOUND_MRAD),
-            )
-        ]
-        low, high = panel.limits or (0.0, 0.0)
-        limits = (min(low, -1.2 * _PAPER_BOUND_MRAD), max(high, 1.2 * _PAPER_BOUND_MRAD))
-        panels.append(replace(panel, curves=[*panel.curves, *bounds], limits=limits))
-    return draw_chart(replace(chart, panels=panels), path)
-
-
-def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
-    title = _walk_title(evaluations, "zmp", "Zero moment point")
-    return draw_chart(_over_time(evaluations, _ZMP, title), path)
-
-
-def _over_time(
-    evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = ""
-) -> Chart:
-    policies = {e.condition.policy.title: [e] for e in evaluations}
-    chart = time_chart(policies, signals, policy_colours(list(policies)))
-    return replace(chart, title=title)
-
-
-def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> str:
-    condition = evaluations[0].condition
-    number = paper_figure(name, condition)
-    beside = "" if number is None else f" (cf. Fig. {number} of the paper)"
-    reference = condition.environment.title(condition.reference_name)
-    return f"{subject}, {reference}, scenario {condition.scenario}{beside}"
 
 
 def _stem(evaluation: Evaluation) -> str:
@@ -209,16 +205,3 @@ def _stem(evaluation: Evaluation) -> str:
 
 def _safe(text: str) -> str:
     return re.sub(r"[^\w.=+-]+", "_", text)
-
-
-def _draw_static(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    model = make_vector_env(evaluations[0].condition, 1).unwrapped.assumed_model
-    return draw_static_errors(evaluations, model, path)
-
-
-_FIGURES: dict[str, Callable[[Sequence[Evaluation], Path], Path]] = {
-    "time": draw_time_series,
-    "static": _draw_static,
-    "pelvis": draw_pelvis,
-    "zmp": draw_zmp,
-}

@@ -7,7 +7,7 @@ import numpy as np
 
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import HeldOut
-from train.figures.plots import require_matplotlib, save
+from train.figures.plots import new_figure, save, show_numbers
 
 _OWN = "#2a6f97"
 _OTHER = "#9aa5b1"
@@ -17,17 +17,14 @@ _ROW = 0.24
 
 def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
     """Held-out errors beside rivals, the error over the number of poses, K of each joint."""
-    plt = require_matplotlib()
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    shown = [joint for joint in result.joints if np.isfinite(joint.stiffness_nm_per_rad)]
+    shown = [own for own in result.joints if np.isfinite(own.stiffness_nm_per_rad)]
     panels = 1 if result.held_out is None else 3
     height = max(_HEIGHT, _ROW * len(shown) + 1.2)
-    figure, axes = plt.subplots(1, panels, figsize=(4.3 * panels, height), squeeze=False)
+    figure, axes = new_figure(1, panels, (4.3 * panels, height))
     if result.held_out is not None:
-        _draw_errors(axes[0, 0], result.held_out)
-        _draw_curve(axes[0, 1], result.held_out)
-    axis = axes[0, -1]
+        _draw_errors(axes[0], result.held_out)
+        _draw_curve(axes[1], result.held_out)
+    axis = axes[-1]
     axis.set_title("K [N·m/rad] with 95 % intervals")
     for row, joint in enumerate(shown):
         low = joint.stiffness_low_nm_per_rad
@@ -37,17 +34,9 @@ def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
         axis.plot(K, row, "o", color=_OWN, ms=5)
     axis.set_yticks(range(len(shown)), [joint.joint for joint in shown], fontsize=8)
     axis.set_xscale("log")
-    # plain numbers: ours are no formulas, and those between the decades would overlap
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
-    axis.xaxis.set_major_formatter(FuncFormatter(_plain))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    show_numbers(axis.xaxis, numticks=6)  # those between the decades would overlap
     axis.invert_yaxis()
-    figure.tight_layout()
     return save(figure, path)
-
-
-def _plain(value: float, _: int) -> str:
-    return f"{value:g}"
 
 
 def _draw_errors(axis: Any, held_out: HeldOut) -> None:
@@ -62,15 +51,12 @@ def _draw_errors(axis: Any, held_out: HeldOut) -> None:
 
 
 def _draw_curve(axis: Any, held_out: HeldOut) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     poses = [point.poses for point in held_out.curve]
     axis.plot(poses, [point.rms_mm for point in held_out.curve], "o-", color=_OWN)
-    axis.axhline(held_out.errors[0].rms_mm, color=_OTHER, lw=1.0, ls="--")
-    axis.text(poses[0], held_out.errors[0].rms_mm, "rigid, as given", fontsize=8, va="bottom")
+    rigid = held_out.errors[0].rms_mm
+    axis.axhline(rigid, color=_OTHER, lw=1.0, ls="--")
+    axis.text(poses[0], rigid, "rigid, as given", fontsize=8, va="bottom")
     axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(FuncFormatter(_plain))
-    axis.yaxis.set_minor_formatter(NullFormatter())
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    show_numbers(axis.yaxis)
     axis.set_xlabel("poses that were fitted")
     axis.set_title("identified: rms [mm] over poses")

@@ -15,7 +15,7 @@ from train.evaluate.changes import BEST_ANALYTIC, SIGNS, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
 from train.figures.colours import INK, policy_colours
-from train.figures.plots import require_matplotlib, save
+from train.figures.plots import new_figure, save
 
 _AHEAD = "#1a7f5a"
 _BEHIND = "#b42318"
@@ -26,6 +26,9 @@ _STRONGEST_CHANGE = 1.0
 """Share of a colour in the strongest square, and the change from which on it has that share."""
 _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
+
+
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,9 @@ class Panel:
     title: str
     x_label: str
     y_label: str
-    x_ticks: tuple[str, ...]
-    y_ticks: tuple[str, ...]
-    squares: tuple[tuple[Square, ...], ...]
+    x_ticks: list[str]
+    y_ticks: list[str]
+    squares: list[list[Square]]
     is_main: bool = True
     key: tuple[tuple[str, str, str], ...] = ()
 
@@ -75,7 +78,8 @@ class Panel:
 def panels(heat_map: HeatMap) -> list[Panel]:
     """Who is best, every residual against the best without learning, and every policy's score."""
     column = heat_map.column
-    policies = heat_map.policies
+    policies = heat_map.table.policies
+    x_ticks, y_ticks = heat_map.ticks
     shades = policy_colours(policies)
     # a map with more policies than letters would not be readable
     letters = dict(zip(policies, ascii_uppercase, strict=False))
@@ -89,17 +93,17 @@ def panels(heat_map: HeatMap) -> list[Panel]:
     def panel(title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
         return Panel(
             title=title,
-            x_label=heat_map.x.title,
-            y_label=heat_map.y.title,
-            x_ticks=tuple(heat_map.x.ticks(heat_map.known)),
-            y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
-            squares=tuple(tuple(map(square, row)) for row in heat_map.cells),
+            x_label=heat_map.axes.x.title,
+            y_label=heat_map.axes.y.title,
+            x_ticks=x_ticks,
+            y_ticks=y_ticks,
+            squares=[list(map(square, row)) for row in heat_map.cells],
             **more,
         )
 
     best = partial(_best_square, column=column, letters=letters, shades=shades)
     found = [panel(f"Best policy, and its {column.label}", best, key=key)]
-    for title in heat_map.families:
+    for title in heat_map.table.members:
         change = partial(_change_square, title=title, letters=rival_letters)
         what = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
         found.append(panel(what, change))
@@ -111,13 +115,11 @@ def panels(heat_map: HeatMap) -> list[Panel]:
 
 def draw_map(heat_map: HeatMap, path: Path) -> Path:
     """Draw the main panels of a map, one below the other, in a width that a telephone shows."""
-    plt = require_matplotlib()
     shown = [panel for panel in panels(heat_map) if panel.is_main]
-    columns = len(heat_map.x.values)
-    rows = len(heat_map.y.values)
+    columns, rows = map(len, heat_map.ticks)
     size = max(0.72 * columns + 0.9, 4.4), (0.5 * rows + 1.25) * len(shown) + 0.35
-    figure, axes = plt.subplots(len(shown), 1, figsize=size, squeeze=False, layout="constrained")
-    for axis, panel in zip(axes[:, 0], shown, strict=True):
+    figure, axes = new_figure(len(shown), 1, size)
+    for axis, panel in zip(axes, shown, strict=True):
         _draw_panel(axis, panel)
     figure.suptitle(heat_map.title, fontsize=9, color="#59636e")
     return save(figure, path)
@@ -128,9 +130,10 @@ def _best_square(
 ) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
-    value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
+    value = _figure(cell.levels[cell.best].value, column)
     small = f"{value}{_falls(cell.failed[cell.best])}"
-    return Square(letters.get(cell.best, "?"), small, blend(shades[cell.best], _BEST_SHARE))
+    colour = blend(shades[cell.best], _BEST_SHARE)
+    return Square(letters.get(cell.best, "?"), small, colour)
 
 
 def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Square:
@@ -147,26 +150,24 @@ def _change_square(cell: MapCell, title: str, letters: Mapping[str, str]) -> Squ
     return Square(text, f"{small}{falls}".strip(), colour)
 
 
-def _score_square(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
-    if title not in cell.levels or not np.isfinite(cell.levels[title].value):
-        return Square("-", _falls(cell.failed.get(title, (0, 0))).strip(), _EMPTY)
+def _score_square(cell: MapCell, title: str, column: Column, ends: Ends) -> Square:
+    falls = _falls(cell.failed.get(title, (0, 0))).strip()
+    if title not in cell.levels or not cell.levels[title].is_known:
+        return Square("-", falls, _EMPTY)
     value = cell.levels[title].value
     low, high = map(math.log, ends)
     share = (math.log(max(value, ends[0])) - low) / (high - low) if high > low else 0.0
-    return Square(
-        f"{column.scale * value:.{_decimals(column)}f}",
-        _falls(cell.failed[title]).strip(),
-        blend(_SCORE, 0.06 + (_STRONGEST - 0.06) * share),
-    )
+    colour = blend(_SCORE, 0.06 + (_STRONGEST - 0.06) * share)
+    return Square(_figure(value, column), falls, colour)
 
 
 def _falls(failed: tuple[int, int]) -> str:
     return f" ✕{failed[0]}/{failed[1]}" if failed[0] else ""
 
 
-def _decimals(column: Column) -> int:
-    """Decimals in a square, where there is little room."""
-    return min(column.decimals, 1)
+def _figure(value: float, column: Column) -> str:
+    """A score in a square, where there is little room."""
+    return f"{column.scale * value:.{min(column.decimals, 1)}f}"
 
 
 def blend(colour: str, share: float) -> str:
@@ -204,8 +205,9 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         axis.spines[side].set_visible(False)
     if panel.key:
         text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
-        below = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "top"}
-        axis.annotate(_wrap(text, 60), (0.0, 0.0), (0, -34), fontsize=8, **below)
+        place = {"xycoords": "axes fraction", "textcoords": "offset points"}
+        below = _wrap(text, 60)
+        axis.annotate(below, (0.0, 0.0), (0, -34), fontsize=8, va="top", **place)
 
 
 def _wrap(text: str, width: int = 52) -> str:

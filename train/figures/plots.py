@@ -1,7 +1,7 @@
 """Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
 from train.runs.escaping import visible
 
+Evaluations = Sequence[Evaluation]
 MRAD = 1e3
 """Factor from rad to what figures show."""
 
@@ -32,24 +33,16 @@ def require_matplotlib() -> Any:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    plt.rcParams.update(
-        {
-            "figure.dpi": 130,
-            "font.size": 10,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.grid": True,
-            "axes.axisbelow": True,
-            "grid.alpha": 0.25,
-            "legend.frameon": False,
-            "axes.titlesize": 11,
-            "axes.titleweight": "bold",
-            "axes.titlelocation": "left",
-            "text.parse_math": False,  # a label of the user's is no formula
-            "text.usetex": False,
-        }
-    )
+    plt.style.use(Path(__file__).with_name("pictures.mplstyle"))
     return plt
+
+
+def new_figure(rows: int, columns: int, size: tuple[float, float], **shape: Any) -> Any:
+    """A figure of a size [in], and its axes row by row."""
+    plt = require_matplotlib()
+    shape |= {"figsize": size, "squeeze": False, "layout": "constrained"}
+    figure, axes = plt.subplots(rows, columns, **shape)
+    return figure, list(axes.flat)
 
 
 def label_text(name: str) -> str:
@@ -80,34 +73,29 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 
     A filled cross on top stands where all episodes of a policy failed, an open one where some did.
     """
-    plt = require_matplotlib()
-    rows = [0.16 * len(chart.failing) + 0.2] if chart.failing else []
-    figure, axes = plt.subplots(
-        len(rows) + len(chart.panels),
-        1,
-        figsize=(chart.width, chart.height),
-        sharex=True,
-        squeeze=False,
-        height_ratios=[*rows, *(panel.height for panel in chart.panels)],
-        layout="constrained",
-    )
-    axes = list(axes[:, 0])
-    if chart.failing:
-        _draw_failing(axes[0], chart)
-    for axis, panel in zip(axes[len(rows) :], chart.panels, strict=True):
+    heights = [panel.height for panel in chart.panels]
+    size = (chart.width, sum(heights) + 1.2)
+    shape = {"sharex": True, "height_ratios": heights}
+    figure, axes = new_figure(len(heights), 1, size, **shape)
+    for axis, panel in zip(axes, chart.panels, strict=True):
+        shade = {"color": "#e9ebee", "lw": 0, "zorder": 0, "label": chart.shade_name}
         for begin, end in chart.shaded:
-            axis.axvspan(begin, end, color="#e9ebee", lw=0, zorder=0, label=chart.shade_name)
+            axis.axvspan(begin, end, **shade)
         for curve in panel.curves:
             _draw_curve(axis, curve, panel.limits)
         axis.set_ylabel(panel.label)
         axis.grid(axis="x", visible=chart.ticks is not None)
         if panel.is_log:
             axis.set_yscale("log")
-            _show_numbers(axis.yaxis)
+            show_numbers(axis.yaxis)
         if panel.limits is not None:
             axis.set_ylim(*panel.limits)
-            if panel.limits[0] < 0.0 < panel.limits[1]:
-                axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
+        if panel.rows:
+            names = [label_text(row) for row in panel.rows]
+            axis.set_yticks(range(len(names)), names, fontsize=8)
+            axis.grid(axis="y", visible=False)
+        elif panel.limits is not None and panel.limits[0] < 0.0 < panel.limits[1]:
+            axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
         if chart.ticks is None:
             axis.margins(x=0.0)
     if chart.ticks is not None:
@@ -118,8 +106,10 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     axes[-1].set_xlabel(chart.label)
     if any(curve.fails for panel in chart.panels for curve in panel.curves):
         axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
-    handles, labels = axes[-1].get_legend_handles_labels()
-    once = dict(zip(labels, handles, strict=True))
+    once = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        once |= dict(zip(labels, handles, strict=True))
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)
@@ -129,49 +119,43 @@ def draw_chart(chart: Chart, path: Path) -> Path:
 
 
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
-    style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
-    marker = {"marker": "o", "ms": 4} if curve.has_points else {}
-    name = label_text(curve.name) or "_"  # without a name Matplotlib has it in no legend
-    axis.plot(curve.x, curve.y, color=curve.colour, lw=curve.width, ls=style, label=name, **marker)
+    colour = curve.colour
+    if curve.crosses:
+        faces = [colour if is_filled else "none" for is_filled in curve.crosses]
+        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": colour}
+        axis.scatter(curve.x, curve.y, lw=1.0, **style)
+        return
+    style = {"marker": "o", "ms": 4} if curve.has_points else {}
+    style |= {"color": colour, "lw": curve.width, "ls": _DASHES[curve.dash]}
+    # without a name Matplotlib has it in no legend
+    axis.plot(curve.x, curve.y, label=label_text(curve.name) or "_", **style)
     if curve.band is not None:
-        axis.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.18, lw=0)
+        axis.fill_between(curve.x, *curve.band, color=colour, alpha=0.18, lw=0)
     if curve.fails:
         last = curve.y[np.isfinite(curve.y)][-1:]
         y = last if limits is None else np.clip(last, *limits)
         cross = {"marker": "X", "s": 70, "edgecolors": "white", "lw": 0.8, "zorder": 6}
-        axis.scatter(curve.x[-1:], y, color=curve.colour, clip_on=False, **cross)
+        axis.scatter(curve.x[-1:], y, color=colour, clip_on=False, **cross)
 
 
-def _draw_failing(axis: Any, chart: Chart) -> None:
-    """A row of crosses per policy that fails somewhere."""
-    for row, policy in enumerate(reversed(chart.failing)):
-        faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
-        style = {"marker": "X", "s": 46, "facecolors": faces, "edgecolors": policy.colour}
-        axis.scatter(policy.x, np.full(len(policy.x), row), lw=1.0, **style)
-    names = [label_text(policy.name) for policy in reversed(chart.failing)]
-    axis.set_yticks(range(len(names)), names, fontsize=8)
-    axis.set_ylim(-0.7, len(chart.failing) - 0.3)
-    axis.set_ylabel(chart.failure)
-    axis.tick_params(axis="x", length=0)
-    axis.grid(axis="y", visible=False)
+_DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 
 
-def _show_numbers(axis: Any) -> None:
+def show_numbers(axis: Any, numticks: int | None = None) -> None:
     """Numbers instead of powers of ten on a logarithmic axis."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=numticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
 
 
-def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
+def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
     """A metric of every policy: a panel per reference, or of one scenario one with all of them.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
     failed.
     """
-    plt = require_matplotlib()
     known = evaluations[0].condition.environment
     titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
     shades = policy_colours(titles)
@@ -189,29 +173,21 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
-        sharey=True,
-        sharex=stacked,
-        squeeze=False,
-        layout="constrained",
-    )
-    for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
+    size = (min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows)
+    figure, axes = new_figure(rows, columns, size, sharey=True, sharex=stacked)
+    for axis, (title, groups) in zip(axes, panels.items(), strict=True):
         _draw_bars(axis, groups, column, shades)
         axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
     if is_one_scenario and known.quantity:
-        axes[-1][0].set_xlabel(known.quantity)
-    bar = axes.flat[0].bar
-    labels = [label_text(title) for title in shades]
-    bars = zip(shades.values(), labels, strict=True)
-    handles = [bar(np.nan, 0.0, color=shade, label=label) for shade, label in bars]
+        axes[-columns].set_xlabel(known.quantity)
+    bar = axes[0].bar
+    names = {label_text(title): shade for title, shade in shades.items()}
+    handles = [bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
-        handles.append(axes.flat[0].scatter([], [], **cross))
+        handles.append(axes[0].scatter([], [], **cross))
     ncols = columns_of(len(handles), max(int(columns * width / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
@@ -224,7 +200,10 @@ _ROOMY = 7
 
 
 def _draw_bars(
-    axis: Any, groups: dict[str, list[Evaluation]], column: Column, shades: dict[str, str]
+    axis: Any,
+    groups: Mapping[str, Evaluations],
+    column: Column,
+    shades: Mapping[str, str],
 ) -> None:
     """A bar per policy in every group."""
     policies = list(shades)
@@ -241,12 +220,12 @@ def _draw_bars(
                 dots = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
                 axis.scatter(np.full(len(values), x), values, **dots)
             if e.num_failed:
-                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5, "zorder": 4}
-                colour = FAILED if len(values) else shade
+                cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5}
+                cross["color"] = FAILED if len(values) else shade
                 bottom = axis.get_xaxis_transform()
-                axis.scatter(x, 0.035, color=colour, transform=bottom, **cross)
+                axis.scatter(x, 0.035, transform=bottom, zorder=4, **cross)
     crowded = len(groups) > 2 and len(policies) < _ROOMY
     slanted = {"rotation": 25, "ha": "right"} if crowded else {}
-    axis.set_xticks(range(len(groups)), [label_text(name) for name in groups], **slanted)
+    axis.set_xticks(range(len(groups)), list(map(label_text, groups)), **slanted)
     axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)

@@ -15,7 +15,7 @@ from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.evaluate.episodes import Evaluation
 from train.figures.colours import policy_colours
-from train.figures.plots import MRAD, label_text, require_matplotlib, save
+from train.figures.plots import MRAD, Evaluations, label_text, new_figure, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
@@ -23,15 +23,17 @@ _BLUE = "#2a6f97"
 
 
 def draw_identification(
-    result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path
+    result: Identification,
+    points: StaticPoints,
+    models: Sequence[RobotModel],
+    path: Path,
 ) -> Path:
     """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper."""
-    plt = require_matplotlib()
     gravities = [make_gravity(model) for model in models]
     torque = link_torque(points, gravities, result.link_angles(points))
     deflection = points.theta - points.q
-    shape = {"figsize": (7.2, 6.4), "sharex": True, "height_ratios": (3, 1.2)}
-    figure, (top, bottom) = plt.subplots(2, 1, **shape)
+    shape = {"sharex": True, "height_ratios": (3, 1.2)}
+    figure, (top, bottom) = new_figure(2, 1, (7.2, 6.4), **shape)
     line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
     for direction, marker, face, label in (
         (1, "^", _BLUE, "approached from below"),
@@ -39,29 +41,31 @@ def draw_identification(
     ):
         chosen = points.direction == direction
         style = {"marker": marker, "facecolors": face, "edgecolors": _BLUE}
-        style |= {"s": 34, "linewidths": 1.2}
-        top.scatter(torque[chosen], MRAD * deflection[chosen], label=label, zorder=3, **style)
+        style |= {"s": 34, "linewidths": 1.2, "zorder": 3}
+        x = torque[chosen]
+        top.scatter(x, MRAD * deflection[chosen], label=label, **style)
         fitted = _fit_line(result, line, direction)
-        top.plot(line, MRAD * fitted, color=_BLUE, lw=0.9, ls="-" if direction > 0 else "--")
-        residual = deflection[chosen] - _fit_line(result, torque[chosen], direction)
+        dash = "-" if direction > 0 else "--"
+        top.plot(line, MRAD * fitted, color=_BLUE, lw=0.9, ls=dash)
+        residual = deflection[chosen] - _fit_line(result, x, direction)
         if result.imu_sine_error_rad is not None:
             residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
-        bottom.scatter(torque[chosen], MRAD * residual, zorder=3, **style)
+        bottom.scatter(x, MRAD * residual, **style)
     slope = result.line_stiffness_nm_per_rad
     plain = line / slope + np.mean(deflection - torque / slope)
     label = f"plain line, K = {slope:.1f}"
     top.plot(line, MRAD * plain, color="#888888", lw=1.0, ls=":", label=label)
     bounds = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
-    top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {bounds}")
-    top.text(
-        0.03,
-        0.95,
-        f"friction {result.friction_nm:.2f} N·m\ndead band {MRAD * result.dead_band_rad:.2f} mrad\n"
-        f"offset {MRAD * result.offset_rad:+.2f} mrad\nPearson r {result.pearson_r:.4f}",
-        transform=top.transAxes,
-        va="top",
-        fontsize=9,
+    K = f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad"
+    top.set_title(f"{K}, 95 % interval {bounds}")
+    found = (
+        f"friction {result.friction_nm:.2f} N·m",
+        f"dead band {MRAD * result.dead_band_rad:.2f} mrad",
+        f"offset {MRAD * result.offset_rad:+.2f} mrad",
+        f"Pearson r {result.pearson_r:.4f}",
     )
+    place = {"transform": top.transAxes, "va": "top", "fontsize": 9}
+    top.text(0.03, 0.95, "\n".join(found), **place)
     top.set_ylabel("deflection θ − q [mrad]")
     top.legend(loc="lower right")
     bottom.axhline(0.0, color="#888888", lw=0.8)
@@ -70,10 +74,9 @@ def draw_identification(
     return save(figure, path)
 
 
-def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, path: Path) -> Path:
+def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) -> Path:
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
-    plt = require_matplotlib()
-    figure, axis = plt.subplots(figsize=(7.6, 4.4))
+    figure, (axis,) = new_figure(1, 1, (7.6, 5.2))
     gravity = [make_gravity(model)]
     shades = policy_colours([e.condition.policy.title for e in evaluations])
     for index, evaluation in enumerate(evaluations):
@@ -83,13 +86,14 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
             continue
         error = MRAD * static_errors(evaluation)
         shade = shades[policy]
-        style = {"facecolors": "none", "edgecolors": shade} if index else {"color": shade}
-        style |= {"marker": "xosDv^"[index % 6], "s": 34, "linewidths": 1.3, "zorder": 3}
+        style = {"marker": "xosDv^"[index % 6], "linewidths": 1.3, "zorder": 3}
+        open_dots = {"facecolors": "none", "edgecolors": shade}
+        style |= open_dots if index else {"color": shade}
         low = error.min()
         high = error.max()
         label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
         torque = link_torque(points, gravity, points.q)
-        axis.scatter(torque, error, label=label, **style)
+        axis.scatter(torque, error, s=34, label=label, **style)
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
         for bound in _PAPER_RANGES_MRAD.get(policy, ()):
             axis.axhline(bound, color=shade, lw=0.9, ls=":")
@@ -102,10 +106,8 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
 
 def static_errors(evaluation: Evaluation) -> Array:
     """Link error by the IMU, averaged over each window at rest, (visits,) [rad]."""
-    points = evaluation.points
-    assert points is not None
-    references = evaluation.rest_references
-    return references - points.q
+    assert evaluation.points is not None
+    return evaluation.rest_references - evaluation.points.q
 
 
 def _fit_line(result: Identification, torque: Array, direction: int) -> Array:

@@ -2,28 +2,23 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from train.evaluate.changes import (
-    BEST_ANALYTIC,
-    CEILING,
-    HELD_OUT,
-    PARTLY,
-    SAME_ROBOT,
-    SIGNS_ARE,
-    Change,
-    by_line,
-    percent_interval,
-    signed_interval,
-)
+from train.evaluate import changes as terms
+from train.evaluate.changes import Change, by_line, percent_interval, signed_interval
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
-from train.report.table_formats import Cell, Head, Part, Row, Table, print_table
+from train.evaluate.statistics import Estimate
+from train.report.table_formats import Cell, Head, Part, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
-_SIGNS = {"°": HELD_OUT, "(°)": PARTLY, "†": CEILING, "‡": SAME_ROBOT}
+_SIGNS = {
+    **{"°": terms.HELD_OUT, "(°)": terms.PARTLY},
+    **{"†": terms.CEILING, "‡": terms.SAME_ROBOT},
+}
 """Marks by their signs, where there is little room."""
 
 
@@ -47,7 +42,8 @@ def cells_table(rows: Sequence[Change]) -> Table:
     policies = tuple(dict.fromkeys(row.policy for row in rows))
     is_one = len(policies) == 1
     names = [*([] if is_one else ["residual"]), "reference", "scenario"]
-    heads = [Head(name, is_number=False, wraps=True, titles=name == "reference") for name in names]
+    words: dict[str, Any] = {"is_number": False, "wraps": True}
+    heads = [Head(name, titles=name == "reference", **words) for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head(column.title, leaves=1) for column in columns]
     heads += [Head(f"{rows[0].failure} ({'other' if rows[0].is_rival else 'base'})")]
@@ -56,8 +52,8 @@ def cells_table(rows: Sequence[Change]) -> Table:
         first = line[0]
         scope = " ".join(filter(None, [first.scope, "".join(_signs(first.marks))]))
         own = [*([] if is_one else [first.policy]), first.reference, scope]
-        figures = {row.column: signed_interval(row.relative, row.verdict) for row in line}
-        cells = [*own, *_swept(first, swept), *(figures[column] for column in columns)]
+        figures = [signed_interval(row.relative, row.verdict) for row in line]
+        cells = [*own, *first.first.swept_values(swept), *figures]
         kind = "group" if first.is_group else ""
         lines.append(Row((*cells, failed_and_base(first)), kind))
     signs = _signs([mark for row in rows for mark in row.marks])
@@ -67,7 +63,7 @@ def cells_table(rows: Sequence[Change]) -> Table:
         keys=len(names),
         title=f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}",
         subjects=policies if is_one else (),
-        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), SIGNS_ARE]),
+        caption=". ".join([*(f"{sign} {_SIGNS[sign]}" for sign in signs), terms.SIGNS_ARE]),
     )
 
 
@@ -80,22 +76,23 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     """
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     is_family = rows[0].is_family
-    figures = ("base → policy", "change", "better than base", f"{rows[0].failure} (base)")
     heads = [Head(name, is_number=False) for name in ("reference", "scenario")]
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head("metric", is_number=False)]
-    heads += [Head(name) for name in figures]
+    heads += [Head(name) for name in ("base → policy", "change", "better than base")]
+    heads += [Head(f"{rows[0].failure} (base)")]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
-    for (policy, base), own in group_by(rows, lambda row: (row.policy, row.base)).items():
+    blocks = group_by(rows, lambda row: (row.policy, row.base))
+    for (policy, base), own in blocks.items():
         number = own[0].num_seeds
         seeds = f", {number} training seed{'s' * (number != 1)}" if is_family else ""
         title = f"{policy} against {base}{seeds}"
         lines.append(Row((title,), kind="heading", dot=colours[policy]))
         for row in (row for line in by_line(own) for row in line):
             failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
-            cells: list[Cell] = [row.reference, _scope(row), *_swept(row, swept)]
-            cells += [row.column.title, _means(row)]
+            cells: list[Cell] = [row.reference, _scope(row)]
+            cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
             cells += [percent_interval(row.improvement, signed=False), (failed,)]
             cells += [row.sentence] if is_family else []
@@ -105,22 +102,22 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
 
 def _scope(row: Change) -> tuple[Part, ...]:
     """Scenario or group, with its marks."""
-    pooled = [Part("pooled", "pooled", before=" ")] if row.is_group else []
-    marks = [Part(m, "ceiling" if m == CEILING else "badge", before=" ") for m in row.marks]
-    return (Part(row.scope), *pooled, *marks)
-
-
-def _swept(row: Change, names: Sequence[str]) -> list[str]:
-    return [f"{row.swept[name]:g}" if name in row.swept else "-" for name in names]
+    parts = [Part(row.scope)]
+    if row.is_group:
+        parts.append(Part("pooled", "pooled", before=" "))
+    for mark in row.marks:
+        parts.append(Part(mark, "ceiling" if mark == terms.CEILING else "badge", before=" "))
+    return tuple(parts)
 
 
 def _means(row: Change) -> str:
     """Means of base and policy in the shown unit; - where there is nothing to compare."""
+    column = row.column
     if not np.isfinite(row.mine):
         return "-"
-    shown = (row.column.scale * value for value in (row.theirs, row.mine))
-    before, after = (f"{value:.{row.column.decimals}f}" for value in shown)
-    return f"{before} → {after} {row.column.unit}"
+    means = (Estimate(row.theirs), Estimate(row.mine))
+    before, after = (number_interval(mean, column) for mean in means)
+    return f"{before} → {after} {column.unit}"
 
 
 def _seeds(rows: Sequence[Change]) -> str:
@@ -134,20 +131,19 @@ def _opponent(rows: Sequence[Change]) -> str:
     """The policy that a table compares residuals with."""
     if not rows[0].is_rival:
         return "the base"
-    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({BEST_ANALYTIC})"
+    return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({terms.BEST_ANALYTIC})"
 
 
 def _signs(marks: Sequence[str]) -> list[str]:
     """Signs of some marks, where there is little room."""
-    return [s for s, words in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
+    return [s for s, words in _SIGNS.items() if any(m.startswith(words) for m in marks)]
 
 
 def failed_and_base(row: Change) -> str:
     """Failed episodes of all, the base's in brackets; an exclamation mark where there are more."""
-    return (
-        f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes}"
-        f" ({row.base_falls}/{row.base_episodes})"
-    )
+    mark = "! " if row.falls_more else ""
+    base = f"{row.base_falls}/{row.base_episodes}"
+    return f"{mark}{row.falls}/{row.episodes} ({base})"
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
@@ -157,7 +153,7 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
 
 
 def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
-    of_residual = BEST_ANALYTIC if row.is_rival else "base of the residual"
+    of_residual = terms.BEST_ANALYTIC if row.is_rival else "base of the residual"
     return {
         "policy": row.policy,
         "base": row.base,
@@ -186,28 +182,29 @@ def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
     """One row per cell, metric and policy; scores in SI units, changes as shares of one."""
-    return write_records([record for found in maps for record in _map_records(found)], path)
+    return write_records([row for found in maps for row in _map_records(found)], path)
 
 
-_AGAINST = ("change", "change_low", "change_high", "verdict")
+_AGAINST = (*Estimate(0.0).record("change"), "verdict")
 """Columns of a map that only residuals fill."""
 
 
 def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
-    x_ticks = found.x.ticks(found.known)
-    for y, row in zip(found.y.ticks(found.known), found.cells, strict=True):
+    x_ticks, y_ticks = found.ticks
+    for y, row in zip(y_ticks, found.cells, strict=True):
         for x, cell in zip(x_ticks, row, strict=True):
             for title, estimate in cell.levels.items():
                 change = cell.learned.get(title)
                 against: dict[str, object] = dict.fromkeys(_AGAINST, "")
                 if change is not None:
-                    against = {**change.relative.record("change"), "verdict": change.verdict}
+                    against = change.relative.record("change")
+                    against["verdict"] = change.verdict
                 failed, episodes = cell.failed[title]
                 yield {
                     "map": found.title,
-                    "x_is": found.x.title,
+                    "x_is": found.axes.x.title,
                     "x": x,
-                    "y_is": found.y.title,
+                    "y_is": found.axes.y.title,
                     "y": y,
                     "metric": found.column.metric,
                     "policy": title,

@@ -12,7 +12,7 @@ from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures, score
 from train.figures.colours import INK, LINE, VERDICTS
 from train.report import specs
-from train.report.specs import LONGEST_NAME, PageChart, Spec, base_axis
+from train.report.specs import LONGEST_NAME, Spec, base_axis
 from train.report.table_formats import number_interval
 from train.runs.escaping import chart_text
 
@@ -25,6 +25,7 @@ class Dot:
         row: Its place, counted downwards.
         estimate: As the axis shows it; nan where there is only a text.
         text: Beside it, as HTML.
+        text_x: Where the text begins.
         name: Shown under the pointer.
         colour, symbol: Its look.
     """
@@ -32,6 +33,7 @@ class Dot:
     row: float
     estimate: Estimate
     text: str
+    text_x: float
     name: str
     colour: str
     symbol: str = "circle"
@@ -39,44 +41,43 @@ class Dot:
 
 def _dot_plot(
     rows: Mapping[float, str],
-    panels: Sequence[tuple[Spec, Sequence[Dot], float]],
+    panels: Sequence[tuple[Spec, Sequence[Dot]]],
     left: float,
     height: float,
     top: int = 40,
-) -> PageChart:
+) -> Spec:
     """Panels side by side whose rows have names, plain or as HTML.
 
     Args:
         rows: Names by place.
-        panels: Axis and dots of each, and the place of a text without a figure.
+        panels: Axis and dots of each.
         left: Margin at the left [px].
         height: Of the chart [px].
         top: Margin at the top [px].
     """
     layout = specs.base_layout(left=left, top=top, bottom=10)
     data: list[Spec] = []
-    for number, (axis, dots, empty_x) in enumerate(panels):
+    for number, (axis, dots) in enumerate(panels):
         x = f"x{specs.nth(number)}"
         known = [dot for dot in dots if dot.estimate.is_known]
         for colour, own in group_by(known, lambda dot: dot.colour).items():
             data.append(_points(own, colour, x))
-        places = [d.estimate.ends[1] if d.estimate.is_known else empty_x for d in dots]
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "text",
-                "x": [specs.digits(place) for place in places],
-                "y": [dot.row for dot in dots],
-                "xaxis": x,
-                "text": [f"  {dot.text}" for dot in dots],
-                "textposition": "middle right",
-                "textfont": {"size": 12, "color": INK},
-                "hoverinfo": "skip",
-                "cliponaxis": False,
-            }
-        )
-        side_by_side = {"domain": specs.domain(number, len(panels), gap=0.03), "anchor": "y"}
-        layout[f"xaxis{specs.nth(number)}"] = {**axis, **side_by_side, "side": "top"}
+        texts = {
+            "type": "scatter",
+            "mode": "text",
+            "x": [specs.digits(dot.text_x) for dot in dots],
+            "y": [dot.row for dot in dots],
+            "xaxis": x,
+            "text": [f"  {dot.text}" for dot in dots],
+            "textposition": "middle right",
+            "textfont": {"size": 12, "color": INK},
+            "hoverinfo": "skip",
+            "cliponaxis": False,
+        }
+        data.append(texts)
+        domain = specs.domain(number, len(panels), gap=0.03)
+        place = {"domain": domain, "anchor": "y", "side": "top"}
+        layout[f"xaxis{specs.nth(number)}"] = {**axis, **place}
     layout["yaxis"] = base_axis(
         range=[max(rows, default=0.0) + 0.7, -0.7],
         tickvals=list(rows),
@@ -84,7 +85,7 @@ def _dot_plot(
         showgrid=False,
     )
     layout["showlegend"] = False
-    return PageChart({"data": data, "layout": layout}, int(height))
+    return {"data": data, "layout": {**layout, "height": int(height)}}
 
 
 def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
@@ -104,7 +105,7 @@ def _points(dots: Sequence[Dot], colour: str, x: str) -> Spec:
     }
 
 
-def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> PageChart:
+def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> Spec:
     """Every policy in every scenario: its mean over the episodes that did not fail."""
     rungs: list[tuple[float, str, Any]] = []
     headings: dict[str, float] = {}
@@ -119,18 +120,20 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> P
                 rungs.append((place, policy, table.of(policy, *cells)))
                 place += 1.0
     panels = []
+    failure = table.environment.failure
     for column in table.environment.judged:
+        levels = [score(episodes, column) for _, _, episodes in rungs]
+        axis = _level_axis(column, [level.times(column.scale) for level in levels])
+        left = 10 ** (axis["range"][0] + 1e-3)
         dots = []
-        for row, policy, episodes in rungs:
-            level = score(episodes, column)
-            text = _failure_text(table.environment.failure, *failures(episodes))
-            if level.is_known:
-                text = f"{number_interval(level, column)}{text}"
-            symbol = "diamond" if policy in table.members else "circle"
+        for (row, policy, episodes), level in zip(rungs, levels, strict=True):
             shown = level.times(column.scale)
-            dots.append(Dot(row, shown, text, policy, colours[policy], symbol))
-        axis = _level_axis(column, dots)
-        panels.append((axis, dots, 10 ** (axis["range"][0] + 1e-3)))
+            figure = number_interval(level, column) if level.is_known else ""
+            text = f"{figure}{_failure_text(failure, *failures(episodes))}"
+            text_x = shown.ends[1] if level.is_known else left
+            symbol = "diamond" if policy in table.members else "circle"
+            dots.append(Dot(row, shown, text, text_x, policy, colours[policy], symbol))
+        panels.append((axis, dots))
     chart = _dot_plot(
         {row: chart_text(specs.shorten(policy)) for row, policy, _ in rungs},
         panels,
@@ -138,8 +141,8 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> P
         height=70 + (24 if len(rungs) < 40 else 19) * (place + 1.0),
         top=34,
     )
-    layout = chart.spec["layout"]
-    layout["annotations"] = [_heading(scenario, place) for scenario, place in headings.items()]
+    layout = chart["layout"]
+    layout["annotations"] = [_heading(*heading) for heading in headings.items()]
     layout["shapes"] = [_rule(place - 0.6) for place in list(headings.values())[1:]]
     return chart
 
@@ -149,15 +152,16 @@ def _failure_text(failure: str, failed: int, played: int) -> str:
     return mark if failed else ""
 
 
-def _level_axis(column: Column, dots: Sequence[Dot]) -> Spec:
+def _level_axis(column: Column, levels: Sequence[Estimate]) -> Spec:
     """A logarithmic axis, with room for figures at its right."""
-    ends = [end for dot in dots if dot.estimate.is_known for end in dot.estimate.ends]
+    ends = [end for level in levels if level.is_known for end in level.ends]
     high = max(ends, default=1.0)
     low = max(min(ends, default=1.0), high / 1e4, 1e-6)
     room = math.log10(max(high / low, 1.3))
     left = math.log10(low) - 0.04 * room - 0.02
     right = math.log10(max(high, low)) + 0.34 * room + 0.1
-    numbers = [d * 10.0**e for e in range(math.floor(left), math.ceil(right)) for d in (1, 2, 5)]
+    decades = [10.0**power for power in range(math.floor(left), math.ceil(right))]
+    numbers = [digit * decade for decade in decades for digit in (1, 2, 5)]
     ticks = [number for number in numbers if left <= math.log10(number) <= right]
     return base_axis(
         column.label,
@@ -186,27 +190,29 @@ def _rule(place: float) -> Spec:
     return {"type": "line", **where, "line": {"color": LINE, "width": 1}}
 
 
-def forest(rows: Sequence[Change]) -> PageChart:
+def forest(rows: Sequence[Change]) -> Spec:
     """Changes of one residual against its base, in every cell, with intervals."""
     lines = by_line(rows)
     several = len({row.reference for row in rows}) > 1
-    names = [f"{own[0].reference} · {own[0].scope}" if several else own[0].scope for own in lines]
+    names = []
+    for row, *_ in lines:
+        names.append(f"{row.reference} · {row.scope}" if several else row.scope)
     panels = []
-    for column in dict.fromkeys(row.column for row in rows):
-        shown = [next(row for row in line if row.column == column) for line in lines]
-        dots = [_change_dot(place, row) for place, row in enumerate(shown)]
-        ends = [end for dot in dots if dot.estimate.is_known for end in dot.estimate.ends]
+    for own in group_by(rows, lambda row: row.column).values():
+        changes = [row.relative.times(100.0) for row in own]
+        ends = [end for change in changes if change.is_known for end in change.ends]
         low = min([*ends, 0.0])
         high = max([*ends, 0.0])
         span = max(high - low, 1.0)
         axis = base_axis(
-            f"change of {column.title} [%]",
+            f"change of {own[0].column.title} [%]",
             range=[low - 0.05 * span, high + 0.5 * span],
             zeroline=True,
             zerolinecolor=INK,
             zerolinewidth=1.2,
         )
-        panels.append((axis, dots, 0.0))
+        # texts stand in a column behind all intervals, so that the line at zero crosses none
+        panels.append((axis, [_change_dot(n, row, high) for n, row in enumerate(own)]))
     titles = [
         f"<b>{chart_text(name)}</b>" if line[0].is_group else chart_text(name)
         for name, line in zip(names, lines, strict=True)
@@ -219,7 +225,7 @@ def forest(rows: Sequence[Change]) -> PageChart:
     )
 
 
-def _change_dot(place: int, row: Change) -> Dot:
+def _change_dot(place: int, row: Change, text_x: float) -> Dot:
     known = row.relative.is_known
     symbol = "circle"
     if CEILING in row.marks:
@@ -230,6 +236,7 @@ def _change_dot(place: int, row: Change) -> Dot:
         place,
         row.relative.times(100.0),
         percent_interval(row.relative) if known else "nothing to compare",
+        text_x,
         f"{row.scope}: {row.sentence}",
         VERDICTS[row.verdict],
         symbol,

@@ -2,10 +2,11 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
 from rich.console import Console
 
 from baselines.catalogue import Track
@@ -17,21 +18,22 @@ from train.evaluate.episodes import group_by
 from train.evaluate.maps import best_of
 from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
-from train.report.page import Page
+from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.table_formats import Head, Part, Row, Table, print_table, to_markdown
 from train.runs.escaping import write_records
 
-_SCORE = ("mean", "low", "high")
-_BASE = ("base", "change", "change_low", "change_high", "verdict")
-_RIVAL = (
-    "best_without_learning",
-    "change_to_best",
-    "change_to_best_low",
-    "change_to_best_high",
-    "verdict_to_best",
-)
-"""Columns of `leaderboard.csv` for a score, and for a paired change."""
+_COLUMNS = {
+    "is_group": ("pooled",),
+    "is_column": ("column",),
+    "score": ("mean", "low", "high"),
+    "base": ("base", "change", "change_low", "change_high", "verdict"),
+    "rival": (
+        *("best_without_learning", "change_to_best", "change_to_best_low"),
+        *("change_to_best_high", "verdict_to_best"),
+    ),
+}
+"""Columns of `leaderboard.csv` by fields of a `Standing`; of the others they have the same name."""
 
 
 def board(found: Sequence[Standing]) -> Table:
@@ -41,8 +43,8 @@ def board(found: Sequence[Standing]) -> Table:
 
 def scenarios_board(found: Sequence[Standing]) -> Table | None:
     """The single scenarios behind the groups of the first motion; None where there are none."""
-    first = found[0].reference
-    single = [s for s in found if s.reference == first and not s.is_group and not s.is_column]
+    there = [s for s in found if s.reference == found[0].reference]
+    single = [s for s in there if not s.is_group and not s.is_column]
     return _board(single, []) if single else None
 
 
@@ -57,9 +59,12 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
             rows.append(Row((str(track),), kind="heading"))
         places = {(s.policy, s.scope, s.reference, s.metric): s for s in own}
         best = {}
-        for key, some in group_by(own, lambda s: (s.scope, s.reference, s.metric)).items():
-            best[key] = best_of({s.policy: (s.score, (s.failed, s.episodes)) for s in some})
-        order = {s.policy: _order(places.get((s.policy, *columns[0], metrics[0]))) for s in own}
+        entries = group_by(own, lambda s: (s.scope, s.reference, s.metric))
+        for key, some in entries.items():
+            scores = {s.policy: (s.score, (s.failed, s.episodes)) for s in some}
+            best[key] = best_of(scores)
+        first = (*columns[0], metrics[0])
+        order = {s.policy: _order(places.get((s.policy, *first))) for s in own}
         for policy in sorted(order, key=lambda policy: order[policy]):
             entries = []
             for column in columns:
@@ -106,12 +111,14 @@ def _entry(
     for s in found:
         score = s.score.times(_column(s).scale)
         look = "bold" if best[s.scope, s.reference, s.metric] == s.policy else ""
-        parts.append(Part(three_digits(score.value), look, before=" / " if parts else ""))
+        before = " / " if parts else ""
+        parts.append(Part(three_digits(score.value), look, before))
         if score.has_interval:
             low, high = map(three_digits, score.ends)
             intervals.append(Part(f"[{low}, {high}]", "small"))
     if found[0].failed:
-        parts.append(Part(f"✕{found[0].failed}/{found[0].episodes}", "failure", before=" "))
+        failed = f"✕{found[0].failed}/{found[0].episodes}"
+        parts.append(Part(failed, "failure", before=" "))
     return (*parts, *intervals)
 
 
@@ -135,8 +142,9 @@ def claims_table(found: Sequence[Standing]) -> Table:
     for (policy, scope, reference), own in lines.items():
         cells = [policy, f"{scope}, {reference}"]
         for s in own:
-            same = s.rival is not None and s.base is not None and s.rival.to == s.base.to
-            cells += [_change(s.base), "the same" if same else _change(s.rival)]
+            base = None if s.base is None else s.base.to
+            is_same = s.rival is not None and s.rival.to == base
+            cells += [_change(s.base), "the same" if is_same else _change(s.rival)]
         rows.append(cells)
     head = ["residual", "where"]
     for title in dict.fromkeys(s.title for s in learned):
@@ -151,26 +159,14 @@ def _change(paired: Paired | None) -> str:
     return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
 
 
-LEGEND = (
-    "Lower is better. Each cell is a mean over scenarios of means over the episodes that did not"
-    " fail. Bold is the best of its track. A residual has the interquartile mean over training"
-    " seeds, with the 95 % interval below. ✕ counts episodes that failed, such as by a fall. A"
-    " policy that fails less often ranks first. The column µs is the processor time of the policy"
-    " alone for a control step of one world on one thread. It is a median of one interleaved run."
-)
-PAIRED = (
-    "Paired changes on the same episodes: interquartile mean over training seeds with its 95 %"
-    f" interval. Below zero, learning is ahead. {SIGNS_ARE} The best policy without learning is the"
-    " best of the first track in that column and metric, on the same episodes, which favours it."
-)
-
-
 def legend(found: Sequence[Standing]) -> str:
     """Meaning of a cell, and its number of episodes."""
     meaning = _meaning([s for s in found if s.is_column])
-    counts = sorted({s.episodes // max(s.training_seeds, 1) for s in found if not s.is_group})
+    single = [s for s in found if not s.is_group]
+    counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
-    return f"{capital(meaning)}; episodes of a scenario, per training seed: {span}. {LEGEND}"
+    episodes = f"episodes of a scenario, per training seed: {span}"
+    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}"
 
 
 def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
@@ -179,11 +175,12 @@ def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
     page.add("table", board(found))
     claims = claims_table(found)
     if claims.rows:
-        page.add("text", PAIRED, "What learning adds")
+        page.add("text", _paired_text(), "What learning adds")
         page.add("table", claims)
     single = scenarios_board(found)
     if single is not None:
-        page.add("table", single, f"Single scenarios, {found[0].reference}", is_folded=True)
+        title = f"Single scenarios, {found[0].reference}"
+        page.add("table", single, title, is_folded=True)
 
 
 def leaderboard_markdown(found: Sequence[Standing]) -> str:
@@ -195,7 +192,11 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
 
 def claims_markdown(found: Sequence[Standing]) -> str:
     """The paired changes of residuals, as a table."""
-    return f"{PAIRED}\n\n{to_markdown(claims_table(found))}\n"
+    return f"{_paired_text()}\n\n{to_markdown(claims_table(found))}\n"
+
+
+def _paired_text() -> str:
+    return TEXTS["paired"].format(signs=SIGNS_ARE)
 
 
 def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
@@ -205,40 +206,29 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv`, and from it `leaderboard.md`, so that they agree."""
-    table = write_records([_record(standing) for standing in found], folder / "leaderboard.csv")
+    table = write_records(list(map(_record, found)), folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
     board = leaderboard_markdown(read_leaderboard(table))
     write_whole(text, f"# Leaderboard\n\n{board}")
     return [table, text]
 
 
-def _record(s: Standing) -> dict[str, Any]:
-    return {
-        "track": str(s.track),
-        "policy": s.policy,
-        "reference": s.reference,
-        "scope": s.scope,
-        "pooled": s.is_group,
-        "column": s.is_column,
-        "title": s.title,
-        "metric": s.metric,
-        **dict(zip(_SCORE, _cells(s.score), strict=True)),
-        "failed": s.failed,
-        "episodes": s.episodes,
-        "training_seeds": s.training_seeds,
-        **dict(zip(_BASE, _paired_cells(s.base), strict=True)),
-        **dict(zip(_RIVAL, _paired_cells(s.rival), strict=True)),
-        "step_us": f"{s.step_us:.3g}",
-    }
+def _record(standing: Standing) -> dict[str, str]:
+    record = {}
+    for name, value in vars(standing).items():
+        columns = _COLUMNS.get(name, (name,))
+        record |= dict(zip(columns, _cells(value, len(columns)), strict=True))
+    return {**record, "step_us": f"{standing.step_us:.3g}"}
 
 
-def _cells(estimate: Estimate) -> list[str]:
-    values = (estimate.value, estimate.low, estimate.high)
-    return ["" if value is None else f"{value:.6g}" for value in values]
-
-
-def _paired_cells(paired: Paired | None) -> list[str]:
-    return [""] * 5 if paired is None else [paired.to, *_cells(paired.change), paired.verdict]
+def _cells(value: Any, number: int) -> list[str]:
+    """A field as cells of a CSV file, empty where there is nothing."""
+    if isinstance(value, Paired):
+        return [value.to, *_cells(value.change, 3), value.verdict]
+    if isinstance(value, Estimate):
+        figures = (value.value, value.low, value.high)
+        return ["" if figure is None else f"{figure:.6g}" for figure in figures]
+    return [""] * number if value is None else [str(value)]
 
 
 def read_leaderboard(path: Path) -> list[Standing]:
@@ -251,35 +241,30 @@ def read_leaderboard(path: Path) -> list[Standing]:
         try:
             found = [_standing(row) for row in csv.DictReader(file)]
         except (KeyError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {error!r}") from None
+            problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
+            raise ConfigurationError(problem) from None
     if not found:
         raise ConfigurationError(f"{shorten(path)} has no rows")
     return found
 
 
 def _standing(row: Mapping[str, str]) -> Standing:
-    return Standing(
-        track=Track(row["track"]),
-        policy=row["policy"],
-        reference=row["reference"],
-        scope=row["scope"],
-        is_group=row["pooled"] == "True",
-        is_column=row["column"] == "True",
-        title=row["title"],
-        metric=row["metric"],
-        score=_estimate(*(row[name] for name in _SCORE)),
-        failed=int(row["failed"]),
-        episodes=int(row["episodes"]),
-        training_seeds=int(row["training_seeds"]),
-        base=_paired(*(row[name] for name in _BASE)),
-        rival=_paired(*(row[name] for name in _RIVAL)),
-        step_us=float(row["step_us"]),
-    )
+    fields = {}
+    for name in Standing.__dataclass_fields__:
+        cells = [row[column] for column in _COLUMNS.get(name, (name,))]
+        fields[name] = _FIELDS[len(cells)](*cells)
+    return _STANDING.validate_python(fields)
+
+
+def _estimate(value: str, low: str, high: str) -> Estimate:
+    ends = (float(low), float(high)) if low else ()
+    return Estimate(float(value), *ends)
 
 
 def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
     return Paired(to, _estimate(value, low, high), verdict) if to else None
 
 
-def _estimate(value: str, low: str, high: str) -> Estimate:
-    return Estimate(float(value), float(low) if low else None, float(high) if high else None)
+_FIELDS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
+"""Fields from so many columns."""
+_STANDING = TypeAdapter(Standing)

@@ -1,13 +1,19 @@
 """A report as sections of texts, tables and charts, written as an HTML page and as Markdown."""
 
+import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
 from typing import Any, Literal
 
 from train.figures.map_plots import Panel, panel_rows
 from train.report.table_formats import Table, load_template, to_markdown
 from train.runs.escaping import markdown_text
 
+_FILE = Path(__file__).with_name("texts.toml")
+TEXTS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+"""Paragraphs by section or table."""
 Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]
 
 
@@ -17,7 +23,7 @@ class Part:
 
     Attributes:
         kind: What it is; captions and charts stand on the page alone.
-        content: A text, texts, pairs of texts, a `Table`, a `PageChart`, or the panels of a map.
+        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, or the panels of a map.
         title: Above it; empty for none.
         is_folded: Whether it is folded away under its title. A chart is drawn when it is unfolded.
         is_open: Whether it is unfolded at first.
@@ -38,7 +44,7 @@ class Part:
         if self.kind == "table":
             return [*blocks, to_markdown(self.content)]
         if self.kind == "map":
-            return [*blocks, *(block for panel in self.content for block in _panel(panel))]
+            return [*blocks, *chain(*map(_panel, self.content))]
         if self.kind == "text":
             return [*blocks, markdown_text(self.content)]
         texts = self.content

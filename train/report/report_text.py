@@ -22,7 +22,7 @@ from train.evaluate.changes import (
 )
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.maps import HeatMap, best_of, ranking
+from train.evaluate.maps import HeatMap, Scores, best_of, ranking
 from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import RobotScores
@@ -75,13 +75,10 @@ class Results:
     @cached_property
     def learning(self) -> dict[str, Curves]:
         """Learning curves of the families whose folders lie in a training run."""
-        columns = self.environment.judged
-        found = {}
-        for title, origin in self.table.families.items():
-            curves = learning_curves(origin.folders, columns)
-            if curves is not None:
-                found[title] = curves
-        return found
+        families = self.table.families.items()
+        judged = self.environment.judged
+        found = [(title, learning_curves(own.folders, judged)) for title, own in families]
+        return {title: curves for title, curves in found if curves is not None}
 
     @cached_property
     def metadata(self) -> Mapping[str, Any]:
@@ -91,12 +88,17 @@ class Results:
     @property
     def grouped_changes(self) -> dict[str, list[Change]]:
         """Changes by what is compared with what."""
-        residuals = [row for row in self.changes if row.is_family]
+        kinds = group_by(self.changes, lambda row: (row.is_family, row.is_rival))
         return {
-            "Residuals against their base": [row for row in residuals if not row.is_rival],
-            f"Residuals against the {BEST_ANALYTIC}": [row for row in residuals if row.is_rival],
-            "Baselines against one another": [row for row in self.changes if not row.is_family],
+            "Residuals against their base": kinds.get((True, False), []),
+            f"Residuals against the {BEST_ANALYTIC}": kinds.get((True, True), []),
+            "Baselines against one another": kinds.get((False, False), []),
         }
+
+    @property
+    def judged(self) -> list[Change]:
+        """Changes of residuals in what policies are judged by."""
+        return [row for row in self.changes if row.is_family and row.is_judged]
 
     @property
     def has_conditions(self) -> bool:
@@ -132,13 +134,14 @@ def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
     found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}"
     if len(known) == 1:
         return f"{found}.", "No other policy was played."
-    ahead = [best_of(_scores(rows, column)) == best for _, rows in table.rows.groupby("cell")]
+    cells = [_scores(rows, column) for _, rows in table.rows.groupby("cell")]
+    ahead = [best_of(cell) == best for cell in cells]
     if len(ahead) > 1:
         found = f"{found}; it is ahead in {sum(ahead)} of {len(ahead)} cells"
     return f"{found}.", f"{known[-1]} comes last, with {shown[known[-1]]}."
 
 
-def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tuple[int, int]]]:
+def _scores(rows: pd.DataFrame, column: Column) -> Scores:
     """Mean of every policy over training seeds and cells [SI], and failures."""
     found = {}
     for title, own in rows.groupby("policy", sort=False):
@@ -151,18 +154,17 @@ def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tup
 
 def _learning_sentence(results: Results) -> str:
     """Change by learning in the first judged metric, or that there are too few training seeds."""
-    rows = [row for row in results.changes if row.is_family and row.is_judged and not row.is_rival]
+    rows = [row for row in results.judged if not row.is_rival]
     if not rows:
         return ""
     row = next((row for row in rows if row.is_group), rows[0])
-    found = f"{row.policy} changes the {row.column.title} of {row.base} in {row.scope} by"
-    if row.num_seeds < FEWEST_SEEDS:
-        few = (
-            f"{_count(row.num_seeds, 'training seed')} cannot tell that from chance, {FEWEST_SEEDS}"
-            " are needed"
-        )
-        return f"{found} {percent(row.relative.value)}; {few}."
-    return f"{found} {percent_interval(row.relative)}."
+    metric = f"the {row.column.title} of {row.base}"
+    subject = f"{row.policy} changes {metric} in {row.scope}"
+    if row.num_seeds >= FEWEST_SEEDS:
+        return f"{subject} by {percent_interval(row.relative)}."
+    few = f"{_count(row.num_seeds, 'training seed')} cannot tell that from chance"
+    change = percent(row.relative.value)
+    return f"{subject} by {change}; {few}, {FEWEST_SEEDS} are needed."
 
 
 def _count(number: int, one: str, several: str = "") -> str:
@@ -193,7 +195,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
 def _training_text(origin: Origin) -> str:
     number = len(origin.folders)
     where = " to ".join(dict.fromkeys([origin.folders[0], origin.folders[-1]]))
-    on = "an unknown condition" if origin.scenarios is None else ", ".join(origin.scenarios)
+    on = ", ".join(origin.scenarios or ["an unknown condition"])
     motion = "" if origin.reference is None else f" ({origin.reference})"
     commits = ", ".join(commit[:12] for commit in origin.commits)
     return f"{_count(number, 'training seed')}, trained on {on}{motion}; {where}; commit {commits}"
@@ -203,16 +205,16 @@ def in_short(results: Results) -> list[str]:
     """Gains by learning in a sentence each; then how many cells are better or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)]
     found += claims(results)
-    judged = [row for row in results.changes if row.is_family and row.is_judged]
-    for rows in group_by(judged, lambda row: (row.policy, row.is_rival)).values():
+    pairs = group_by(results.judged, lambda row: (row.policy, row.is_rival))
+    for rows in pairs.values():
         for own in group_by(rows, lambda row: row.column).values():
             found += _of_a_metric(results, own)
         worse = [row for row in rows if row.falls_more and not row.is_group]
         if worse:
-            where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
-            found.append(
-                f"{rows[0].policy}: more {rows[0].failure} than {rows[0].base} in {where}."
-            )
+            places = [f"{row.scope}{_at(results, row)}" for row in worse]
+            than = f"more {rows[0].failure} than {rows[0].base}"
+            where = ", ".join(dict.fromkeys(places))
+            found.append(f"{rows[0].policy}: {than} in {where}.")
     return found or [
         "No residual takes part: there are no training seeds, and differences are differences of"
         " means."
@@ -224,10 +226,10 @@ def of_a_map(heat_map: HeatMap) -> list[str]:
     where = f"{heat_map.column.title}, {heat_map.title}"
     cells = heat_map.flat
     wins = Counter(cell.best for cell in cells)
-    ranking = sorted((t for t in heat_map.policies if wins[t]), key=lambda title: -wins[title])
-    best = ", ".join(f"{title} in {wins[title]}" for title in ranking)
+    ranked = sorted(heat_map.table.policies, key=lambda title: -wins[title])
+    best = ", ".join(f"{title} in {wins[title]}" for title in ranked if wins[title])
     found = [f"{where}: best of {len(cells)} cells: {best}."]
-    for title in heat_map.families:
+    for title in heat_map.table.members:
         rows = [cell.learned[title] for cell in cells if title in cell.learned]
         values = [row.relative.value for row in rows if row.relative.is_known]
         if values:
@@ -239,13 +241,15 @@ def of_a_map(heat_map: HeatMap) -> list[str]:
 
 def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
     """Lines of a residual in one metric against one policy: pooled figures, and counts of cells."""
-    title = f"{own[0].policy} against {own[0].base}, {own[0].column.title}"
-    has_rival = any(row.is_rival and row.policy == own[0].policy for row in results.changes)
+    policy = own[0].policy
+    title = f"{policy} against {own[0].base}, {own[0].column.title}"
+    has_rival = any(row.is_rival and row.policy == policy for row in results.changes)
     found = []
     for row in own:
         if row.is_group and not has_rival:
             figure = f"{percent_interval(row.relative)}{marks_text(row)}{_besides(row)}"
-            found.append(f"{title}, pooled over {row.scope}{_at(results, row)}: {figure}.")
+            where = f"{row.scope}{_at(results, row)}"
+            found.append(f"{title}, pooled over {where}: {figure}.")
     cells = [row for row in own if not row.is_group]
     return [*found, f"{title}: {_tally(cells)}."] if cells else found
 
@@ -255,27 +259,22 @@ def claims(results: Results) -> list[str]:
 
     Scopes are the groups; without groups the scenarios, where there are few.
     """
-    judged = [row for row in results.changes if row.is_family and row.is_judged]
-    rivals = [row for row in judged if row.is_rival]
-    bases = {_place(row): row for row in reversed(judged) if not row.is_rival}
+    rivals = [row for row in results.judged if row.is_rival]
+    others = [row for row in results.judged if not row.is_rival]
+    bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
     shown = [row for row in rivals if row.is_group]
-    if not shown and len({_place(row)[:-1] for row in rivals}) <= _MOST_CLAIMS:
+    if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
         shown = rivals
     found = []
     for rival in shown:
-        base = bases[_place(rival)]
-        where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
-        found.append(
-            f"{rival.policy}, {rival.column.title}, {where}{marks_text(rival)}: {_comparison(base)}"
-            f" than {base.base}, its base{_bounds(base)}; {_comparison(rival)} than {rival.base},"
-            f" the {BEST_ANALYTIC}{_bounds(rival)}."
-        )
+        base = bases[rival.policy, rival.place, rival.column]
+        pooled = "pooled over " if rival.is_group else ""
+        where = f"{pooled}{rival.scope}{_at(results, rival)}{marks_text(rival)}"
+        subject = f"{rival.policy}, {rival.column.title}, {where}"
+        to_base = f"{_comparison(base)} than {base.base}, its base{_bounds(base)}"
+        best = f"{rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}"
+        found.append(f"{subject}: {to_base}; {_comparison(rival)} than {best}.")
     return found
-
-
-def _place(row: Change) -> tuple[object, ...]:
-    swept = tuple(row.swept.items())
-    return (row.policy, row.reference, row.scope, row.is_group, swept, row.column)
 
 
 _MOST_CLAIMS = 4
@@ -324,9 +323,9 @@ _VERDICTS: Mapping[Verdict, str] = {
 
 
 def _at(results: Results, row: Change) -> str:
-    several = len(results.table.references) > 1
-    swept = [f"{name}={value:g}" for name, value in row.swept.items()]
-    return "".join(f", {part}" for part in [*([row.reference] if several else []), *swept])
+    parts = [row.reference] if len(results.table.references) > 1 else []
+    parts += [f"{name}={value:g}" for name, value in row.swept.items()]
+    return "".join(f", {part}" for part in parts)
 
 
 def marks_text(row: Change) -> str:
@@ -340,6 +339,7 @@ def notes(results: Results) -> list[str]:
     kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
     text = load_template("notes.html.j2").render(
         failures=results.environment.failures,
+        walks=results.environment.walks,
         families=results.table.families,
         maps=results.maps,
         has_rivals=any(row.is_rival for row in results.changes),

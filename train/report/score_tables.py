@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from train.evaluate.changes import percent_interval
@@ -11,23 +10,11 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
+from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
 from train.figures.chart import spread
 from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
-
-SCORES = (
-    "Mean over the episodes that reached the end; of residuals the interquartile mean over training"
-    " seeds, with its 95 % interval."
-)
-"""Meaning of the tables of scores."""
-ROBOTS = (
-    "Over the robots of each cell that did not fail: mean, interquartile mean, and mean of the"
-    " worst tenth. Better than: share of the robots for which the policy is better, ties as one"
-    " half; to fail is worse than any value. Of residuals interquartile means over training seeds"
-    " with 95 % intervals."
-)
-"""Meaning of the tables of drawn robots."""
 
 
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
@@ -38,11 +25,12 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
             for policy in table.policies:
                 for cell in table.cells_of(policy, reference, scenario):
                     own = table.of(policy, cell)
-                    swept = table.conditions[policy, cell].swept
-                    values = [f"{swept[name]:g}" if name in swept else "-" for name in table.swept]
-                    figures = [number_interval(score(own, column), column) for column in columns]
+                    condition = table.conditions[policy, cell]
+                    values = condition.swept_values(table.swept)
+                    figures = [number_interval(score(own, c), c) for c in columns]
                     rows.append([reference, scenario, policy, *values, *figures])
-    head = ["reference", "scenario", "policy", *table.swept, *(column.label for column in columns)]
+    labels = [column.label for column in columns]
+    head = ["reference", "scenario", "policy", *table.swept, *labels]
     return Table.plain(head, rows, words=3 + len(table.swept))
 
 
@@ -65,11 +53,14 @@ def robots_table(found: Sequence[RobotScores]) -> Table:
     head = ["reference", "scenario", "policy", "metric", *figures]
     rows = []
     for row in found:
-        names = (row.reference, row.scenario, row.policy, row.column.label)
-        scores = [number_interval(own, row.column) for own in (row.mean, row.middle, row.worst)]
-        shares = {title: percent_interval(own, signed=False) for title, own in row.better.items()}
-        better = "; ".join(f"{title}: {share}" for title, share in shares.items())
-        rows.append(Row((*names, *scores, f"{row.failed}/{row.episodes}", better or "-")))
+        names = (row.reference, row.scope, row.policy, row.column.label)
+        scores = [number_interval(own, row.column) for own in row.scores]
+        better = [
+            f"{title}: {percent_interval(share, signed=False)}"
+            for title, share in row.better.items()
+        ]
+        others = "; ".join(better) or "-"
+        rows.append(Row((*names, *scores, f"{row.failed}/{row.episodes}", others)))
     heads = Table.plain(head, [], words=4).heads
     return Table((*heads, Head("better than", is_number=False)), tuple(rows), keys=4)
 
@@ -79,26 +70,25 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
     if not found:
         return
     columns = list(dict.fromkeys(row.column for row in found))
-    heads = [Head("policy", is_number=False), *(Head(c.title, c.unit, leaves=1) for c in columns)]
+    heads = [Head(column.title, column.unit, leaves=1) for column in columns]
+    heads = [Head("policy", is_number=False), *heads, Head(found[0].failure)]
     rows = []
-    for names, cell in group_by(found, lambda row: (row.reference, row.scenario)).items():
+    for names, cell in group_by(found, lambda row: (row.reference, row.scope)).items():
         rows.append(Row((", ".join(names),), kind="heading"))
         for policy, own in group_by(cell, lambda row: row.policy).items():
             figures = {row.column: _three(row) for row in own}
             failed = f"{own[0].failed}/{own[0].episodes}"
-            rows.append(Row((policy, *(figures[column] for column in columns), failed)))
+            cells = (figures[column] for column in columns)
+            rows.append(Row((policy, *cells, failed)))
     figures = "mean / interquartile mean / mean of the worst tenth"
     title = f"over the drawn robots that did not fail: {figures}"
-    heads.append(Head(found[0].failure))
     print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
 
 
 def _three(row: RobotScores) -> str:
     """Mean, interquartile mean and worst tenth in the unit in which they are shown."""
-    values = (row.column.scale * estimate.value for estimate in (row.mean, row.middle, row.worst))
-    return " / ".join(
-        "-" if np.isnan(value) else f"{value:.{row.column.decimals}f}" for value in values
-    )
+    values = [Estimate(score.value) for score in row.scores]
+    return " / ".join(number_interval(value, row.column) for value in values)
 
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
@@ -106,18 +96,15 @@ def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
     return write_records([record for row in rows for record in _records(row)], path)
 
 
-_SHARE = ("better_share", "better_share_low", "better_share_high")
-
-
 def _records(row: RobotScores) -> Iterator[dict[str, object]]:
-    for other, better in row.better.items() or [("", None)]:
-        share: dict[str, object] = dict.fromkeys(_SHARE, "")
-        if better is not None:
-            share = better.record("better_share")
+    for other, better in row.better.items() or [("", Estimate(0.0))]:
+        share = better.record("better_share")
+        if not other:
+            share = dict.fromkeys(share, "")
         yield {
             "policy": row.policy,
             "reference": row.reference,
-            "scenario": row.scenario,
+            "scenario": row.scope,
             "metric": row.column.metric,
             **row.mean.record("mean"),
             **row.middle.record("interquartile_mean"),

@@ -1,14 +1,13 @@
 """Charts of the report as plain specifications for plotly.js: lists, numbers and colours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.signals import Array
 from train.evaluate.statistics import Estimate
-from train.figures.chart import Chart, Curve, Failing, Panel
+from train.figures.chart import Chart, Curve, Panel
 from train.figures.colours import FRAME, GRID, INK, SHADE
 from train.runs.escaping import chart_text
 
@@ -17,70 +16,62 @@ LONGEST_NAME = 34
 """Letters of a policy that stand beside an axis."""
 _LEGEND_ROW = 150
 """Letters in a row of a legend."""
+_PIXELS = 110
+"""Pixels for an inch of a picture."""
+_GAP = 0.05
+"""Share of the height between panels."""
 
 Spec = dict[str, Any]
+"""A chart, with its height in the layout [px], or a part of it."""
 
 
-@dataclass(frozen=True)
-class PageChart:
-    """A chart on a page.
-
-    Attributes:
-        spec: `data` and `layout` for plotly.js.
-        height: Height [px].
-    """
-
-    spec: Spec
-    height: int
-
-
-def page_chart(chart: Chart) -> PageChart:
+def page_chart(chart: Chart) -> Spec:
     """The panels of a chart one below the other, with a legend on top."""
-    count = len(chart.panels)
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
     legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
-    strip = 24 * len(chart.failing) + 12 if chart.failing else 0
-    height = 130 + chart.panel_height * count + strip
-    top = 1.0 - strip / height
-    layout = base_layout(left=76, top=28 + 20 * legend_rows, bottom=50)
+    rows = [shorten(row) for panel in chart.panels for row in panel.rows]
+    left = max(76, 7.4 * max(map(len, rows), default=0) + 20)
+    layout = base_layout(left=left, top=28 + 20 * legend_rows, bottom=50)
+    total = sum(panel.height for panel in chart.panels)
+    scale = (1.0 - _GAP * (len(chart.panels) - 1)) / total
+    top = 1.0
     data: list[Spec] = []
     for number, panel in enumerate(chart.panels):
         axis = nth(number)
         for curve in panel.curves:
-            data += _curve_traces(curve, axis, is_first=number == 0)
-        low, high = domain(count - 1 - number, count, gap=0.06)
-        layout[f"yaxis{axis}"] = _panel_axis(panel, [top * low, top * high])
-    if chart.failing:
-        axis = nth(count)
-        data += [_failing_trace(policy, row, axis) for row, policy in enumerate(chart.failing)]
-        titles = [chart_text(shorten(policy.name)) for policy in chart.failing]
-        layout[f"yaxis{axis}"] = base_axis(
-            domain=[min(top + 0.02, 0.99), 1.0],
-            tickvals=list(range(len(titles))),
-            ticktext=titles,
-            anchor="x",
-            range=[len(titles) - 0.4, -0.6],
-            showgrid=False,
-        )
-        layout["margin"]["l"] = max(76, 7.4 * max(map(len, titles)) + 20)
+            is_first = curve.name in names
+            names.pop(curve.name, None)
+            data += _curve_traces(curve, axis, is_first)
+        low = max(top - scale * panel.height, 0.0)
+        layout[f"yaxis{axis}"] = _panel_axis(panel, [round(low, 6), round(top, 6)])
+        top = low - _GAP
     ticks: Spec = {"showgrid": False}
     if chart.ticks is not None:
-        values = list(chart.ticks)
-        ticks = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
-    layout["xaxis"] = base_axis(chart.label, anchor=f"y{nth(count - 1)}", **ticks)
+        texts = [f"{value:g}" for value in chart.ticks]
+        ticks = {"type": "log", "tickvals": list(chart.ticks), "ticktext": texts}
+    last = nth(len(chart.panels) - 1)
+    layout["xaxis"] = base_axis(chart.label, anchor=f"y{last}", **ticks)
     layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0}
     layout["showlegend"] = True
-    layout["hovermode"] = "x unified" if len(names) < 7 else "closest"
+    is_small = len({curve.name for curve in curves if curve.name}) < 7
+    layout["hovermode"] = "x unified" if is_small else "closest"
     layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
-    return PageChart({"data": data, "layout": layout}, height)
+    return {"data": data, "layout": {**layout, "height": round(130 + _PIXELS * total)}}
 
 
 def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
-    options: Spec = {"type": "log", "dtick": "D2", "tickformat": "~r"} if panel.is_log else {}
+    options: Spec = {}
+    if panel.is_log:
+        options = {"type": "log", "dtick": "D2", "tickformat": "~r"}
+    if panel.rows:
+        titles = [chart_text(shorten(row)) for row in panel.rows]
+        places = list(range(len(titles)))
+        options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
         options["range"] = [digits(end) for end in panel.limits]
-    return base_axis(panel.label, domain=list(place), anchor="x", **options)
+    label = "" if panel.rows else panel.label
+    return base_axis(label, domain=list(place), anchor="x", **options)
 
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
@@ -96,6 +87,10 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
         "line": {"color": curve.colour, "width": curve.width, "dash": curve.dash},
         "marker": {"size": 7},
     }
+    if curve.crosses:
+        symbols = ["x" if is_filled else "x-open" for is_filled in curve.crosses]
+        marker = {"symbol": symbols, "size": 9, "color": curve.colour}
+        return [{**line, "mode": "markers", "marker": marker, "hoverinfo": "skip"}]
     if curve.band is None:
         return [line]
     hidden = {
@@ -118,24 +113,11 @@ def _abscissa(x: Array) -> Spec:
     return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
 
 
-def _failing_trace(policy: Failing, row: int, axis: str) -> Spec:
-    """Crosses where a policy fails: filled where in all episodes, open where in some."""
-    symbols = ["x" if is_all else "x-open" for is_all in policy.is_all]
-    return {
-        "type": "scatter",
-        "mode": "markers",
-        "x": list(policy.x),
-        "y": [row] * len(policy.x),
-        "yaxis": f"y{axis}",
-        "showlegend": False,
-        "marker": {"symbol": symbols, "size": 9, "color": policy.colour},
-        "hoverinfo": "skip",
-    }
-
-
 def _shade(begin: float, end: float) -> Spec:
-    place = {"xref": "x", "yref": "paper", "x0": digits(begin), "x1": digits(end), "y0": 0, "y1": 1}
-    return {"type": "rect", **place, "fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+    x = {"xref": "x", "x0": digits(begin), "x1": digits(end)}
+    y = {"yref": "paper", "y0": 0, "y1": 1}
+    look = {"fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+    return {"type": "rect", **x, **y, **look}
 
 
 def shorten(name: str) -> str:

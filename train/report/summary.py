@@ -4,18 +4,18 @@ Scores of an episode that failed are never averaged in; failures are counted bes
 """
 
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
 from elastic_env.core.files import write_whole
-from train.evaluate.environments import Column, Environment
+from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.report.page import bullets
 from train.report.report_text import capital
-from train.report.table_formats import Head, Row, Table, print_table, to_markdown
+from train.report.table_formats import Head, Row, Table, column_notes, print_table, to_markdown
 from train.runs.escaping import write_records
 
 
@@ -42,19 +42,21 @@ def summary_table(
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
     judged = {column.metric for column in known.judged}
-    heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy")]
+    names = ("reference", "scenario", "policy")
+    heads = [Head(name, is_number=False) for name in names]
     heads += [Head(name) for name in swept]
-    heads += [Head(c.title, c.unit, c.note, leaves=2 if c.metric in judged else 1) for c in columns]
+    for column in columns:
+        leaves = 2 if column.metric in judged else 1
+        heads.append(Head(column.title, column.unit, column.note, leaves=leaves))
     heads += [Head(known.failure)]
     rows = []
     for e in evaluations:
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
-        values = [
-            f"{condition.swept[name]:g}" if name in condition.swept else "-" for name in swept
-        ]
+        values = condition.swept_values(swept)
         figures = [_median(e, column, worst) for column in columns]
-        rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
+        failed = f"{e.num_failed}/{len(e.episodes)}"
+        rows.append(Row((*names, *values, *figures, failed)))
     title = f"{known.subject}, median over episodes"
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=known.note)
 
@@ -78,19 +80,20 @@ def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
         number = len(e.episodes)
         if e.num_failed < number or not number:
             continue
-        reasons = "/".join(dict.fromkeys(episode["termination"] for episode in e.episodes))
+        reasons = "/".join(dict.fromkeys(own["termination"] for own in e.episodes))
         times = e.values("duration_s", failed=True)
         when = f" after {np.median(times):.1f} s" if len(times) else ""
-        swept = [f"{name}={value:g}" for name, value in e.condition.swept.items()]
-        cell = [] if len(cells) == 1 else [e.condition.reference_name, e.condition.scenario]
-        who = ", ".join([*cell, " ".join([e.condition.policy.title, *swept])])
+        own = e.condition
+        swept = [f"{name}={value:g}" for name, value in own.swept.items()]
+        cell = [] if len(cells) == 1 else [own.reference_name, own.scenario]
+        who = ", ".join([*cell, " ".join([own.policy.title, *swept])])
         notes.append(f"{who}: {reasons}{when} ({number} of {number})")
     return notes
 
 
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
-    return write_records([episode for own in evaluations for episode in own.episodes], path)
+    return write_records(list(chain(*(own.episodes for own in evaluations))), path)
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
@@ -107,18 +110,14 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     worst = " (the worst of them in brackets)" if several else ""
     statistic = f"Median over the episodes that did not fail{worst}"
+    legend = [*column_notes(known.columns), *filter(None, [known.note])]
     parts = [
         f"{capital(known.subject)}. {statistic}; failures are counted beside.",
-        _legend(known, known.columns),
+        " ".join(legend),
         to_markdown(summary_table(evaluations, known.columns, worst=True)),
     ]
-    for title, columns in known.splits:
-        parts += [f"{title}:", to_markdown(summary_table(evaluations, columns, worst=True))]
+    for title, columns in known.splits.items():
+        table = summary_table(evaluations, columns, worst=True)
+        parts += [f"{title}:", to_markdown(table)]
     notes = failure_notes(evaluations)
     return [*parts, "Where all episodes failed:", bullets(notes)] if notes else parts
-
-
-def _legend(known: Environment, columns: Sequence[Column]) -> str:
-    """Notes on the titles of the columns that are shown."""
-    notes = "; ".join(f"{column.title}: {column.note}" for column in columns if column.note)
-    return " ".join(sentence for sentence in (notes and f"{notes}.", known.note) if sentence)

@@ -7,9 +7,8 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-import numpy as np
 from rich import box
 from rich.cells import cell_len
 from rich.console import Console
@@ -52,6 +51,7 @@ class Part:
 
 
 Cell = str | tuple[Part, ...]
+Texts = Iterable[str]
 
 
 @dataclass(frozen=True)
@@ -133,16 +133,15 @@ class Table:
     kind: str = ""
 
     @classmethod
-    def plain(
-        cls, head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1, **more: Any
-    ) -> "Table":
+    def plain(cls, head: Texts, rows: Iterable[Texts], words: int = 1, **more: Any) -> Self:
         """A table of texts whose first columns hold words and the others figures."""
-        heads = tuple(Head(title, is_number=number >= words) for number, title in enumerate(head))
+        heads = tuple(Head(text, is_number=n >= words) for n, text in enumerate(head))
         return cls(heads, tuple(Row(tuple(row)) for row in rows), keys=words, **more)
 
     def column(self, place: int) -> list[str]:
         """Texts of a column, without headings."""
-        return [plain_text(row.cells[place]) for row in self.rows if row.kind != "heading"]
+        rows = [row for row in self.rows if row.kind != "heading"]
+        return [plain_text(row.cells[place]) for row in rows]
 
     def without(self, place: int) -> "Table":
         """The same without a column."""
@@ -170,11 +169,15 @@ class Table:
         return found
 
 
+def parts_of(cell: Cell) -> tuple[Part, ...]:
+    """A cell as parts."""
+    return (Part(cell),) if isinstance(cell, str) else cell
+
+
 def plain_text(cell: Cell) -> str:
     """The text of a cell without looks; what is small is left out."""
-    if isinstance(cell, str):
-        return cell
-    return "".join(part.before + part.text for part in cell if part.style != "small")
+    shown = [part for part in parts_of(cell) if part.style != "small"]
+    return "".join(part.before + part.text for part in shown)
 
 
 def print_table(table: Table, console: Console, file: str) -> None:
@@ -198,9 +201,9 @@ def print_table(table: Table, console: Console, file: str) -> None:
         shown = shown.without(place)
     console.print(fitting)
     if left_out:
-        console.print(
-            f"no room for {'; '.join(left_out)}; {file} has them", style="dim", markup=False
-        )
+        missing = f"no room for {'; '.join(left_out)}"
+        cure = f"widen the terminal, or see {file}"
+        console.print(f"{missing}: {cure}", style="dim", markup=False)
 
 
 def _fit(table: Table, console: Console) -> RichTable | None:
@@ -225,8 +228,7 @@ def _with_titles(table: Table) -> Table:
 def to_terminal(table: Table, breaks_words: bool = False) -> RichTable:
     """A table for a terminal; words are broken where there is no other way."""
     title = ": ".join(filter(None, [", ".join(table.subjects), table.title]))
-    notes = "; ".join(f"{head.title}: {head.note}" for head in table.heads if head.note)
-    caption = " ".join(filter(None, [notes and f"{notes}.", table.caption]))
+    caption = " ".join(filter(None, [*column_notes(table.heads), table.caption]))
     found = RichTable(
         title=Text(title) if title else None,
         caption=Text(caption) if caption else None,
@@ -236,8 +238,9 @@ def to_terminal(table: Table, breaks_words: bool = False) -> RichTable:
     indent = "  " if any(row.kind == "heading" for row in table.rows) else ""
     for place, head in enumerate(table.heads):
         texts = [*head.lines.split("\n"), *table.column(place)]
-        pieces = [word for text in texts for word in _WORD.findall(text)] if head.wraps else texts
-        least = max(map(cell_len, pieces), default=0) + (len(indent) if place == 0 else 0)
+        if head.wraps:
+            texts = [word for text in texts for word in _WORD.findall(text)]
+        least = max(map(cell_len, texts), default=0) + (len(indent) if place == 0 else 0)
         found.add_column(
             Text(head.lines),
             justify="right" if head.is_number else "left",
@@ -246,25 +249,28 @@ def to_terminal(table: Table, breaks_words: bool = False) -> RichTable:
             overflow="fold",
             min_width=None if breaks_words and not head.is_number else least,
         )
-    is_first = True
     for row in table.sparse:
         is_heading = row.kind == "heading"
-        if not is_first and (
-            is_heading or ("" not in row.cells[: table.keys - 1][:1] and table.keys > 1)
-        ):
+        if found.row_count and (is_heading or (table.keys > 1 and row.cells[0])):
             found.add_section()
-        is_first = False
         cells = [_terminal_cell(cell) for cell in row.cells]
         cells[0] = cells[0] if is_heading else Text(indent).append(cells[0])
-        found.add_row(*cells, style={"group": "bold", "heading": "italic"}.get(row.kind, ""))
+        found.add_row(*cells, style=_ROW_STYLES[row.kind])
     return found
 
 
+_ROW_STYLES = {"": "", "group": "bold", "heading": "italic"}
+
+
+def column_notes(columns: Iterable[Head | Column]) -> list[str]:
+    """A sentence with what the titles of columns leave open, if there is something."""
+    notes = [f"{column.title}: {column.note}" for column in columns if column.note]
+    return [f"{'; '.join(notes)}."] if notes else []
+
+
 def _terminal_cell(cell: Cell) -> Text:
-    if isinstance(cell, str):
-        return Text(cell)
     text = Text()
-    for part in cell:
+    for part in parts_of(cell):
         if part.style != "small":
             text.append(part.before)
             text.append(part.text, "bold" if part.style == "bold" else None)
@@ -284,18 +290,17 @@ def to_markdown(table: Table) -> str:
 
 
 def _markdown_cell(cell: Cell) -> str:
-    if isinstance(cell, str):
-        return markdown_text(cell)
-    looks = {
-        "bold": "**{}**",
-        "small": "<br><sub>{}</sub>",
-        "badge": "({})",
-        "ceiling": "({})",
-        "pooled": "({})",
-    }
-    return "".join(
-        part.before + looks.get(part.style, "{}").format(markdown_text(part.text)) for part in cell
-    )
+    text = ""
+    for part in parts_of(cell):
+        look = _MARKDOWN.get(part.style, "{}")
+        text += part.before + look.format(markdown_text(part.text))
+    return text
+
+
+_MARKDOWN = {
+    **{"bold": "**{}**", "small": "<br><sub>{}</sub>"},
+    **dict.fromkeys(("badge", "ceiling", "pooled"), "({})"),
+}
 
 
 def load_template(name: str = "page.html.j2") -> "Template":
@@ -322,10 +327,8 @@ def load_template(name: str = "page.html.j2") -> "Template":
 
 def number_interval(estimate: Estimate, column: Column) -> str:
     """A figure in the unit in which it is shown, with its interval; - where there is none."""
-    if not np.isfinite(estimate.value):
+    if not estimate.is_known:
         return "-"
     shown = estimate.times(column.scale)
-    text = f"{shown.value:.{column.decimals}f}"
-    if shown.low is None or shown.high is None:
-        return text
-    return f"{text} [{shown.low:.{column.decimals}f}, {shown.high:.{column.decimals}f}]"
+    value, low, high = (f"{v:.{column.decimals}f}" for v in (shown.value, *shown.ends))
+    return f"{value} [{low}, {high}]" if shown.has_interval else value

@@ -10,20 +10,15 @@ from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import Cells, learning_chart, sweep_chart, time_chart
-from train.figures.comparison_figures import (
-    by_option,
-    by_reference,
-    cells_together,
-    swept_scenarios,
-)
+from train.figures.chart import learning_chart, time_chart
+from train.figures.comparison_figures import cells_together, sweep_charts
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
 from train.report.leaderboard import add_leaderboard
-from train.report.page import Page
+from train.report.page import TEXTS, Page
 from train.report.report_text import Results, capital, facts, headline, in_short, notes
-from train.report.score_tables import ROBOTS, SCORES, learning_table, robots_table, scores_table
+from train.report.score_tables import learning_table, robots_table, scores_table
 from train.report.specs import page_chart
 from train.report.table_formats import Table, load_template
 
@@ -72,9 +67,8 @@ def write_report(results: Results) -> list[Path]:
 
 def _page(results: Results) -> Page:
     subject = capital(results.environment.subject)
-    page = Page(
-        f"Comparison: {results.name}", f"{subject}; made {results.metadata['created'][:10]}"
-    )
+    under = f"{subject}; made {results.metadata['created'][:10]}"
+    page = Page(f"Comparison: {results.name}", under)
     page.section("What was compared", headline(results))
     page.add("definitions", facts(results))
     page.add("bullets", in_short(results), "In short")
@@ -86,41 +80,35 @@ def _page(results: Results) -> Page:
         _add_ladder(page, results)
     _add_changes(page, results)
     if results.robots:
-        page.section("Drawn robots", ROBOTS)
+        page.section("Drawn robots", TEXTS["robots"])
         _add_table(page, robots_table(results.robots), "Table of drawn robots")
-    for title, columns in results.environment.splits:
-        page.section(title, SCORES)
+    for title, columns in results.environment.splits.items():
+        page.section(title, TEXTS["scores"])
         _add_table(page, scores_table(results.table, columns))
     if results.has_conditions:
         _add_curves(page, results)
     if not results.maps:
         _add_sweeps(page, results)
     if results.learning:
-        _add_learning(page, results)
+        columns = results.environment.judged
+        page.section("Learning curves", TEXTS["learning"])
+        chart = learning_chart(results.learning, columns, results.colours)
+        page.add("chart", page_chart(chart))
+        table = learning_table(results.learning, columns)
+        page.add("table", table, "Table of learning curves", is_folded=True)
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
 
 
-def _add_learning(page: Page, results: Results) -> None:
-    columns = results.environment.judged
-    page.section(
-        "Learning curves",
-        "Score over that of the base (dotted) on episodes that training never sees, mean over the"
-        " trained scenarios: median over training seeds, band from the best to the worst.",
-    )
-    page.add("chart", page_chart(learning_chart(results.learning, columns, results.colours)))
-    table = learning_table(results.learning, columns)
-    page.add("table", table, "Table of learning curves", is_folded=True)
+def _text(results: Results, name: str) -> str:
+    """A paragraph, with its sentence about families where there are some."""
+    return TEXTS[name] + (TEXTS[f"{name}_families"] if results.table.members else "")
 
 
 def _add_maps(page: Page, results: Results) -> None:
     """Heat maps: who is best, what learning adds, and folded away every policy's score."""
-    page.section(
-        "Maps",
-        "Who is best where, and what learning changes against the best policy without it, in per"
-        f" cent: below zero, learning is ahead. {SIGNS_ARE} A cross counts failed episodes.",
-    )
+    page.section("Maps", TEXTS["maps"].format(signs=SIGNS_ARE))
     page.add("caption", "Green: learning is ahead. Red: it is behind.")
     for heat_map in results.maps:
         found = panels(heat_map)
@@ -131,10 +119,7 @@ def _add_maps(page: Page, results: Results) -> None:
 
 
 def _add_ladder(page: Page, results: Results) -> None:
-    text = "Mean over the episodes that reached the end; lower is better; the axis is logarithmic."
-    if results.table.members:
-        text += " Diamonds: interquartile mean over training seeds with its 95 % interval."
-    page.section("Ladder of policies", text)
+    page.section("Ladder of policies", _text(results, "ladder"))
     references = results.table.references
     for number, reference in enumerate(references):
         chart = ladder(results.table, reference, results.colours)
@@ -149,80 +134,52 @@ def _add_changes(page: Page, results: Results) -> None:
     for name, rows in of_residuals:
         if not rows:
             continue
-        page.section(name, "Change on the same episodes, with 95 % intervals over training seeds.")
-        page.add(
-            "caption",
-            "Green: the interval lies below zero. Red: above. Grey: it includes zero, or there are"
-            " too few training seeds. In charts, open circles are held out, and stars are ceilings"
-            " on the training condition.",
-        )
+        page.section(name, TEXTS["changes"])
+        page.add("caption", TEXTS["changes_colours"])
         drawn = [row for row in rows if row.is_judged] if results.has_conditions else []
         for title, own in group_by(drawn, lambda row: row.policy).items():
             page.add("chart", forest(own), f"{title} against {own[0].base}")
         _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
-        page.section(
-            name_of_others,
-            "Paired differences of means. Baselines are not trained: there are no training seeds to"
-            " draw from.",
-        )
-        _add_table(page, changes_table(others, results.colours), "Table of differences")
+        page.section(name_of_others, TEXTS["differences"])
+        table = changes_table(others, results.colours)
+        _add_table(page, table, "Table of differences")
 
 
 def _add_table(page: Page, table: Table, title: str = "Table") -> None:
     """A table, folded away under its title where it is long."""
     number = len(table.rows)
     is_long = number > _LONG
-    page.add("table", table, f"{title} ({number} rows)" if is_long else "", is_folded=is_long)
+    title = f"{title} ({number} rows)" if is_long else ""
+    page.add("table", table, title, is_folded=is_long)
 
 
 def _add_curves(page: Page, results: Results) -> None:
     """Signals of the first episodes over time, a chart for each motion and scenario."""
     table = results.table
-    text = "The first episode of every cell; a line ends where the episode does."
-    if table.members:
-        text += " Of residuals: median over training seeds, band from the least to the most."
-    if table.environment.splits:
-        text += " Single support is shaded."
-    page.section("Curves over time", text)
+    known = table.environment
+    walk = TEXTS["curves_walk"] if known.walks else ""
+    page.section("Curves over time", f"{_text(results, 'curves')}{walk}")
     traced = [e for e in results.evaluations if e.trace]
-    cells = group_by(traced, lambda e: (e.condition.reference_name, e.condition.scenario))
     shared = _ALL_POINTS // (len(table.references) * len(table.scenarios))
     most = min(_POINTS, max(_LEAST_POINTS, shared))
-    for number, ((reference, scenario), own) in enumerate(cells.items()):
+    for number, own in enumerate(cells_together(traced)):
+        first = own[0].condition
         policies = group_by(own, lambda e: e.condition.policy.title)
-        chart = time_chart(policies, table.environment.curves, results.colours, most)
-        title = capital(f"{table.environment.title(reference)}, {scenario}")
+        chart = time_chart(policies, known.curves, results.colours, most)
+        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
         page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
     """Scores over the swept option, or over what the references differ in."""
-    known = results.environment
-    charts: list[tuple[str, Cells]] = []
-    label = f"{known.quantity} [s]" if results.swept is None else results.swept
-    if results.swept is not None:
-        for own in cells_together(results.evaluations):
-            first = own[0].condition
-            title = f"{known.title(first.reference_name)}, {first.scenario}"
-            charts.append((title, by_option(own)))
-    else:
-        for scenario in swept_scenarios(results.evaluations):
-            own = [e for e in results.evaluations if e.condition.scenario == scenario]
-            charts.append((f"scenario {scenario}", by_reference(own)))
-    if not charts:
-        return
-    text = (
-        "Means over the episodes that reached the end. A cross on top: all episodes of a policy"
-        " failed there; an open one: some did."
-    )
-    if results.table.members:
-        text += " Bands are 95 % intervals over training seeds."
-    page.section("Sweeps", text)
-    for number, (title, cells) in enumerate(charts):
-        chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)
-        title = capital(title)
-        page.add("chart", page_chart(chart), title, is_folded=True, is_open=number == 0)
+    columns = results.environment.judged
+    charts = sweep_charts(results.evaluations, results.swept, columns, _cell_score)
+    if charts:
+        page.section("Sweeps", _text(results, "sweeps"))
+    for number, chart in enumerate(charts.values()):
+        folding = {"is_folded": True, "is_open": number == 0}
+        page.add("chart", page_chart(chart), chart.title, **folding)
 
 
 def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:
