@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import compress
 from pathlib import Path
 
 from rich.console import Console
@@ -31,10 +32,10 @@ class CellsFailedError(ElasticError):
         finished: Evaluations of the others.
     """
 
-    def __init__(self, why: Sequence[tuple[str, int]], finished: list[Evaluation]) -> None:
-        super().__init__("\n".join(dict.fromkeys(said for said, _ in why)))
+    def __init__(self, why: dict[str, int], finished: list[Evaluation]) -> None:
+        super().__init__("\n".join(why))
         self.finished = finished
-        self.exit_code = max(code for _, code in why)  # type: ignore[misc]
+        self.exit_code = max(why.values())  # type: ignore[misc]
 
 
 def run_conditions(
@@ -69,17 +70,19 @@ def run_conditions(
     kept = [None] * len(conditions)
     if store is not None and not fresh:
         kept = _load_kept(conditions, store, console)
-    missing = [condition for condition, own in zip(conditions, kept, strict=True) if own is None]
+    missing = list(compress(conditions, [own is None for own in kept]))
     if len(missing) < len(conditions):
-        console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept")
+        number = len(conditions) - len(missing)
+        console.print(f"{number} of {len(conditions)} cells are kept")
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if own is None else Outcome(own) for own in kept]
-    finished = [result.value for result in results if result is not None and result.error is None]
-    failed = [
-        _failure_text(condition, result.error, result.trace)
-        for condition, result in zip(conditions, results, strict=True)
-        if result is not None and result.error is not None
-    ]
+    finished = list[Evaluation]()
+    failed = dict[str, int]()
+    for condition, result in zip(conditions, results, strict=True):
+        if result is not None and result.error is None:
+            finished.append(result.value)
+        elif result is not None:
+            failed.update([_explain_failure(condition, result)])
     if failed:
         raise CellsFailedError(failed, finished)
     if None in results:
@@ -100,10 +103,10 @@ def _load_kept(
             found.append(None)
             unfit.append(f"{_name(condition)} ({error})")
     if unfit:
-        more = f", and {len(unfit) - _MOST_NAMED} more" if len(unfit) > _MOST_NAMED else ""
         named = "; ".join(unfit[:_MOST_NAMED])
-        said = f"kept cells that do not fit are played again: {named}{more}"
-        console.print(said, markup=False)
+        others = len(unfit) - _MOST_NAMED
+        more = f", and {others} more" if others > 0 else ""
+        console.print(f"kept cells that do not fit are played again: {named}{more}")
     return found
 
 
@@ -122,14 +125,14 @@ class _Playing:
         self._place = place
         self._store = store
         steps = num_steps(conditions)
-        cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
-        batches = in_batches(conditions, cores)
-        steps_of = [sum(steps[number] for number in batch) for batch in batches]
-        longest_first = sorted(range(len(batches)), key=lambda batch: -steps_of[batch])
-        self._batches = [batches[batch] for batch in longest_first]
-        self._steps = [steps_of[batch] for batch in longest_first]
-        self._cells = [[conditions[number] for number in batch] for batch in self._batches]
-        self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
+        cores = place.jobs or os.cpu_count() or 1
+        batches = in_batches(conditions, cores if place.is_local else len(conditions))
+        by_steps = [(sum(steps[number] for number in batch), batch) for batch in batches]
+        by_steps.sort(key=lambda own: -own[0])
+        self._steps = [steps for steps, _ in by_steps]
+        self._batches = [batch for _, batch in by_steps]
+        self._cells = [[conditions[i] for i in batch] for batch in self._batches]
+        self._keys = [] if store is None else list(map(cell_key, conditions))
         self._played = [0] * len(batches)
         self._tally = Tally(len(conditions))
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
@@ -144,7 +147,8 @@ class _Playing:
             if len(self._batches) == 1 and self._place.is_local:
                 # a process of its own takes seconds to start
                 report = partial(self._report, 0)
-                self._end(0, Outcome(_evaluate(self._cells[0], report, self._place.jobs)))
+                threads = self._place.jobs
+                self._end(0, Outcome(_evaluate(self._cells[0], report, threads)))
             else:
                 self._play_beside()
         return self._outcomes
@@ -171,16 +175,17 @@ class _Playing:
         for number, own in zip(numbers, outcomes, strict=True):
             self._outcomes[number] = own
             self._tally.end(number, own)
-            store = self._store
-            if own.error is None and store and not store.keep(own.value, self._keys[number]):
+            if own.error is not None or self._store is None:
+                continue
+            if not self._store.keep(own.value, self._keys[number]):
                 name = _name(self._conditions[number])
                 cause = "a file that it names changed while it was played"
                 self._console.print(f"{name} is not kept: {cause}")
         self._report(batch, self._steps[batch])
 
     def _say_moved(self, batch: int) -> None:
-        for condition in self._cells[batch]:
-            self._console.print(f"a worker was lost; {_name(condition)} is played again")
+        for name in map(_name, self._cells[batch]):
+            self._console.print(f"a worker was lost; {name} is played again")
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
@@ -211,10 +216,12 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     return batches
 
 
-def _failure_text(condition: Condition, error: Exception, trace: str) -> tuple[str, int]:
+def _explain_failure(condition: Condition, result: Outcome) -> tuple[str, int]:
     """Text and exit code of a failure; a defect's traceback goes to the terminal."""
-    defect = (f"this is a defect: {type(error).__name__}: {error}\n{trace}", DEFECT)
-    said, code = explain(error) or defect
+    error = result.error
+    assert error is not None
+    defect = f"this is a defect: {type(error).__name__}: {error}\n{result.trace}"
+    said, code = explain(error) or (defect, DEFECT)
     if isinstance(error, PolicyFailedError):  # which names the cell itself
         return said, code
     return f"{_name(condition)}: {said}", code

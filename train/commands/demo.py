@@ -1,14 +1,15 @@
 """`elastic demo`: the paper's experiments (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
+from baselines.identification.identify import Identification, identify_points
 from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare import CompareConfig
@@ -53,7 +54,8 @@ _WALK = CompareConfig(
     references=[3],
     policies=_policies("uncompensated", "input_output", "input_wrench"),
 )
-_SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its base alone
+# where the model is right, a residual leaves its base alone
+_SOFT_WALK = CompareConfig(
     name="demo",
     env="walker",
     references=[3],
@@ -63,6 +65,7 @@ _SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its b
         PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
     ],
 )
+_WALKS = (_SLOW_WALK, _WALK, _SOFT_WALK)
 
 
 class Demo(Model):
@@ -74,10 +77,9 @@ class Demo(Model):
     def run(self, console: Console) -> None:
         """Run, print the tables beside the paper's figures, and say where the pictures are."""
         plots.require_matplotlib()
-        walking = [*_SLOW_WALK.conditions(), *_WALK.conditions(), *_SOFT_WALK.conditions()]
-        parts = [_STATIC.conditions(), _MOTION.conditions(), walking]
-        conditions = [condition for part in parts for condition in part]
-        recorded = {"conditions": [condition.model_dump(mode="json") for condition in conditions]}
+        parts = [config.conditions() for config in (_STATIC, _MOTION, *_WALKS)]
+        conditions = list(chain(*parts))
+        recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
             console.print(
                 "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic"
@@ -85,15 +87,17 @@ class Demo(Model):
                 " them; at the end with joints that are softer than assumed (scenario soft)"
             )
             evaluations = iter(run_conditions(conditions, console))
-            static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
+            static, motion, *walked = ([next(evaluations) for _ in part] for part in parts)
+            walks = list(chain(*walked))
             scored = [*motion, *walks]
             model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
             points = static[0].points
             assert points is not None
-            result = identification.identify_points(points, [make_gravity(model)])
+            result = identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
+            fig5 = folder / "fig5_identification.png"
             files = [
-                draw_identification(result, points, [model], folder / "fig5_identification.png"),
+                draw_identification(result, points, [model], fig5),
                 draw_static_errors(static, model, folder / "fig6_static_errors.png"),
                 draw_time_series(motion, folder / "sine.png"),
             ]
@@ -115,17 +119,20 @@ class Demo(Model):
 _HEAD = ("quantity", "here", "paper")
 
 
-def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
+def _testbed_table(result: Identification, static: Sequence[Evaluation]) -> Table:
+    stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+    line = f"{result.line_stiffness_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
-        ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
+        ("identified stiffness [N·m/rad]", stiffness, "1001"),
         ("  95 % interval", interval, "-"),
-        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
+        ("  plain line", line, "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
     ]
-    for evaluation, paper in zip(static, ("-56.2 to +41.7", "-3.7 to +7.1"), strict=True):
+    ranges = ("-56.2 to +41.7", "-3.7 to +7.1")
+    for evaluation, paper in zip(static, ranges, strict=True):
         error = 1e3 * static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
@@ -147,4 +154,5 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
         name = f"{walked}, {condition.policy.title} [mrad]"
         rows.append((name, " and ".join(peaks) or "fell", paper))
-    return make_table("the paper's walks, Figs. 7 and 8: largest roll and pitch", _HEAD, rows)
+    title = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
+    return make_table(title, _HEAD, rows)

@@ -72,7 +72,8 @@ def _have_streams() -> None:
     """Open standard streams where the program began without them: libraries ask what they are."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(nowhere, "w" if number else "r"))
 
 
 def _end_without_output(error: OSError) -> None:

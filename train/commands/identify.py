@@ -117,12 +117,10 @@ class Identify(Model):
             finally:
                 for env in envs:
                     env.close()
-            results[0].save(folder / "identification.json")
+            files = [folder / "identification.json", folder / "identification.png"]
+            results[0].save(files[0])
             models = [env.unwrapped.assumed_model for env in envs]
-            files = [
-                folder / "identification.json",
-                draw_identification(results[0], points[0], models, folder / "identification.png"),
-            ]
+            draw_identification(results[0], points[0], models, files[1])
             console.print(result_table(results[0]))
             if self.repeats > 1:
                 seeds = range(self.seed, self.seed + self.repeats)
@@ -205,12 +203,8 @@ def identified_environments(options: Identify) -> list[Any]:
             "stiffness": options.stiffness,
         }
     arguments["reference"] = {"kind": "hold", "positions": options.positions}
-    return [
-        gymnasium.make_vec(
-            name, vectorization_mode="vector_entry_point", pendulum=pendulum, **arguments
-        )
-        for pendulum in pendulums
-    ]
+    arguments["vectorization_mode"] = "vector_entry_point"
+    return [gymnasium.make_vec(name, pendulum=own, **arguments) for own in pendulums]
 
 
 def _spread(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:

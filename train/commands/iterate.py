@@ -18,9 +18,8 @@ from baselines.options import PolicyOptions
 from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.robot_model import WalkerModel
-from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, reference_of
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.environments import Column
 from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.chart import trials_chart
@@ -84,11 +83,13 @@ class Iterate(Model):
     @property
     def condition(self) -> Condition:
         """The cell in which it learns."""
-        base = {} if self.base is None else {"learned_base": self.base}
+        options: dict[str, Any] = {"learning": self.gains}
+        if self.base is not None:
+            options["learned_base"] = self.base
         return Condition(
             env=self.env,
-            policy=PolicySpec(name="iterative", options={**base, "learning": self.gains}),
-            reference=reference_of(self.env, self.reference),
+            policy=PolicySpec(name="iterative", options=options),
+            reference=self.reference,
             scenario=self.scenario,
             seed=self.seed,
         )
@@ -111,13 +112,14 @@ class Iterate(Model):
             with run_folder("iterate", recorded, self.seed, self.output) as folder:
                 trials = _trials(self, env, policy, console)
                 columns = condition.environment.judged
-                chart = trials_chart(trials, columns, f"Learned on the robot, {self.scenario}")
+                title = f"Learned on the robot, {self.scenario}"
+                chart = trials_chart(trials, columns, title)
                 files = [
                     _write_trials(trials, policy, self.seed, folder / "trials.csv"),
                     plots.draw_chart(chart, folder / "trials.png"),
                 ]
                 policies = _save(self, env, policy, folder)
-        console.print(trials_table(trials, columns, condition))
+        console.print(trials_table(trials, condition))
         for path in files:
             console.print(f"wrote {path}")
         for path in policies:
@@ -139,15 +141,15 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
     return trials
 
 
-def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
+def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
     """Judged metrics of every trial, means over the robots that did not fail, and failures."""
-    title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
-    head = ["trial", *(column.label for column in columns), condition.environment.failures]
+    known = condition.environment
+    title = f"{known.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in known.judged), known.failures]
     rows = []
     for trial in trials:
-        survived = pd.DataFrame(trial.metrics)[~trial.failed]
-        means = [column.scale * survived[column.metric].mean() for column in columns]
-        scores = [f"{m:.{column.decimals}f}" for m, column in zip(means, columns, strict=True)]
+        means = pd.DataFrame(trial.metrics)[~trial.failed].mean(numeric_only=True)
+        scores = [f"{c.scale * means[c.metric]:.{c.decimals}f}" for c in known.judged]
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)
@@ -155,20 +157,22 @@ def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: 
 
 def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
     """One row per robot and trial: what the sensors showed, and the metrics."""
+    names = [f"measured_{name}" for name in policy.names]
     rows = []
     for trial in trials:
         for robot, metrics in enumerate(trial.metrics):
-            row = {"trial": trial.number, "seed": seed + robot, "failed": bool(trial.failed[robot])}
-            for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True):
-                row[f"measured_{name}"] = rms
-            rows.append({**row, **metrics})
+            failed = bool(trial.failed[robot])
+            row = {"trial": trial.number, "seed": seed + robot, "failed": failed}
+            measured = zip(names, trial.error_rms[robot].tolist(), strict=True)
+            rows.append({**row, **dict(measured), **metrics})
     return write_records(rows, path)
 
 
 def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
     """Write the offsets of every robot: to the folder itself for one, else to folders by seed."""
     model = env.unwrapped.assumed_model
-    base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
+    chosen = PolicyOptions(learned_base=options.base)
+    base = learned_base(chosen, isinstance(model, WalkerModel))
     folders = []
     for robot, table in enumerate(policy.tables):
         seed = options.seed + robot

@@ -115,7 +115,8 @@ class OnHardware(Model):
             chosen = Mounting(**given)
         else:
             chosen = load_yaml(self.mounting, Mounting, given)
-        values = chosen.model_dump(include={*chosen.model_fields_set, *options, "limits"})
+        named = {*chosen.model_fields_set, *options, "limits"}
+        values = chosen.model_dump(include=named)
         if self.patient:
             values["limits"] |= PATIENT_LIMITS
             values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
@@ -153,18 +154,14 @@ class OnHardware(Model):
         return "hardware"
 
 
-def reference_of(env: str, reference: Any) -> Any:
-    """The reference, or the environment's default for None."""
-    return environment(env).default_reference if reference is None else reference
-
-
 _OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "policy"}
 """Options that give a list of a configuration its only entry."""
 
 
 def option_name(path: ParameterPath) -> str:
     """A parameter as the option that sets it."""
-    return "--" + _OF_ONE.get(str(path[0]), str(path[0])).replace("_", "-") if path else ""
+    name = str(path[0]) if path else ""
+    return f"--{_OF_ONE.get(name, name).replace('_', '-')}" if path else ""
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import io
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -20,12 +20,14 @@ from elastic_env.core.errors import (
     missing_extra,
     shorten,
 )
-from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options, reference_of
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options
 from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
+_Step = tuple[int, Mapping[str, Any]]
+"""Number and info of a control step."""
 
 
 def play(
@@ -55,11 +57,13 @@ def play(
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
-        steps_of_it = (step for step, _ in episode(env, policy, condition, steps, console))
+        played = episode(env, policy, condition, steps, console)
         if video is None:
-            _window(steps_of_it, period)
+            _window(played, period)
         else:
-            _film(env, steps_of_it, steps, period, video, console)
+            shown = track(played, "filming", total=steps, console=console, transient=True)
+            _film(env, shown, period, video)
+            console.print(f"wrote {video}")
 
 
 def steps_within(task: Any, max_s: float | None) -> int:
@@ -76,7 +80,8 @@ def steps_within(task: Any, max_s: float | None) -> int:
         return task.num_steps
     if not max_s > 0.0:
         raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
-    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
+    steps = max_s / task.assumed_model.control_period_s
+    return max(round(min(steps, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
@@ -88,7 +93,7 @@ def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
 
 def episode(
     env: Any, policy: Any, condition: Condition, steps: int, console: Console
-) -> Iterator[tuple[int, Mapping[str, Any]]]:
+) -> Iterator[_Step]:
     """Play step by step; yields number and info of each step, and says so where the episode fails.
 
     Args:
@@ -106,19 +111,16 @@ def episode(
             )
 
 
-def _window(episode: Iterator[int], period: float) -> None:
+def _window(episode: Iterable[_Step], period: float) -> None:
     begin = time.perf_counter()
-    for step in episode:
+    for step, _ in episode:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
 
 
-def _film(
-    env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console
-) -> None:
+def _film(env: Any, episode: Iterable[_Step], period: float, video: Path) -> None:
     if video.exists() or video.is_symlink():
-        raise ResultsExistError(
-            f"{shorten(video)} exists and is not overwritten; name another file"
-        )
+        problem = f"{shorten(video)} exists and is not overwritten; name another file"
+        raise ResultsExistError(problem)
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
     try:
@@ -138,7 +140,7 @@ def _film(
     else:
         writer = imageio.get_writer(video, fps=1.0 / frame_s)
     with writer:
-        for step in track(episode, "filming", total=steps, console=console, transient=True):
+        for step, _ in episode:
             if step % every == 0:
                 writer.append_data(env.render())
                 frames += 1
@@ -146,7 +148,6 @@ def _film(
         video.write_bytes(memory.getbuffer())
     else:
         _require_whole(video, frames)
-    console.print(f"wrote {video}")
 
 
 def _require_whole(video: Path, frames: int) -> None:
@@ -188,16 +189,14 @@ class WatchedEpisode(Model):
     @property
     def condition(self) -> Condition:
         """The cell that is played."""
-        reference = self.reference
-        if reference is None:
-            reference = environment(self.env).watched_reference
+        watched = environment(self.env).watched_reference
         with name_options():
             return Condition(
                 env=self.env,
                 policy=PolicySpec(name=self.policy),
                 scenario=self.scenario,
                 seed=self.seed,
-                reference=reference_of(self.env, reference),
+                reference=watched if self.reference is None else self.reference,
             )
 
 

@@ -22,7 +22,6 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read
 from elastic_env.core.errors import ConfigurationError, ElasticError, quote
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
-from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
@@ -214,23 +213,20 @@ def _of_gallery(name: str) -> dict[str, Any]:
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
+    joints = {
+        joint: assumed.model_dump(include=_ASSUMED)
+        for joint, assumed in gallery_joints(name).items()
+    }
     return {
         "model": model,
-        "joints": {name: _settings(joint) for name, joint in gallery_joints(name).items()},
+        "joints": joints,
         "end_effector": end_effector,
         "home": dict(known.home),
     }
 
 
-def _settings(joint: ElasticJoint) -> dict[str, Any]:
-    """An elastic joint as a file has it."""
-    assert joint.servo is not None
-    names = ("stiffness", "damping", "rotor_inertia")
-    gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit", "speed_limit")
-    return {
-        **{name: getattr(joint, name) for name in names},
-        "servo": {name: getattr(joint.servo, name) for name in gains},
-    }
+_ASSUMED = {"stiffness", "damping", "rotor_inertia", "servo"}
+"""What is known of a joint of the gallery, as a file has it."""
 
 
 def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
@@ -275,7 +271,8 @@ def _placement(evaluation: Evaluation) -> dict[str, Any]:
 def rest_poses(plant: JointPlant) -> Array:
     """The static poses of a reference, (poses, n) [rad]."""
     plan = plant.motion.plan(np.random.default_rng(0), plant.true.control_period_s)
-    return plan.q[np.unique(plan.rest, return_index=True)[1][int(plan.rest.min() < 0) :]]
+    numbers, first = np.unique(plan.rest, return_index=True)
+    return plan.q[first[numbers >= 0]]
 
 
 def joint_shares(plant: JointPlant) -> pd.DataFrame:
@@ -339,7 +336,8 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     tool = plant.end_effector
     assert tool is not None
     known = plant.assumed
-    in_series = known.rest_stiffness("tendon").tolist()  # spring and servo: the command leads both
+    # spring and servo: the command leads both
+    in_series = known.rest_stiffness("tendon").tolist()
     compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
     q_ref = rest_poses(plant)
     order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
@@ -378,10 +376,11 @@ def _placed_table(placed: Sequence[dict[str, Any]]) -> Table:
     rows = []
     for motion in dict.fromkeys(one["motion"] for one in placed):
         errors = [1e3 * one["error_rms_m"] for one in placed if one["motion"] == motion]
-        best = min((error for error in errors[1:] if not np.isnan(error)), default=np.nan)
+        best = pd.Series(errors[1:]).min()  # of those that did not fail
         left = best / errors[0] if errors[0] > 0.0 else np.nan
+        share = "-" if np.isnan(left) else f"{100.0 * left:.1f} %"
         cells = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
-        rows.append([motion, *cells, "-" if np.isnan(left) else f"{100.0 * left:.1f} %"])
+        rows.append([motion, *cells, share])
     head = ["motion", *POLICIES, "left by the best"]
     return make_table("end effector, rms error [mm]", head, rows, **_STYLE)
 

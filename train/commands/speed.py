@@ -104,21 +104,26 @@ class Speed(Model):
         console.print(f"wrote {path}")
 
 
+_TIMES = {"latency": "from due to command", "policy": "in the policy"}
+
+
 def measure_real_time(config: Speed, console: Console) -> Path:
     """Time a policy against the clock, print its latencies, and write them as JSON."""
     recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
     with run_folder("speed", recorded, 0, config.output) as folder:
-        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
+        length = f"{config.seconds:g} s"
+        console.print(f"recording an episode, then {length} against the clock")
         found = play_against_the_clock(config.env, config.policy, config.seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(found, indent=2) + "\n")
-    title = f"{found['policy']} on the {config.env}, once in {found['period_us']:.0f} µs"
+    period = f"once in {found['period_us']:.0f} µs"
+    title = f"{found['policy']} on the {config.env}, {period}; times in µs"
     rows = [
         (label, *(f"{found[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
-        for label, key in (("from due to command", "latency"), ("in the policy", "policy"))
+        for key, label in _TIMES.items()
     ]
     head = ["", "median", "99 %", "99.9 %", "longest"]
-    console.print(make_table(f"{title}; times in µs", head, rows))
+    console.print(make_table(title, head, rows))
     share = 100.0 * found["late_share"]
     console.print(f"late: {found['late']} of {found['cycles']} cycles, {share:.3f} %")
     if not found["is_real_time"]:
@@ -129,9 +134,11 @@ def measure_real_time(config: Speed, console: Console) -> Path:
 def measure_throughput(config: Speed, console: Console) -> Path:
     """Time all contenders, print their ratios, and write them as JSON and CSV."""
     if config.others or config.ppo:
-        importlib.import_module("stable_baselines3")  # what is missing is said before the work
+        # what is missing is said before the work
+        importlib.import_module("stable_baselines3")
     VectorLoop(config.env, 1, 1, config.policy)
-    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
+    unused = {"output", "profile", "real_time", "seconds"}
+    recorded = config.model_dump(mode="json", exclude=unused)
     with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))
@@ -176,11 +183,12 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
     try:
         for turn in range(rates.size):
             number = turn % len(contenders)
-            rates[turn // len(contenders), number] = contenders[number].run(config.steps)
+            rates.flat[turn] = contenders[number].run(config.steps)
             progress((turn + 1) / rates.size)
     finally:
         for contender in contenders:
             contender.close()
+    names = [f"{contender.title}, {contender.num_envs}" for contender in contenders]
     medians = np.median(rates[1:], axis=0)
     ratios = np.median(rates[1:] / rates[1:, against], axis=0)
     return [
@@ -191,9 +199,9 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
             "threads": config.threads_used,
             "steps_per_s": float(medians[number]),
             "ratio": float(ratios[number]),
-            "against": f"{contenders[other].title}, {contenders[other].num_envs}",
+            "against": names[against[number]],
         }
-        for number, (contender, other) in enumerate(zip(contenders, against, strict=True))
+        for number, contender in enumerate(contenders)
     ]
 
 
@@ -241,5 +249,6 @@ def profile(config: Speed) -> str:
     profiler = cProfile.Profile()
     profiler.runcall(loop.run, config.steps * config.rounds)
     text = io.StringIO()
-    pstats.Stats(profiler, stream=text).strip_dirs().sort_stats("cumulative").print_stats(40)
+    stats = pstats.Stats(profiler, stream=text).strip_dirs()
+    stats.sort_stats("cumulative").print_stats(40)
     return text.getvalue()

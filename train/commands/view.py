@@ -158,7 +158,8 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
             end_s = play.recording.times_s[-1]
-            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, LARGEST_FACTOR)
+            most = LARGEST_FACTOR
+            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, most)
             _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, end_s)
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
@@ -176,7 +177,8 @@ class _PrivateViewer(web_viewer.WebViewer):
     def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
         self._listener = listener
         config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address that is not ours
+        # it prints an address that is not ours
+        with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
@@ -276,7 +278,8 @@ class View(WatchedEpisode):
 
     def run(self, console: Console) -> None:
         """Play an episode, then show it until Ctrl-C."""
-        listen(self.host, self.port).close()  # what cannot be is said before the episode
+        # what cannot be is said before the episode
+        listen(self.host, self.port).close()
         condition = self.condition
         console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
@@ -131,10 +131,10 @@ class Condition(Model):
     policy: PolicySpec
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
-    reference: GivenReference = "hold"
+    reference: GivenReference = None
     """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the
-    environment."""
+    three durations [s], or a mapping with `step_period` and further arguments of the environment;
+    None for the environment's default."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
@@ -152,6 +152,14 @@ class Condition(Model):
     """Seed of the first episode; the next ones follow [1]."""
 
     _checked = field_validator("env_options")(_options)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _environment_has_a_default(cls, values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("reference") is None:
+            known = environment(values.get("env", "testbed"))
+            values = {**values, "reference": known.default_reference}
+        return values
 
     @property
     def environment(self) -> Environment:

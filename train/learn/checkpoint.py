@@ -73,7 +73,8 @@ def require_whole(checkpoint: Path) -> None:
         if name not in digests:
             raise damage_error(checkpoint, f"{name} is not of it")
         if digests[name] != found[name]:
-            raise damage_error(checkpoint, f"the content of {name} is not what was written")
+            problem = f"the content of {name} is not what was written"
+            raise damage_error(checkpoint, problem)
 
 
 def damage_error(checkpoint: Path, why: object) -> ElasticError:

@@ -2,7 +2,7 @@
 
 import pickle
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +19,8 @@ from train.runs.folders import provenance
 Tensors = dict[str, npt.NDArray[Any]]
 
 
-def network_of(
-    model: BaseAlgorithm, normaliser: Any | None
-) -> tuple[Tensors, str, Literal["clip", "tanh"]]:
-    """Weights, activation and output of the network that a model acts by deterministically.
+def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, dict[str, Any]]:
+    """Weights of the network that a model acts by deterministically; its activation and output.
 
     Args:
         model: With an actor as PPO and A2C have it, or as SAC and TQC have it.
@@ -58,7 +56,7 @@ def network_of(
     if normaliser is not None:
         tensors["mean"] = normaliser.obs_rms.mean.copy()
         tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
-    return tensors, names[activations.pop()], output  # type: ignore[return-value]
+    return tensors, {"activation": names[activations.pop()], "output": output}
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
@@ -68,8 +66,8 @@ def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     does = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()
-    last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))
-    given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
+    layers = sum(name.startswith("bias") for name in tensors)
+    given = tensors["weight0"].shape[1], len(tensors[f"bias{layers - 1}"])
     if given != (sees, does):
         raise ConfigurationError(
             f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on"
@@ -109,20 +107,17 @@ def export_zip(
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
         statistics = pickle.loads(normaliser.read_bytes()) if normaliser else None
-        tensors, activation, kind = network_of(model, statistics)
+        tensors, network = network_of(model, statistics)
     except ConfigurationError:
         raise
     except Exception as error:  # whatever a pickle of something else leads to
-        files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
+        files = " with ".join(map(str, filter(None, (path, normaliser))))
         raise ConfigurationError(
             f"{files} is no model that SB3's {config.algorithm} saved: {error}"
         ) from error
     joints = _joints_that_fit(tensors, config)
-    training = {
-        "config": config.model_dump(mode="json"),
-        **provenance(None),
-        "exported_from": path.name,
-    }
-    description = config.description(joints, activation=activation, output=kind, training=training)
+    recorded = config.model_dump(mode="json")
+    training = {"config": recorded, **provenance(None), "exported_from": path.name}
+    description = config.description(joints, training=training, **network)
     save_residual(output, description, tensors)
     return output

@@ -50,7 +50,7 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Begin an episode in every world, with the seeds of the last call of `seed`."""
-        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        seeds: Any = None if self._seeds[0] is None else list(self._seeds)
         observation, _ = self.env.reset(seed=seeds)
         if self._stagger is not None:
             self.env.stagger(self._stagger)  # type: ignore[attr-defined]
@@ -88,12 +88,12 @@ class SB3VecEnv(VecEnv):
             metrics = final.get("episode_metrics", {})
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
-                own = {
-                    name: values[world].item() for name, values in metrics.items() if scored[world]
-                }
+                ended = metrics if scored[world] else {}
+                own = {name: values[world].item() for name, values in ended.items()}
+                is_cut = bool(truncated[world] and not terminated[world])
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
-                    "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
+                    "TimeLimit.truncated": is_cut,
                     "episode_metrics": own,
                 }
                 if own or self._stagger is None:

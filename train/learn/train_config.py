@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 import baselines
 from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
+from elastic_env.core.config import Entries, Locator, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
@@ -23,6 +23,7 @@ from train.evaluate.environments import environment
 from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
+from train.runs.user_code import CodeNamingModel
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
@@ -36,14 +37,14 @@ _TRAINING_SEED_STRIDE = 100_000
 _MOST_DECISIONS = 10**12
 
 
-class TrainConfig(Model):
+class TrainConfig(CodeNamingModel):
     """A training: worlds, base policy, algorithm, and how long."""
 
     name: Title = "train"
     env: str = "walker"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
+    scenarios: Entries[Title] = ["nominal"]
     """Scenarios whose worlds are learned from together, in equal shares."""
     weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = {}
     """How much the rewards of single scenarios count, at most 10⁶; 1 where nothing is said."""
@@ -71,9 +72,7 @@ class TrainConfig(Model):
     """Worlds, shared out to the scenarios."""
     decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
     """Decisions of all worlds together."""
-    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(
-        default=[0], min_length=1, max_length=MOST_ENTRIES
-    )
+    seeds: Entries[Annotated[int, Field(ge=0, lt=2**32)]] = [0]
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
@@ -121,26 +120,25 @@ class TrainConfig(Model):
         return seeds
 
     @property
-    def motion(self) -> Any:
-        """The reference, or the environment's default."""
-        if self.reference is not None:
-            return self.reference
-        return environment(self.env).default_reference
+    def names_of_code(self) -> list[str]:
+        """Names that may stand for code; that of the base never does."""
+        return [self.algorithm, self.env]
 
     def condition(self, scenario: str, policy: str) -> Condition:
         """A cell in which a policy is evaluated; where nothing is drawn, it has one episode."""
-        is_one = environment(self.env).is_deterministic(scenario, self.motion)
         options = self.base_options if policy == self.base else {}
-        return Condition(
+        condition = Condition(
             env=self.env,
             policy=PolicySpec(name=policy, options=options),
             scenario=scenario,
-            reference=self.motion,
+            reference=self.reference,
             ranges=self.ranges,
             env_options=self.env_options,
-            episodes=1 if is_one else self.evaluation_episodes,
+            episodes=self.evaluation_episodes,
             seed=EVALUATION_SEED,
         )
+        is_one = condition.environment.is_deterministic(scenario, condition.reference)
+        return condition.replace(episodes=1) if is_one else condition
 
     def description(self, joints: list[str], **network: Any) -> ResidualDescription:
         """Description of an exported policy; `network` names its activation and output."""
@@ -171,7 +169,8 @@ class TrainConfig(Model):
                 f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
             )
         whole, rest = divmod(self.worlds, count)
-        return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
+        sizes = [whole + (number < rest) for number in range(count)]
+        return list(zip(self.scenarios, sizes, strict=True))
 
 
 _WORLD_BYTES = 100_000
@@ -214,6 +213,6 @@ def training_worlds(
         [config.weights.get(scenario, 1.0) for scenario, _ in shares],
     )
     base = baselines.make(config.base, worlds, **config.base_options)
-    return ResidualVectorWrapper(
-        worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump()
-    )
+    settings = config.settings.model_dump()
+    mode = AutoresetMode.SAME_STEP
+    return ResidualVectorWrapper(worlds, base, autoreset_mode=mode, **settings)

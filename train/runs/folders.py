@@ -36,7 +36,8 @@ _LOCK = ".lock"
 _RETRY_S = 0.2
 _LONGEST_HOLDER = 200
 """Characters of a lock that say who holds it."""
-_LIBRARIES = ("mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
+_RECORDED = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
+"""Packages whose versions a run records."""
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
@@ -45,13 +46,8 @@ def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> N
     write_whole(folder / _METADATA, json.dumps(provenance(seed), indent=2) + "\n")
 
 
-def require_run(folder: Path, what: str, writer: str) -> Path:
-    """The configuration of a run that is gone on with.
-
-    Args:
-        folder: Of the run.
-        what: What kind of run it has to be, in words.
-        writer: Who made such a folder, in words.
+def require_run(folder: Path) -> Path:
+    """The file with the configuration of a run that is gone on with.
 
     Raises:
         ConfigurationError: The folder has no configuration, or something in it is a link that leads
@@ -59,9 +55,8 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
     """
     file = folder / CONFIG
     if not file.is_file():
-        raise ConfigurationError(
-            f"{folder} is no {what}: it has no {CONFIG}; name the folder that {writer}"
-        )
+        problem = f"{folder} is no run: it has no {CONFIG}; name a run's folder"
+        raise ConfigurationError(problem)
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(place, name)
@@ -192,11 +187,11 @@ def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def run_folder(
-    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
+    name: str, recorded: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:
     """`own_folder` for a new run, described; arguments as there and in `describe`."""
     with own_folder(name, output) as folder:
-        describe(folder, configuration, seed)
+        describe(folder, recorded, seed)
         yield folder
 
 
@@ -230,7 +225,8 @@ def _next_free(name: str) -> Path:
 
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
-        raise ResultsExistError(f"{shorten(folder)} is a file; name a folder that is new or empty")
+        cure = "name a folder that is new or empty"
+        raise ResultsExistError(f"{shorten(folder)} is a file; {cure}")
     folder.mkdir(parents=True, exist_ok=True)
     if names := sorted(path.name for path in folder.iterdir()):
         raise ResultsExistError(
@@ -248,7 +244,7 @@ def provenance(seed: int | None) -> dict[str, Any]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in ("elastic-env", *_LIBRARIES)},
+        "versions": {name: installed_version(name) for name in _RECORDED.split()},
     }
 
 
@@ -265,9 +261,10 @@ def _commit() -> str | None:
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str:
-        return subprocess.run(
-            ["git", *arguments], cwd=here, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
+        command = ["git", *arguments]
+        return subprocess.check_output(
+            command, cwd=here, text=True, timeout=10, stderr=subprocess.PIPE
+        ).strip()
 
     try:
         is_changed = git("status", "--porcelain", "--untracked-files=no")

@@ -69,8 +69,8 @@ def plain_progress(
         if int(10 * share) > said and time.monotonic() - when >= least_s:
             said = int(10 * share)
             when = time.monotonic()
-            more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
-            console.print(f"  {10 * said} %{more}")
+            more = f" of the {unit}, about {duration(to_go)} to go; {note}"
+            console.print(f"  {10 * said} %{more if note else ''}")
 
     return say
 
@@ -117,9 +117,8 @@ def show_progress(
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=console, transient=transient) as bar:
-        tasks = [
-            bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()
-        ]
+        begun = {"start": False, "note": ""}
+        tasks = [bar.add_task(name, total=total, **begun) for name, total in totals.items()]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])
@@ -158,5 +157,6 @@ class _FirstRecord(logging.Handler):
         """Print the first record."""
         if not self._is_said:
             self._is_said = True
-            with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
+            # nobody reads: no reason to end what is compiled
+            with contextlib.suppress(OSError):
                 self._console.print(record.getMessage(), soft_wrap=True)

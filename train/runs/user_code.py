@@ -10,7 +10,6 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,23 @@ from typing import Any, TypeVar
 
 from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, quote, shorten
+from train.runs.folders import require_run
 from train.runs.import_path import look_last_in
 
-_Config = TypeVar("_Config", bound=Model)
+
+class CodeNamingModel(Model):
+    """A configuration with names that may stand for code."""
+
+    @property
+    def names_of_code(self) -> list[str]:
+        """Those names."""
+        raise NotImplementedError
+
+
+_Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
 _REFUSED_IN: ContextVar["_Untrusted | None"] = ContextVar("refused_in", default=None)
-TRUST = "say --trust-code, or name a configuration of yours"
+_TRUST = "say --trust-code, or name a configuration of yours"
 """What the user can do who trusts the folder of a run."""
 
 
@@ -42,15 +52,12 @@ class _Untrusted:
         )
 
 
-def load_without_code(
-    file: Path, kind: type[_Config], names: Callable[[_Config], Iterable[str]], cure: str
-) -> _Config:
+def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
     """A configuration that was found and not named by the user; nothing that it names is imported.
 
     Args:
         file: Where it was found.
         kind: Of the configuration.
-        names: Its names that may stand for code.
         cure: What the user can do who trusts it, in words.
 
     Raises:
@@ -62,10 +69,25 @@ def load_without_code(
         config = load_yaml(file, kind)
     finally:
         _REFUSED_IN.reset(before)
-    for name in names(config):
+    for name in config.names_of_code:
         if ":" in name:
             raise found.error(name)
     return config
+
+
+def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False) -> _Config:
+    """The configuration of a run that is gone on with.
+
+    Args:
+        folder: Of the run.
+        kind: Of the configuration.
+        trust_code: Whether code that it names may run: it may lie in the folder.
+
+    Raises:
+        ConfigurationError: The folder is no such run, or names code that is not trusted.
+    """
+    file = require_run(folder)
+    return load_yaml(file, kind) if trust_code else load_without_code(file, kind, _TRUST)
 
 
 def named_object(name: str) -> Any:

@@ -1,9 +1,9 @@
 """Contenders of `elastic speed`: each plays control steps and measures how long they take."""
 
 import itertools
-import threading
 import time
 from abc import ABC, abstractmethod
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -90,11 +90,13 @@ class VectorLoop(_OurLoop):
         residual: bool = False,
     ) -> None:
         with_policy = "" if policy is None else f" with {policy}"
-        self.title = f"vector env{with_policy}{' and residual network' if residual else ''}"
+        with_network = " and residual network" if residual else ""
+        self.title = f"vector env{with_policy}{with_network}"
         self.num_envs = num_envs
         self._condition = _condition(env, policy)
         super().__init__(make_vector_env(self._condition, num_envs, threads))
-        self._policy = None if policy is None else make_policy(PolicySpec(name=policy), self.env)
+        spec = self._condition.policy
+        self._policy = None if policy is None else make_policy(spec, self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
         self._state: Any = None
@@ -159,14 +161,10 @@ class RawWorlds(Contender):
     @override
     def run(self, steps: int) -> float:
         controls = self._loop.controls
-        workers = [
-            threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))
-        ]
-        begin = time.perf_counter()
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
+        numbers = range(len(self._data))
+        with ThreadPoolExecutor(len(numbers)) as threads:
+            begin = time.perf_counter()
+            list(threads.map(self._play, numbers, itertools.repeat(controls)))
         return self.num_envs * steps / (time.perf_counter() - begin)
 
     @override
@@ -213,10 +211,10 @@ class ForeignLoop(Contender):
 
         subprocesses = partial(SubprocVecEnv, start_method="spawn")
         makers = (AsyncVectorEnv, subprocesses, SyncVectorEnv, DummyVecEnv)
-        kinds: dict[str, Any] = dict(zip((*IN_PROCESSES, *IN_THIS_PROCESS), makers, strict=True))
+        make: Any = makers[[*IN_PROCESSES, *IN_THIS_PROCESS].index(kind)]
         self.title = kind
         self.num_envs = num_envs
-        self.env = kinds[kind]([partial(_make, env)] * num_envs)
+        self.env = make([partial(_make, env)] * num_envs)
         self.env.reset()
         one_world = getattr(self.env, "single_action_space", self.env.action_space)
         self._action = np.zeros((num_envs, *one_world.shape), dtype=np.float32)
@@ -253,7 +251,8 @@ class PPOLoop(Contender):
             venv: Any = SubprocVecEnv([maker] * num_envs, start_method="spawn")
         else:
             condition = _condition(env, policy)
-            inner = make_vector_env(condition, num_envs, threads, AutoresetMode.SAME_STEP)
+            mode = AutoresetMode.SAME_STEP
+            inner = make_vector_env(condition, num_envs, threads, mode)
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, acts_on=acts_on))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
@@ -278,7 +277,8 @@ class PPOLoop(Contender):
         before = self._model.num_timesteps
         begin = time.perf_counter()
         self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
-        return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
+        decisions = self._model.num_timesteps - before
+        return decisions * self._period / (time.perf_counter() - begin)
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
@@ -301,7 +301,7 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
 
 def _condition(env: str, policy: str | None = None) -> Condition:
     spec = PolicySpec(name=policy or "zero")
-    return Condition(env=env, policy=spec, reference=environment(env).default_reference)
+    return Condition(env=env, policy=spec)
 
 
 def _make(env: str) -> Any:

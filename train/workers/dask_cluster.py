@@ -36,9 +36,11 @@ def dask_pool(address: str) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("distributed", "cluster", "--on dask://") from None
     warn_of_public(address)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by us
+    # what is lost is said by us
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    options = {"timeout": _CONNECT_S, "set_as_default": False}
     try:
-        client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
+        client = distributed.Client(f"tcp://{address}", **options)
     except (OSError, ValueError) as error:
         raise SystemFailedError(
             f"no dask scheduler answers at {address} ({error}); start one there with: dask"
@@ -47,14 +49,15 @@ def dask_pool(address: str) -> Iterator[Pool]:
     with client:
         _prepare(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
-        pool = Pool(client.get_executor(pure=False), _LogEvent(topic))
+        executor = client.get_executor(pure=False)
+        pool = Pool(executor.submit, _LogEvent(topic))
         client.subscribe_topic(topic, lambda event: pool.events.put(tuple(event[1])))
         try:
             yield pool
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 client.unsubscribe_topic(topic)
-                pool.executor.shutdown(wait=False)  # cancels what runs
+                executor.shutdown(wait=False)  # cancels what runs
 
 
 def warn_of_public(address: str) -> None:
@@ -68,8 +71,8 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    addresses = [str(place[0]) for *_, place in found]
-    public = [one for one in addresses if ipaddress.ip_address(one.partition("%")[0]).is_global]
+    addresses = [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
+    public = [address for address in addresses if address.is_global]
     if public:
         warnings.warn(
             f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"
