@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
 
 from rich.console import Console
@@ -127,7 +127,7 @@ class _Playing:
         steps = num_steps(conditions)
         cores = place.jobs or os.cpu_count() or 1
         batches = in_batches(conditions, cores if place.is_local else len(conditions))
-        by_steps = [(sum(steps[number] for number in batch), batch) for batch in batches]
+        by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
         by_steps.sort(key=lambda own: -own[0])
         self._steps = [steps for steps, _ in by_steps]
         self._batches = [batch for _, batch in by_steps]
@@ -275,8 +275,5 @@ def _evaluate(
     except PolicyFailedError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]
-    return [
-        outcome
-        for condition in conditions
-        for outcome in _evaluate([condition], lambda _: None, num_threads)
-    ]
+    quiet = (lambda _: None, num_threads)
+    return list(chain(*(_evaluate([one], *quiet) for one in conditions)))

@@ -130,9 +130,9 @@ class Bench(Model):
         if self.update:
             _accept(path, evaluations)
             console.print(f"accepted the figures into {path}")
-        short = [
-            one for one in figures if (one["measured"] is None if self.update else one["problem"])
-        ]
+        short = [one for one in figures if one["problem"]]
+        if self.update:
+            short = [one for one in figures if one["measured"] is None]
         for one in short:
             console.print(f"{one['case']}: {one['problem']}")
         if short:
@@ -160,9 +160,9 @@ _Figure = dict[str, Any]
 """
 
 
-def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> Iterator[_Figure]:
-    (episode,) = evaluation.episodes
-    motion = evaluation.condition.reference_name
+def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
+    (episode,) = found.episodes
+    motion = found.condition.reference_name
     for metric, accepted in case.figures.items():
         measured = None if episode["termination"] else episode.get(metric)
         if measured is not None and np.isnan(measured):
@@ -178,7 +178,7 @@ def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> Iterator
         }
 
 
-def _problem(metric: str, measured: Any, bound: float | None, episode: dict[str, Any]) -> str:
+def _problem(metric: str, measured: Any, bound: Any, episode: dict[str, Any]) -> str:
     if episode["termination"]:
         return f"{metric} has no value: the episode ended as {episode['termination']!r}"
     if metric not in episode:

@@ -157,9 +157,10 @@ _OVERVIEW = (
 def _help_of(name: str) -> str | None:
     """The docstring of a command, from its source."""
     source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
-    classes = (node for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
-    own = next(node for node in classes if node.name == name.capitalize())
-    return ast.get_docstring(own)
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef) and node.name == name.capitalize():
+            return ast.get_docstring(node)
+    raise AssertionError
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -74,6 +74,9 @@ class Sweep(Model):
         return self.label or self.option
 
 
+_USUAL_POLICIES = [PolicySpec(name=name) for name in ("uncompensated", "input")]
+
+
 class CompareConfig(CodeNamingModel):
     """A comparison, as read from `configs/*.yaml`."""
 
@@ -83,7 +86,7 @@ class CompareConfig(CodeNamingModel):
     references: Entries[GivenReference]
     """Motions, see `Condition.reference`; default the environment's."""
     scenarios: Entries[Title] = ["nominal"]
-    policies: Entries[PolicySpec] = [PolicySpec(name="uncompensated"), PolicySpec(name="input")]
+    policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
     """Episodes per cell."""
@@ -161,7 +164,8 @@ class CompareConfig(CodeNamingModel):
         require_known("policy of the figures", self.figure_policies, titles)
         known = self.scenarios
         own = self.reference_scenarios
-        require_known("scenario with episodes of its own", self.scenario_episodes, known)
+        episodes = self.scenario_episodes
+        require_known("scenario with episodes of its own", episodes, known)
         require_known("reference with scenarios of its own", own, references)
         once: dict[str, list[Any]] = {"reference": references, "scenario": known}
         once["value of the sweep"] = self.sweep.values if self.sweep else []
@@ -173,10 +177,10 @@ class CompareConfig(CodeNamingModel):
         for what, values in once.items():
             for value in _repeated(values):
                 yield f"the {what} {quote(value)} stands twice; its episodes would count double"
-        for name, episodes in self.scenario_episodes.items():
-            if not 1 <= episodes <= MOST_EPISODES:
+        for name, count in episodes.items():
+            if not 1 <= count <= MOST_EPISODES:
                 bounds = f">= 1 and <= {MOST_EPISODES}"
-                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(episodes)}"
+                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
             if name in known or not scenarios or _repeated(scenarios):
@@ -339,9 +343,8 @@ def compare(
         if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
         if report:
-            name = config.name
-            results = Results(name, evaluations, rows, folder, axis, maps, board, robots)
-            files += write_report(results)
+            parts = (rows, folder, axis, maps, board, robots)
+            files += write_report(Results(config.name, evaluations, *parts))
     print_summary(cells, console)
     print_robots(robots, console)
     print_changes(rows, console)
@@ -353,14 +356,14 @@ def compare(
 @contextmanager
 def _open_run(config: CompareConfig, output: Path | None, resumes: bool) -> Iterator[Path]:
     """The folder of a run, new or gone on with, for this program alone."""
-    content = config.model_dump(mode="json")
+    recorded = (config.model_dump(mode="json"), config.seed)
     if not resumes or output is None:
-        with run_folder(config.name, content, config.seed, output) as new, lock_run(new):
+        with run_folder(config.name, *recorded, output) as new, lock_run(new):
             yield new
         return
     require_run(output)
     with lock_run(output):
-        describe(output, content, config.seed)
+        describe(output, *recorded)
         yield output
 
 
@@ -493,9 +496,8 @@ class Compare(Model):
         elif self.resume is not None:
             config = recorded_config(self.resume, CompareConfig, self.trust_code)
         else:
-            raise ConfigurationError(
-                "name a configuration or, with --resume, the run to go on with"
-            )
+            problem = "name a configuration or, with --resume, the run to go on with"
+            raise ConfigurationError(problem)
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}

@@ -1,7 +1,7 @@
 """`elastic demo`: the paper's experiments (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +87,7 @@ class Demo(Model):
                 " them; at the end with joints that are softer than assumed (scenario soft)"
             )
             evaluations = iter(run_conditions(conditions, console))
-            static, motion, *walked = ([next(evaluations) for _ in part] for part in parts)
+            static, motion, *walked = (list(islice(evaluations, len(part))) for part in parts)
             walks = list(chain(*walked))
             scored = [*motion, *walks]
             model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model

@@ -104,7 +104,8 @@ class Check(Model):
         table = make_table(f"check of {self.port}", ["", "", "what to do"], [], left=3)
         for one in checks:
             cells = (one.what, one.value, "fine" if one.is_good else one.cure)
-            table.add_row(*map(escape, cells), style="" if one.is_good else "bold yellow")
+            style = "" if one.is_good else "bold yellow"
+            table.add_row(*map(escape, cells), style=style)
         console.print(table)
         if not all(one.is_good for one in checks):
             sys.exit(3)
@@ -131,17 +132,16 @@ class Run(Model):
     def run(self, console: Console) -> None:
         """Play one episode and show it; log.csv keeps every step, also of one that is cut short."""
         if not (arguments := self.on.arguments):
-            raise ConfigurationError(
-                "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
-            )
-        played = Condition(
-            env="hardware", policy=PolicySpec(name=self.policy), reference=self.reference
-        )
+            problem = "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
+            raise ConfigurationError(problem)
+        spec = PolicySpec(name=self.policy)
+        played = Condition(env="hardware", policy=spec, reference=self.reference)
         arguments = {"reference": played.reference, **arguments}
-        env: Any = gymnasium.make(played.environment.id, disable_env_checker=True, **arguments)
-        recorded = {"policy": played.policy.model_dump(mode="json"), **arguments}
+        name = played.environment.id
+        env: Any = gymnasium.make(name, disable_env_checker=True, **arguments)
+        recorded = {"policy": spec.model_dump(mode="json"), **arguments}
         with contextlib.closing(env):
-            policy = make_policy(played.policy, env)
+            policy = make_policy(spec, env)
             with run_folder("hardware", recorded, None, self.output) as folder:
                 metrics: dict[str, Any] = {}
                 with _open_log(folder / "log.csv", console) as log:
@@ -251,7 +251,8 @@ class Emulate(Model):
     def run(self, console: Console) -> None:
         """Emulate until Ctrl-C."""
         known = Faults.model_fields
-        require_known("fault", self.fault, [k for k in known if known[k].annotation is bool])
+        switches = [name for name in known if known[name].annotation is bool]
+        require_known("fault", self.fault, switches)
         shares = self.model_dump(include=set(known))
         config = EmulatorConfig(
             ids=tuple(self.ids),

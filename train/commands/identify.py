@@ -68,9 +68,8 @@ class Identify(Model):
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
         if self.second_mass == 1.0:
-            raise ValueError(
-                "second_mass must differ from 1: two equal masses do not separate anything"
-            )
+            problem = "second_mass must differ from 1: two equal masses do not separate anything"
+            raise ValueError(problem)
         return self
 
     def run(
@@ -93,9 +92,8 @@ class Identify(Model):
         if others:
             options = [option_name((name,)) for name in others if name != "on"]
             names = ", ".join([*options, *["--port and the like"] * ("on" in others)])
-            raise ConfigurationError(
-                f"options of the testbed: {names}; leave them out beside --robot and --log"
-            )
+            problem = f"options of the testbed: {names}; leave them out beside --robot and --log"
+            raise ConfigurationError(problem)
         return run_arm_identification(self.arm, console, **given)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
@@ -138,17 +136,14 @@ class Identify(Model):
     def _require_real_joint(self, hardware: Mapping[str, Any]) -> None:
         """Refuse options that do not go with a real joint."""
         if hardware.get("imu_port") is None:
-            raise ConfigurationError(
-                "an identification on hardware needs the link's angle: name the IMU with --imu-port"
-            )
+            needed = "an identification on hardware needs the link's angle"
+            raise ConfigurationError(f"{needed}: name the IMU with --imu-port")
         if self.stiffness is not None or self.repeats > 1:
-            raise ConfigurationError(
-                "stiffness and repeats are of a simulated joint; leave them out on hardware"
-            )
+            problem = "stiffness and repeats are of a simulated joint; leave them out on hardware"
+            raise ConfigurationError(problem)
         if self.second_mass is not None and not hardware.get("confirm", True):
-            raise ConfigurationError(
-                "somebody must change the mass between the runs: a second_mass excludes --yes"
-            )
+            problem = "somebody must change the mass between the runs: a second_mass excludes --yes"
+            raise ConfigurationError(problem)
 
 
 @contextmanager

@@ -143,9 +143,8 @@ def run_arm_identification(
         ResultsExistError: The output folder holds results.
     """
     if options.robot is None:
-        raise ConfigurationError(
-            "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
-        )
+        problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
+        raise ConfigurationError(problem)
     if options.log is None and (not options.plan or options.measured_by is None):
         raise ConfigurationError(
             "give the CSV file of static poses by --log, or plan the first poses by --plan 40"

@@ -111,8 +111,9 @@ def pose_problem(
     for joint in options.free:
         if joint not in log.joints:
             raise unknown_name("joint of the log", joint, log.joints)
-    angles = {model.joint(j).name: float(model.joint(j).qpos0[0]) for j in range(model.njnt)}
-    held = {joint: angle for joint, angle in angles.items() if joint not in log.joints}
+    joints = [model.joint(number) for number in range(model.njnt)]
+    others = [joint for joint in joints if joint.name not in log.joints]
+    held = {joint.name: float(joint.qpos0[0]) for joint in others}
     tree = Tree.of(model, log.joints, held)
     names = [end_effector]
     if log.kind == "markers":
@@ -140,10 +141,10 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     """Print held-out errors, stiffness, and what the poses do not tell."""
     if result.held_out is not None:
         console.print(verdict(result.held_out), highlight=False)
-        rows = [
-            [error.name, f"{error.rms_mm:.2f}", f"{error.mean_mm:.2f}", f"{error.worst_mm:.2f}"]
-            for error in result.held_out.errors
-        ]
+        rows = []
+        for error in result.held_out.errors:
+            values = (error.rms_mm, error.mean_mm, error.worst_mm)
+            rows.append([error.name, *(f"{value:.2f}" for value in values)])
         number = result.held_out.held_out
         title = f"error of markers at {number} poses that were held out"
         head = ["prediction", "rms [mm]", "mean", "worst"]
@@ -154,8 +155,8 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     rows = []
     for joint in result.joints:
         stiffness = _number(joint.stiffness_nm_per_rad).replace("inf", "rigid")
-        low = _number(joint.stiffness_low_nm_per_rad)
-        rows.append([joint.joint, stiffness, low, _number(joint.stiffness_high_nm_per_rad)])
+        ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
+        rows.append([joint.joint, stiffness, *map(_number, ends)])
     noise = f"{result.noise_mm:.2f} mm"
     console.print(f"unexplained: {noise} in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"

@@ -110,15 +110,15 @@ class Iterate(Model):
         with closing(make_vector_env(condition, self.robots)) as env:
             policy: IterativeLearner = make_policy(condition.policy, env)
             with run_folder("iterate", recorded, self.seed, self.output) as folder:
-                trials = _trials(self, env, policy, console)
+                trials = self._play(env, policy, console)
                 columns = condition.environment.judged
                 title = f"Learned on the robot, {self.scenario}"
                 chart = trials_chart(trials, columns, title)
                 files = [
-                    _write_trials(trials, policy, self.seed, folder / "trials.csv"),
+                    self._write(trials, policy.names, folder / "trials.csv"),
                     plots.draw_chart(chart, folder / "trials.png"),
                 ]
-                policies = _save(self, env, policy, folder)
+                policies = self._save(env, policy, folder)
         console.print(trials_table(trials, condition))
         for path in files:
             console.print(f"wrote {path}")
@@ -126,19 +126,52 @@ class Iterate(Model):
             console.print(f"play it as iterative:{path}")
         return trials
 
+    def _play(self, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
+        trials: list[Trial] = []
+        with show_progress(console, {"trials": policy.trials + 1}, transient=True) as show:
 
-def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
-    trials: list[Trial] = []
-    with show_progress(console, {"trials": policy.trials + 1}, transient=True) as show:
+            def keep(trial: Trial) -> None:
+                trials.append(trial)
+                show(0, len(trials))
 
-        def keep(trial: Trial) -> None:
-            trials.append(trial)
-            show(0, len(trials))
+            policy.rehearse(env, self.seed, keep)
+            signals = learned_signals(env.unwrapped.assumed_model, self.gains)
+            keep(Stage(env, self.seed).trial(policy, signals, policy.trials))
+        return trials
 
-        policy.rehearse(env, options.seed, keep)
-        signals = learned_signals(env.unwrapped.assumed_model, options.gains)
-        keep(Stage(env, options.seed).trial(policy, signals, policy.trials))
-    return trials
+    def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
+        """One row per robot and trial: what the sensors showed, and the metrics."""
+        columns = [f"measured_{name}" for name in names]
+        rows = []
+        for trial in trials:
+            for robot, metrics in enumerate(trial.metrics):
+                failed = bool(trial.failed[robot])
+                row = {"trial": trial.number, "seed": self.seed + robot, "failed": failed}
+                measured = zip(columns, trial.error_rms[robot].tolist(), strict=True)
+                rows.append({**row, **dict(measured), **metrics})
+        return write_records(rows, path)
+
+    def _save(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
+        """Write the offsets of every robot: into the folder for one, else into folders by seed."""
+        model = env.unwrapped.assumed_model
+        chosen = PolicyOptions(learned_base=self.base)
+        base = learned_base(chosen, isinstance(model, WalkerModel))
+        folders = []
+        for robot, table in enumerate(policy.tables):
+            seed = self.seed + robot
+            description = TableDescription(
+                robot=env.unwrapped.task.name,
+                base=base,
+                learning=self.gains,
+                signals=list(policy.names),
+                motion=motion_of(env),
+                control_period_s=model.control_period_s,
+                scenario=self.scenario,
+                training=provenance(seed),
+            )
+            folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
+            save_table(folders[-1], description, table)
+        return folders
 
 
 def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
@@ -153,39 +186,3 @@ def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)
-
-
-def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
-    """One row per robot and trial: what the sensors showed, and the metrics."""
-    names = [f"measured_{name}" for name in policy.names]
-    rows = []
-    for trial in trials:
-        for robot, metrics in enumerate(trial.metrics):
-            failed = bool(trial.failed[robot])
-            row = {"trial": trial.number, "seed": seed + robot, "failed": failed}
-            measured = zip(names, trial.error_rms[robot].tolist(), strict=True)
-            rows.append({**row, **dict(measured), **metrics})
-    return write_records(rows, path)
-
-
-def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-    """Write the offsets of every robot: to the folder itself for one, else to folders by seed."""
-    model = env.unwrapped.assumed_model
-    chosen = PolicyOptions(learned_base=options.base)
-    base = learned_base(chosen, isinstance(model, WalkerModel))
-    folders = []
-    for robot, table in enumerate(policy.tables):
-        seed = options.seed + robot
-        description = TableDescription(
-            robot=env.unwrapped.task.name,
-            base=base,
-            learning=options.gains,
-            signals=list(policy.names),
-            motion=motion_of(env),
-            control_period_s=model.control_period_s,
-            scenario=options.scenario,
-            training=provenance(seed),
-        )
-        folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
-        save_table(folders[-1], description, table)
-    return folders

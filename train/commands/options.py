@@ -101,9 +101,10 @@ class OnHardware(Model):
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
                     option = "--" + name.replace("_", "-")
-                    raise ConfigurationError(
+                    problem = (
                         f"{option} is for a real testbed: name its servo's port too, with --port"
                     )
+                    raise ConfigurationError(problem)
             return {}
         options = {
             "port": self.port,

@@ -61,7 +61,8 @@ def play(
         if video is None:
             _window(played, period)
         else:
-            shown = track(played, "filming", total=steps, console=console, transient=True)
+            bar = {"total": steps, "console": console, "transient": True}
+            shown = track(played, "filming", **bar)
             _film(env, shown, period, video)
             console.print(f"wrote {video}")
 
@@ -106,9 +107,8 @@ def episode(
     for step in islice(control_steps(env, policy, condition.seed, condition), steps):
         yield step.number, step.info
         if step.terminated:
-            console.print(
-                f"the episode ended after {step.info['time_s']:.2f} s: {step.info['termination']}"
-            )
+            when = f"after {step.info['time_s']:.2f} s"
+            console.print(f"the episode ended {when}: {step.info['termination']}")
 
 
 def _window(episode: Iterable[_Step], period: float) -> None:
@@ -163,10 +163,9 @@ def _require_whole(video: Path, frames: int) -> None:
     except RuntimeError:
         found = 0
     if found != frames:
-        raise SystemFailedError(
-            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full:"
-            " free some space, then play again"
-        )
+        problem = f"{video} is not whole, {found} of {frames} frames can be read"
+        cure = "the disk may be full: free some space, then play again"
+        raise SystemFailedError(f"{problem}; {cure}")
 
 
 class WatchedEpisode(Model):

@@ -125,9 +125,8 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     moving.robot.plant(moving)  # refuses what its servos cannot follow
     plant = config.robot.plant(config)
     if trial.stiffness is None and trial.model in GALLERY:
-        console.print(
-            f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
-        )
+        text = f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
+        console.print(text)
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
@@ -174,9 +173,8 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
         arguments["joints"] = dict(read_mapping(Path(stiffness)))
     elif stiffness is not None:
         if not stiffness > 0.0:
-            raise ConfigurationError(
-                f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
-            )
+            problem = f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
+            raise ConfigurationError(problem)
         arguments["joints"] = {"*": stiffness}
     if trial.end_effector is not None:
         arguments["end_effector"] = trial.end_effector

@@ -150,16 +150,11 @@ def measure_throughput(config: Speed, console: Console) -> Path:
             (folder / "profile.txt").write_text(text)
             console.print(text)
     title = f"{config.env}: control steps per second, medians of one interleaved run"
-    rows = [
-        (
-            one["contender"],
-            str(one["num_envs"]),
-            f"{one['steps_per_s']:,.0f}",
-            f"{one['ratio']:.3f}",
-            one["against"],
-        )
-        for one in results
-    ]
+    rows = []
+    for one in results:
+        worlds = str(one["num_envs"])
+        figures = (f"{one['steps_per_s']:,.0f}", f"{one['ratio']:.3f}")
+        rows.append((one["contender"], worlds, *figures, one["against"]))
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     console.print(table)
@@ -217,27 +212,22 @@ def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
     for n in config.num_envs:
         threads = min(config.threads_used, n)
         loop = VectorLoop(env, n, threads)
+        with_policy = VectorLoop(env, n, threads, policy)
+        with_network = VectorLoop(env, n, threads, policy, residual=True)
         against += [len(contenders) + 1] * 4
-        contenders += [
-            loop,
-            RawWorlds(loop, threads),
-            VectorLoop(env, n, threads, policy),
-            VectorLoop(env, n, threads, policy, residual=True),
-        ]
+        contenders += [loop, RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
         scalar = ScalarLoop(env)
         against += [len(contenders) + 1] * 2
         contenders += [scalar, RawWorlds(scalar, 1)]
-        counted = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
-        foreign = [*counted, *((kind, config.processes[0]) for kind in IN_THIS_PROCESS)]
+        foreign = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
+        foreign += [(kind, config.processes[0]) for kind in IN_THIS_PROCESS]
         against += [0] * len(foreign)
         contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
         against += [len(contenders)] * 2
-        contenders += [
-            PPOLoop(env, policy, 64, config.threads_used),
-            PPOLoop(env, policy, _PPO_PROCESSES, 1, processes=True),
-        ]
+        contenders.append(PPOLoop(env, policy, 64, config.threads_used))
+        contenders.append(PPOLoop(env, policy, _PPO_PROCESSES, None))
     return contenders, against
 
 

@@ -36,8 +36,7 @@ _TOKEN = "token="
 _CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
-_WEBSOCKET = [f"sec-websocket-{name}" for name in ("key", "version", "protocol", "extensions")]
-_UPGRADED = {"upgrade", "connection", *_WEBSOCKET}
+_UPGRADED = re.compile("upgrade|connection|sec-websocket-(key|version|protocol|extensions)", re.I)
 """Headers of a WebSocket's opening that the viewer gets."""
 _PRIVATE = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
@@ -157,7 +156,7 @@ class Access:
         others = [part for part in parts if not part.startswith(_TOKEN)]
         has_address = self._has_token(parts, _TOKEN)
         cookies = ";".join(request.values("Cookie")).split(";")
-        has_cookie = self._has_token([one.strip() for one in cookies], f"{self.cookie}=")
+        has_cookie = self._has_token(map(str.strip, cookies), f"{self.cookie}=")
         _require(has_address or has_cookie, f"the token is missing: {_CURE}")
         is_socket = bool(request.values("Upgrade"))
         _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
@@ -227,9 +226,8 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         SystemFailedError: The port is taken, or this machine has no such address.
     """
     if not 0 <= port <= _LARGEST_PORT:
-        raise ConfigurationError(
-            f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
-        )
+        problem = f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
+        raise ConfigurationError(problem)
     kind = {"type": socket.SOCK_STREAM, "flags": socket.AI_PASSIVE}
     try:
         family = socket.getaddrinfo(host or None, port, **kind)[0][0]
@@ -276,9 +274,9 @@ class Proxy:
         self._listener.close()
 
     def _run(self) -> None:
-        server = asyncio.start_server(self._answer, sock=self._listener, limit=_LARGEST_HEAD)
+        place = {"sock": self._listener, "limit": _LARGEST_HEAD}
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(server)
+            runner.run(asyncio.start_server(self._answer, **place))
             self._loop.run_forever()
 
     async def _answer(self, reader: StreamReader, writer: StreamWriter) -> None:
@@ -297,8 +295,8 @@ class Proxy:
     async def _pass_on(
         self, request: Head, asked: Asked, reader: StreamReader, writer: StreamWriter
     ) -> None:
-        place = self._viewer
-        viewer, to_viewer = await asyncio.open_unix_connection(place, limit=_LARGEST_HEAD)
+        opened = asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
+        viewer, to_viewer = await opened
         try:
             to_viewer.write(_for_viewer(request, asked).encode())
             answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))
@@ -317,14 +315,15 @@ class Proxy:
 
     def _for_browser(self, answer: Head, asked: Asked) -> Head:
         """An answer that no other page may read, and with the cookie where a page begins."""
-        headers = [(name, value) for name, value in answer.headers if not _opens_page(name)]
+        headers = [own for own in answer.headers if not _opens_page(own[0])]
         headers += _PRIVATE
         if not asked.is_socket:
             headers = [own for own in headers if own[0].lower() != "connection"]
             headers.append(("Connection", "close"))
         if asked.has_address:
-            cookie = f"{self._access.cookie}={self._access.token}"
-            headers.append(("Set-Cookie", f"{cookie}; Path=/; HttpOnly; SameSite=Strict"))
+            kept = f"{self._access.cookie}={self._access.token}"
+            cookie = f"{kept}; Path=/; HttpOnly; SameSite=Strict"
+            headers.append(("Set-Cookie", cookie))
         return Head(answer.line, headers)
 
 
@@ -341,7 +340,7 @@ def _for_viewer(request: Head, asked: Asked) -> Head:
     """A request as the viewer gets it: without token, cookies and Origin."""
     headers = [("Host", "viewer")]
     if asked.is_socket:
-        headers += [own for own in request.headers if own[0].lower() in _UPGRADED]
+        headers += [own for own in request.headers if _UPGRADED.fullmatch(own[0])]
     return Head(f"GET {asked.path} HTTP/1.1", headers)
 
 

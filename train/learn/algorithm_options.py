@@ -57,7 +57,7 @@ def _are_widths(given: Any) -> bool:
 def _entropy_weight(given: Any) -> Any:
     """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
     if isinstance(given, str):
-        is_right = re.fullmatch(r"auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?", given) is not None
+        is_right = re.fullmatch(r"auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?", given)
     else:
         is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
     if not is_right:
@@ -79,9 +79,10 @@ class _Options(Model):
     @model_validator(mode="before")
     @classmethod
     def _none_is_set_by_us(cls, values: Any) -> Any:
-        given = [f"leave out {name!r}: {_OURS[name]}" for name in _OURS if name in values]
+        given = [name for name in _OURS if name in values]
         if given:
-            raise ValueError("; ".join(given))
+            cures = [f"leave out {name!r}: {_OURS[name]}" for name in given]
+            raise ValueError("; ".join(cures))
         return values
 
 

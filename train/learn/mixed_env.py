@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import groupby, pairwise
+from itertools import chain, groupby, pairwise, repeat
 from typing import Any
 
 import gymnasium
@@ -131,7 +131,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             return [function(self.envs[0], self._worlds[0])]
         return list(self._threads.map(function, self.envs, self._worlds))
 
-    def _info(self, infos: Sequence[dict[str, Any]], ended: BoolArray) -> dict[str, Any]:
+    def _info(self, infos: Sequence[Any], ended: BoolArray) -> dict[str, Any]:
         metrics: dict[str, Array] = {}
         for info, worlds in zip(infos, self._worlds, strict=True):
             if ended[worlds].any():
@@ -162,7 +162,7 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    worlds = [own for own, size in zip(conditions, sizes, strict=True) for _ in range(size)]
+    worlds = list(chain(*map(repeat, conditions, sizes)))
     shares = [list(share) for _, share in groupby(worlds, shared_settings)]
     threads = threads_of_each(_cores(num_threads), len(shares))
     mode = AutoresetMode.DISABLED

@@ -36,6 +36,11 @@ class Run:
     folder: Path
 
     @property
+    def here(self) -> "Run":
+        """The same with the whole path of its folder, for workers."""
+        return Run(self.config, self.folder.resolve())
+
+    @property
     def is_complete(self) -> bool:
         """True if all training seeds have come to their end."""
         seeds = self.config.seeds
@@ -110,9 +115,8 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
         text = f"training in {run.folder}; if it stops: elastic train --resume {run.folder}"
         if run.is_complete:
-            text = (
-                f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
-            )
+            cure = "to learn for longer, start a new run with --decisions"
+            text = f"{run.folder} is complete; {cure}"
         console.print(text, soft_wrap=True)
     calls = [(run, seed) for run in runs for seed in run.config.seeds]
     names = [f"seed {seed}" for _, seed in calls]
@@ -123,10 +127,10 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
             for number, (run, seed) in enumerate(calls):
-                _train_seed(run.config, seed, run.folder, 0, partial(show, number))
+                _train_seed(run, seed, 0, partial(show, number))
         else:
             threads = executors.threads_per_call(len(calls))
-            given = [(run.config, seed, run.folder.resolve(), threads) for run, seed in calls]
+            given = [(run.here, seed, threads) for run, seed in calls]
             watch = _watch(names, console, show)
             with executors.open(len(given), runs[0].folder) as pool:
                 # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint
@@ -160,15 +164,14 @@ def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> No
             raise error
 
 
-def _train_seed(
-    config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]
-) -> None:
+def _train_seed(run: Run, seed: int, threads: int, report: Callable[[int], None]) -> None:
     """Train a seed, or go on with it.
 
     A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed
     over, waits for it.
     """
-    own = folder / f"seed_{seed}"
+    config = run.config
+    own = run.folder / f"seed_{seed}"
     report(0)
     with lock_part(own, _PATIENCE_S):
         if not _is_complete(own):

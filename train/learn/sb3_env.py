@@ -38,15 +38,16 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ConfigurationError(
-                f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
-            )
+            why = "SB3 restarts worlds in the same step"
+            problem = f"{why}, autoreset_mode must be SameStep, got {mode}"
+            raise ConfigurationError(problem)
         self.env = env
         self._stagger = stagger
         self._actions: Any = None
         self._reward = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, dtype=np.int64)
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        spaces = (env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, *spaces)
 
     def reset(self) -> Any:
         """Begin an episode in every world, with the seeds of the last call of `seed`."""
@@ -121,9 +122,8 @@ class SB3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Worlds have no attributes of their own."""
-        raise NotImplementedError(
-            "the worlds of a vector environment have no attributes of their own"
-        )
+        problem = "the worlds of a vector environment have no attributes of their own"
+        raise NotImplementedError(problem)
 
     def env_method(
         self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any

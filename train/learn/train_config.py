@@ -165,9 +165,8 @@ class TrainConfig(CodeNamingModel):
         """
         count = len(self.scenarios)
         if self.worlds < 2 * count:
-            raise ConfigurationError(
-                f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
-            )
+            problem = f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
+            raise ConfigurationError(problem)
         whole, rest = divmod(self.worlds, count)
         sizes = [whole + (number < rest) for number in range(count)]
         return list(zip(self.scenarios, sizes, strict=True))

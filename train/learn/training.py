@@ -18,18 +18,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual.settings import ResidualDescription
 from train.learn.algorithm_options import complete_options
-from train.learn.algorithms import algorithm_class, name_options
-from train.learn.curves import Curves
-from train.learn.export import network_of
+from train.learn.checkpoint import read_state, write_state
+from train.learn.export import algorithm_class, name_options, network_of
 from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.state import read_state, write_state
 from train.learn.train_config import (
     FIRST_TRAINING_SEED,
     first_episode,
@@ -118,7 +117,7 @@ class Training(Trainer):
         try:
             portion = self._portion()
             self.model.learn(portion, reset_num_timesteps=before == 0, log_interval=1)
-        except ValueError:  # such as of a distribution of torch whose parameters are nan
+        except ValueError:  # such as of a distribution whose parameters are nan
             self._require_finite_weights()
             raise
         self._require_finite_weights()
@@ -289,8 +288,50 @@ def _with_activation(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _to_lists(value: Any) -> Any:
-    return [_to_lists(part) for part in value] if isinstance(value, tuple) else value
+    return list(map(_to_lists, value)) if isinstance(value, tuple) else value
 
 
 def _to_tuples(value: Any) -> Any:
-    return tuple(_to_tuples(part) for part in value) if isinstance(value, list) else value
+    return tuple(map(_to_tuples, value)) if isinstance(value, list) else value
+
+
+_REWARD = "rollout/reward_per_decision"
+_MISLEADING = "rollout/ep_rew_mean"
+"""Sum of rewards of an episode: each is a penalty, so that an episode which ends early would
+look better.
+"""
+
+
+class Curves(Logger):
+    """SB3's logger with the reward per decision in the place of that per episode.
+
+    It is the mean over the last whole episodes. Those that were cut short to spread the worlds over
+    the motion do not count, since their decisions are of its beginning alone.
+
+    Args:
+        folder: Of TensorBoard's files.
+        model: Whose episodes they are.
+        worlds: In which it learns.
+    """
+
+    def __init__(self, folder: str, model: Any, worlds: SB3VecEnv) -> None:
+        super().__init__(folder, [make_output_format("tensorboard", folder)])
+        self._model = model
+        self._worlds = worlds
+
+    def dump(self, step: int = 0) -> None:
+        """Write what was recorded; see SB3."""
+        self.name_to_value.pop(_MISLEADING, None)
+        self.name_to_excluded.pop(_MISLEADING, None)
+        episodes = self._model.ep_info_buffer
+        if episodes:
+            decisions = sum(episode["l"] for episode in episodes)
+            self.record(_REWARD, sum(episode["r"] for episode in episodes) / decisions)
+        super().dump(step)
+
+    def finish(self, step: int) -> None:
+        """Write the reward per decision of the present episodes, where no whole one has ended."""
+        reward = self._worlds.reward_per_decision
+        if not self._model.ep_info_buffer and reward is not None:
+            self.record(_REWARD, reward)
+            self.dump(step)

@@ -48,9 +48,10 @@ class PlainConsole(Console):
             yield one if one.control else Segment(visible(one.text), one.style)
 
 
-def make_table(
-    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
-) -> Table:
+_Row = Sequence[str]
+
+
+def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **style: Any) -> Table:
     """A table of plain texts.
 
     Args:

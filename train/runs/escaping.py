@@ -83,7 +83,10 @@ def _escape(found: re.Match[str]) -> str:
     return f"{sign}\\" if sign == "]" else f"\\{sign}"
 
 
-def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+_Row = Sequence[str]
+
+
+def markdown_table(head: _Row, rules: _Row, rows: Iterable[_Row]) -> str:
     """A table of plain texts; `rules` say how columns are aligned, such as "---:"."""
     above, *below = [[markdown_text(cell) for cell in row] for row in (head, *rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in (above, rules, *below))

@@ -67,9 +67,8 @@ def require_run(folder: Path) -> Path:
                     " remove it"
                 )
             if not (stat.S_ISLNK(kind) or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-                raise ConfigurationError(
-                    f"{path} is neither a file nor a folder, as all of a run are; remove it"
-                )
+                problem = f"{path} is neither a file nor a folder, as all of a run are; remove it"
+                raise ConfigurationError(problem)
     return file
 
 
@@ -88,9 +87,8 @@ def free_folder(name: str, output: Path | None = None) -> Path:
         return _next_free(require_name(name)) if output is None else _empty(output)
     except OSError as error:
         cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
-        raise SystemFailedError(
-            f"no folder for results can be made at {shorten(place)} ({cause}); name one by --output"
-        ) from None
+        problem = f"no folder for results can be made at {shorten(place)} ({cause})"
+        raise SystemFailedError(f"{problem}; name one by --output") from None
 
 
 def require_name(name: str) -> str:

@@ -118,7 +118,7 @@ def show_progress(
     )
     with Progress(*columns, console=console, transient=transient) as bar:
         begun = {"start": False, "note": ""}
-        tasks = [bar.add_task(name, total=total, **begun) for name, total in totals.items()]
+        tasks = [bar.add_task(name, total=totals[name], **begun) for name in totals]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])

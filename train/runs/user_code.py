@@ -87,7 +87,9 @@ def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False)
         ConfigurationError: The folder is no such run, or names code that is not trusted.
     """
     file = require_run(folder)
-    return load_yaml(file, kind) if trust_code else load_without_code(file, kind, _TRUST)
+    if trust_code:
+        return load_yaml(file, kind)
+    return load_without_code(file, kind, _TRUST)
 
 
 def named_object(name: str) -> Any:
@@ -113,14 +115,10 @@ def named_object(name: str) -> Any:
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
-        own = [
-            name
-            for name, found in inspect.getmembers(module, inspect.isfunction)
-            if found.__module__ == module.__name__
-        ]
-        raise ConfigurationError(
-            f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
-        )
+        functions = inspect.getmembers(module, inspect.isfunction)
+        own = [name for name, found in functions if found.__module__ == module.__name__]
+        known = f"its functions are: {', '.join(own) or 'none'}"
+        raise ConfigurationError(f"{shorten(place)} has no {attribute!r}; {known}")
     return getattr(module, attribute)
 
 

@@ -111,9 +111,8 @@ class VectorLoop(_OurLoop):
     @override
     def step(self) -> None:
         if self._policy is not None:
-            self._action, self._state = self._policy.predict(
-                self._observation, self._state, self._start, True
-            )
+            seen = (self._observation, self._state, self._start)
+            self._action, self._state = self._policy.predict(*seen, deterministic=True)
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
         # a world that ends begins a step later
         self._start = self._done
@@ -154,9 +153,8 @@ class RawWorlds(Contender):
         self._model = task.model
         self._substeps = task.num_substeps
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self.states = np.stack(
-            [self._state_of(simulation, world) for world in range(self.num_envs)]
-        )
+        worlds = range(self.num_envs)
+        self.states = np.stack([self._state_of(simulation, world) for world in worlds])
 
     @override
     def run(self, steps: int) -> float:
@@ -228,11 +226,16 @@ class ForeignLoop(Contender):
 
 
 class PPOLoop(Contender):
-    """PPO end to end, collecting and learning, of a residual: in our environment, or processes."""
+    """PPO end to end, collecting and learning, of a residual.
 
-    def __init__(
-        self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False
-    ) -> None:
+    Args:
+        env: Environment.
+        policy: Base.
+        n: Worlds.
+        threads: Of our vector environment; None for a process for each world.
+    """
+
+    def __init__(self, env: str, policy: str, n: int, threads: int | None) -> None:
         import torch
         from stable_baselines3 import PPO
         from stable_baselines3.common.logger import Logger
@@ -241,22 +244,22 @@ class PPOLoop(Contender):
         from baselines.residual_env import ResidualVectorWrapper
         from train.learn.sb3_env import SB3VecEnv
 
-        where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
+        where = f"SubprocVecEnv({n})" if threads is None else "vector env"
         self.title = f"PPO with {policy}, {where}"
-        self.num_envs = num_envs
+        self.num_envs = n
         has_model = policy not in ("zero", "uncompensated", "uncompensated_open")
         acts_on = {DEFLECTION if has_model else COMMAND: None}
-        if processes:
+        if threads is None:
             maker = partial(_make_corrected, env, policy, acts_on)
-            venv: Any = SubprocVecEnv([maker] * num_envs, start_method="spawn")
+            venv: Any = SubprocVecEnv([maker] * n, start_method="spawn")
         else:
             condition = _condition(env, policy)
             mode = AutoresetMode.SAME_STEP
-            inner = make_vector_env(condition, num_envs, threads, mode)
+            inner = make_vector_env(condition, n, threads, mode)
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, acts_on=acts_on))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
-        self._rollout = max(PPO_DECISIONS // num_envs, 8)
+        self._rollout = max(PPO_DECISIONS // n, 8)
         self._model = PPO(
             "MlpPolicy",
             venv,
@@ -293,9 +296,8 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     for i, (inputs, outputs) in enumerate(widths):
         tensors[f"weight{i}"] = 0.01 * generator.normal(size=(outputs, inputs))
         tensors[f"bias{i}"] = np.zeros(outputs)
-    description = ResidualDescription(
-        robot=env.unwrapped.task.name, base="", settings=corrected.settings
-    )
+    robot = env.unwrapped.task.name
+    description = ResidualDescription(robot=robot, base="", settings=corrected.settings)
     return ResidualPolicy(corrected, Network(description, tensors))
 
 

@@ -71,8 +71,8 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    addresses = [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
-    public = [address for address in addresses if address.is_global]
+    hosts = [str(place[0]).partition("%")[0] for *_, place in found]
+    public = [host for host in hosts if ipaddress.ip_address(host).is_global]
     if public:
         warnings.warn(
             f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"

@@ -40,7 +40,7 @@ class Executors:
             raise ConfigurationError(
                 f"jobs must be {bound}, 0 for one per core, got {quote(self.jobs)}"
             )
-        if not re.fullmatch(rf"{_LOCAL}|{_DASK}.+:\d+|{_SLURM}(:.*)?", self.on, re.DOTALL):
+        if not re.fullmatch(rf"(?s){_LOCAL}|{_DASK}.+:\d+|{_SLURM}(:.*)?", self.on):
             raise ConfigurationError(
                 f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or"
                 f" {_SLURM}:FILE.yaml with what a job asks for, got {quote(self.on)}"

@@ -63,9 +63,8 @@ def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("submitit", "cluster", "--on slurm") from None
     if config.cluster == "slurm" and shutil.which("sbatch") is None:
-        raise SystemFailedError(
-            "there is no Slurm here: the command sbatch was not found; start on a login node"
-        )
+        problem = "there is no Slurm here: the command sbatch was not found; start on a login node"
+        raise SystemFailedError(problem)
     folder = folder.resolve()
     reports = folder / "reports"
     reports.mkdir(parents=True, exist_ok=True)
