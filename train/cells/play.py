@@ -12,9 +12,9 @@ from rich.console import Console
 from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
 from train.cells.store import Store, UnfitCellError
+from train.evaluate import rollout
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
-from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
 from train.runs.console import shown_warnings, warn_once
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
@@ -124,7 +124,7 @@ class _Playing:
         self._console = console
         self._place = place
         self._store = store
-        steps = num_steps(conditions)
+        steps = rollout.num_steps(conditions)
         cores = place.jobs or os.cpu_count() or 1
         batches = in_batches(conditions, cores if place.is_local else len(conditions))
         by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
@@ -201,11 +201,11 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     batches: list[list[int]] = []
     open_batch: dict[str, tuple[list[int], int]] = {}
     for number, condition in enumerate(conditions):
-        if not can_share_worlds(condition):
+        if not rollout.can_share_worlds(condition):
             batches.append([number])
             continue
         policy = (condition.policy, condition.member, condition.policy_options)
-        key = repr((policy, condition.reference_name, shared_settings(condition)))
+        key = repr((policy, condition.reference_name, rollout.shared_settings(condition)))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
             batch = []
@@ -222,7 +222,7 @@ def _explain_failure(condition: Condition, result: Outcome) -> tuple[str, int]:
     assert error is not None
     defect = f"this is a defect: {type(error).__name__}: {error}\n{result.trace}"
     said, code = explain(error) or (defect, DEFECT)
-    if isinstance(error, PolicyFailedError):  # which names the cell itself
+    if isinstance(error, rollout.PolicyFailedError):  # which names the cell itself
         return said, code
     return f"{_name(condition)}: {said}", code
 
@@ -236,7 +236,7 @@ def _name(condition: Condition) -> str:
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
-    (total,) = num_steps([condition])
+    (total,) = rollout.num_steps([condition])
     say = plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}")
     return evaluate(condition, _count(lambda done: say(done / total)))
@@ -272,7 +272,7 @@ def _evaluate(
     try:
         played = evaluate_together(conditions, _count(report), num_threads)
         return [Outcome(evaluation) for evaluation in played]
-    except PolicyFailedError as error:
+    except rollout.PolicyFailedError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]
     quiet = (lambda _: None, num_threads)

@@ -29,7 +29,7 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec, cell_of
 from train.evaluate.episodes import Evaluation
 from train.runs.console import make_table
 from train.runs.escaping import markdown_table
@@ -59,13 +59,7 @@ class BenchCase(Model):
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        return Condition(
-            env=self.env,
-            policy=PolicySpec(name=self.policy),
-            scenario=self.scenario,
-            seed=self.seed,
-            reference=self.reference,
-        )
+        return cell_of(self, PolicySpec(name=self.policy))
 
 
 class BenchConfig(CodeNamingModel):

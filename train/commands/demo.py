@@ -16,9 +16,7 @@ from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.rollout import make_vector_env
-from train.figures import plots
-from train.figures.comparison_figures import cells_together, draw_figure, draw_time_series
-from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
+from train.figures import comparison_figures, plots, testbed_plots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
@@ -65,7 +63,6 @@ _SOFT_WALK = CompareConfig(
         PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
     ],
 )
-_WALKS = (_SLOW_WALK, _WALK, _SOFT_WALK)
 
 
 class Demo(Model):
@@ -77,7 +74,8 @@ class Demo(Model):
     def run(self, console: Console) -> None:
         """Run, print the tables beside the paper's figures, and say where the pictures are."""
         plots.require_matplotlib()
-        parts = [config.conditions() for config in (_STATIC, _MOTION, *_WALKS)]
+        shown = (_STATIC, _MOTION, _SLOW_WALK, _WALK, _SOFT_WALK)
+        parts = [config.conditions() for config in shown]
         conditions = list(chain(*parts))
         recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
@@ -97,13 +95,13 @@ class Demo(Model):
             result.save(folder / "identification.json")
             fig5 = folder / "fig5_identification.png"
             files = [
-                draw_identification(result, points, [model], fig5),
-                draw_static_errors(static, model, folder / "fig6_static_errors.png"),
-                draw_time_series(motion, folder / "sine.png"),
+                testbed_plots.draw_identification(result, points, [model], fig5),
+                testbed_plots.draw_static_errors(static, model, folder / "fig6_static_errors.png"),
+                comparison_figures.draw_time_series(motion, folder / "sine.png"),
             ]
             for name in ("pelvis", "zmp"):
-                for walk in cells_together(walks):
-                    files += draw_figure(name, walk, folder)
+                for walk in comparison_figures.cells_together(walks):
+                    files += comparison_figures.draw_figure(name, walk, folder)
             files += [
                 folder / "identification.json",
                 write_episodes(scored, folder / "episodes.csv"),
@@ -133,7 +131,7 @@ def _testbed_table(result: Identification, static: Sequence[Evaluation]) -> Tabl
     ]
     ranges = ("-56.2 to +41.7", "-3.7 to +7.1")
     for evaluation, paper in zip(static, ranges, strict=True):
-        error = 1e3 * static_errors(evaluation)
+        error = 1e3 * testbed_plots.static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
     return make_table("the paper's testbed experiments, Figs. 5 and 6", _HEAD, rows)

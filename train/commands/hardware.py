@@ -5,9 +5,9 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import gymnasium
 import tyro
@@ -29,7 +29,7 @@ from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.rollout import control_steps, make_policy
+from train.evaluate.rollout import ControlStep, control_steps, make_policy
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 
@@ -143,11 +143,8 @@ class Run(Model):
         with contextlib.closing(env):
             policy = make_policy(spec, env)
             with run_folder("hardware", recorded, None, self.output) as folder:
-                metrics: dict[str, Any] = {}
-                with _open_log(folder / "log.csv", console) as log:
-                    for step in control_steps(env, policy, None):
-                        log.write(step.info)
-                        metrics = step.info.get("episode_metrics", metrics)
+                steps = control_steps(env, policy, None)
+                metrics = _keep_log(steps, folder / "log.csv", console)
                 text = json.dumps(metrics, indent=2)
                 (folder / "metrics.json").write_text(f"{text}\n")
         files = "log.csv (every step), metrics.json, config.yaml"
@@ -167,46 +164,37 @@ _SHOWN = (
 """Columns on the console: title, unit, signal, factor and format."""
 
 
-class _Log:
-    """The rows of log.csv, and once a second a line on the console and all rows on the disk."""
-
-    def __init__(self, file: TextIO, console: Console) -> None:
-        self.num_rows = 0
-        self._file = file
-        self._console = console
-        self._writer: csv.DictWriter[str] | None = None
-        self._next_s = _SHOWN_S
-
-    def write(self, info: dict[str, Any]) -> None:
-        row = {key: value for key, value in info.items() if not isinstance(value, dict)}
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(row))
-            self._writer.writeheader()
-            widths = [len(format(0, form)) for *_, form in _SHOWN]
-            for titles in list(zip(*_SHOWN, strict=True))[:2]:
-                self._console.print("".join(map(str.rjust, titles, widths)))
-        self._writer.writerow(row)
-        self.num_rows += 1
-        if row["time_s"] >= self._next_s:
-            self._next_s += _SHOWN_S
-            self._file.flush()
-            cells = (format(row[key] * by, form) for _, _, key, by, form in _SHOWN)
-            self._console.print("".join(cells))
-
-
-@contextlib.contextmanager
-def _open_log(path: Path, console: Console) -> Iterator[_Log]:
-    """A log that stays whatever ends the episode."""
+def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
+    """Write every step, whatever ends the episode, and show a line once a second; the metrics."""
+    metrics: dict[str, Any] = {}
+    rows = 0
+    next_s = _SHOWN_S
     with path.open("w", newline="") as file:
-        log = _Log(file, console)
+        log: Any = None
         try:
-            yield log
+            for step in steps:
+                row = {k: own for k, own in step.info.items() if not isinstance(own, dict)}
+                if not rows:
+                    log = csv.DictWriter(file, list(row))
+                    log.writeheader()
+                    widths = [len(format(0, form)) for *_, form in _SHOWN]
+                    for titles in list(zip(*_SHOWN, strict=True))[:2]:
+                        console.print("".join(map(str.rjust, titles, widths)))
+                log.writerow(row)
+                rows += 1
+                metrics = step.info.get("episode_metrics", metrics)
+                if row["time_s"] >= next_s:
+                    next_s += _SHOWN_S
+                    file.flush()
+                    shown = (format(row[key] * by, form) for _, _, key, by, form in _SHOWN)
+                    console.print("".join(shown))
         except BaseException:
-            if rows := log.num_rows:
+            if rows:
                 console.print(f"cut short; the {rows} steps until then are in {path}")
             else:
                 path.unlink()
             raise
+    return metrics
 
 
 class Emulate(Model):

@@ -19,7 +19,7 @@ from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.robot_model import WalkerModel
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
-from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.conditions import Condition, PolicySpec, cell_of
 from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.chart import trials_chart
@@ -86,13 +86,7 @@ class Iterate(Model):
         options: dict[str, Any] = {"learning": self.gains}
         if self.base is not None:
             options["learned_base"] = self.base
-        return Condition(
-            env=self.env,
-            policy=PolicySpec(name="iterative", options=options),
-            reference=self.reference,
-            scenario=self.scenario,
-            seed=self.seed,
-        )
+        return cell_of(self, PolicySpec(name="iterative", options=options))
 
     def run(self, console: Console) -> list[Trial]:
         """Learn, play a last trial with what was learned, write the run, and print the trials.

@@ -21,8 +21,7 @@ from elastic_env.core.errors import (
     shorten,
 )
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options
-from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
-from train.evaluate.environments import environment
+from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec, cell_of
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
@@ -188,15 +187,12 @@ class WatchedEpisode(Model):
     @property
     def condition(self) -> Condition:
         """The cell that is played."""
-        watched = environment(self.env).watched_reference
         with name_options():
-            return Condition(
-                env=self.env,
-                policy=PolicySpec(name=self.policy),
-                scenario=self.scenario,
-                seed=self.seed,
-                reference=watched if self.reference is None else self.reference,
-            )
+            played = cell_of(self, PolicySpec(name=self.policy))
+        watched = played.environment.watched_reference
+        if self.reference is None and watched is not None:
+            return played.replace(reference=watched)
+        return played
 
 
 class Play(WatchedEpisode):

@@ -14,22 +14,13 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
+import train.speed.contenders as loops
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
-from train.speed.contenders import (
-    IN_PROCESSES,
-    IN_THIS_PROCESS,
-    Contender,
-    ForeignLoop,
-    PPOLoop,
-    RawWorlds,
-    ScalarLoop,
-    VectorLoop,
-)
 from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2
@@ -136,7 +127,7 @@ def measure_throughput(config: Speed, console: Console) -> Path:
     if config.others or config.ppo:
         # what is missing is said before the work
         importlib.import_module("stable_baselines3")
-    VectorLoop(config.env, 1, 1, config.policy)
+    loops.VectorLoop(config.env, 1, 1, config.policy)
     unused = {"output", "profile", "real_time", "seconds"}
     recorded = config.model_dump(mode="json", exclude=unused)
     with run_folder("speed", recorded, None, config.output) as folder:
@@ -200,41 +191,42 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
     ]
 
 
-def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
+def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
     """Contenders, and for each the number of the one that it is compared with.
 
     The two are beside each other in turn, where that one is for it alone.
     """
     env = config.env
     policy = config.looped_policy
-    contenders: list[Contender] = []
+    contenders: list[loops.Contender] = []
     against: list[int] = []
     for n in config.num_envs:
         threads = min(config.threads_used, n)
-        loop = VectorLoop(env, n, threads)
-        with_policy = VectorLoop(env, n, threads, policy)
-        with_network = VectorLoop(env, n, threads, policy, residual=True)
+        loop = loops.VectorLoop(env, n, threads)
+        with_policy = loops.VectorLoop(env, n, threads, policy)
+        with_network = loops.VectorLoop(env, n, threads, policy, residual=True)
         against += [len(contenders) + 1] * 4
-        contenders += [loop, RawWorlds(loop, threads), with_policy, with_network]
+        contenders += [loop, loops.RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
-        scalar = ScalarLoop(env)
+        scalar = loops.ScalarLoop(env)
         against += [len(contenders) + 1] * 2
-        contenders += [scalar, RawWorlds(scalar, 1)]
-        foreign = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
-        foreign += [(kind, config.processes[0]) for kind in IN_THIS_PROCESS]
+        contenders += [scalar, loops.RawWorlds(scalar, 1)]
+        foreign = [(kind, n) for n in config.processes for kind in loops.IN_PROCESSES]
+        foreign += [(kind, config.processes[0]) for kind in loops.IN_THIS_PROCESS]
         against += [0] * len(foreign)
-        contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
+        contenders += [loops.ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
         against += [len(contenders)] * 2
-        contenders.append(PPOLoop(env, policy, 64, config.threads_used))
-        contenders.append(PPOLoop(env, policy, _PPO_PROCESSES, None))
+        contenders.append(loops.PPOLoop(env, policy, 64, config.threads_used))
+        contenders.append(loops.PPOLoop(env, policy, _PPO_PROCESSES, None))
     return contenders, against
 
 
 def profile(config: Speed) -> str:
     """Profile of the vector environment with its policy, as text."""
     n = config.num_envs[0]
-    loop = VectorLoop(config.env, n, min(config.threads_used, n), config.looped_policy)
+    threads = min(config.threads_used, n)
+    loop = loops.VectorLoop(config.env, n, threads, config.looped_policy)
     loop.run(config.steps)
     profiler = cProfile.Profile()
     profiler.runcall(loop.run, config.steps * config.rounds)

@@ -216,6 +216,12 @@ class Condition(Model):
         return self.policy.track or track(self.policy.name, self.environment.walks)
 
 
+def cell_of(options: Any, policy: PolicySpec) -> Condition:
+    """The cell of a policy that options name by their env, scenario, reference and seed."""
+    names = ("env", "scenario", "reference", "seed")
+    return Condition(policy=policy, **{name: getattr(options, name) for name in names})
+
+
 def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
     """A scenario with other values of some fields, such as `scenario.stiffness_scale` [SI].
 

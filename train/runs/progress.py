@@ -6,15 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
@@ -109,14 +102,14 @@ def show_progress(
         yield count
         return
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[note]}", markup=False),
     )
-    with Progress(*columns, console=console, transient=transient) as bar:
+    with progress.Progress(*columns, console=console, transient=transient) as bar:
         begun = {"start": False, "note": ""}
         tasks = [bar.add_task(name, total=totals[name], **begun) for name in totals]
 

@@ -10,8 +10,9 @@ import importlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Callable
 from contextvars import ContextVar
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -33,23 +34,16 @@ class CodeNamingModel(Model):
 
 _Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
-_REFUSED_IN: ContextVar["_Untrusted | None"] = ContextVar("refused_in", default=None)
+_REFUSE: ContextVar[Callable[[str], None]] = ContextVar("refuse", default=lambda _: None)
+"""Called with each name before its code runs."""
 _TRUST = "say --trust-code, or name a configuration of yours"
 """What the user can do who trusts the folder of a run."""
 
 
-@dataclass(frozen=True)
-class _Untrusted:
-    """A file whose names must not run code, and what the user can do to let them."""
-
-    file: Path
-    cure: str
-
-    def error(self, name: str) -> ConfigurationError:
-        """The error for a name of the file that stands for code."""
-        return ConfigurationError(
-            f"{self.file} names {quote(name)}, whose code would run; look at it, then {self.cure}"
-        )
+def _refuse(file: Path, cure: str, name: str) -> None:
+    """Refuse a name that stands for code in a file whose names must not run any."""
+    problem = f"{file} names {quote(name)}, whose code would run"
+    raise ConfigurationError(f"{problem}; look at it, then {cure}")
 
 
 def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
@@ -63,15 +57,15 @@ def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
     Raises:
         ConfigurationError: It is no such configuration, or names code.
     """
-    found = _Untrusted(file, cure)
-    before = _REFUSED_IN.set(found)
+    refuse = partial(_refuse, file, cure)
+    before = _REFUSE.set(refuse)
     try:
         config = load_yaml(file, kind)
     finally:
-        _REFUSED_IN.reset(before)
+        _REFUSE.reset(before)
     for name in config.names_of_code:
         if ":" in name:
-            raise found.error(name)
+            refuse(name)
     return config
 
 
@@ -103,8 +97,7 @@ def named_object(name: str) -> Any:
         ConfigurationError: There is no such module, file or attribute, or it fails while it is
             imported; or code is refused here, and nothing was imported.
     """
-    if (untrusted := _REFUSED_IN.get()) is not None:
-        raise untrusted.error(name)
+    _REFUSE.get()(name)
     place, _, attribute = name.rpartition(":")
     look_last_in(Path.cwd())
     try:

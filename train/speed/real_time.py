@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.safety import realtime
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, policy_errors
@@ -53,11 +53,11 @@ def play_against_the_clock(
             steps = list(islice(control_steps(env, policy, seed=0), max(cycles - 1, 1)))
             later = [step.observation for step in steps]
             observations = [steps[0].seen, *later][:cycles]
-            is_real_time = prefer_realtime(Priority.LOOP)
+            is_real_time = realtime.prefer_realtime(realtime.Priority.LOOP)
             try:
                 latency_s, policy_s = _time(policy, observations, cycles, period_s)
             finally:
-                give_up_realtime()
+                realtime.give_up_realtime()
     figures = summarise(period_s, latency_s, policy_s)
     return {"env": env_name, "policy": name, "is_real_time": is_real_time, **figures}
 

@@ -7,6 +7,7 @@ import uuid
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
@@ -50,7 +51,7 @@ def dask_pool(address: str) -> Iterator[Pool]:
         _prepare(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
         executor = client.get_executor(pure=False)
-        pool = Pool(executor.submit, _LogEvent(topic))
+        pool = Pool(executor.submit, partial(_log_event, topic))
         client.subscribe_topic(topic, lambda event: pool.events.put(tuple(event[1])))
         try:
             yield pool
@@ -108,13 +109,8 @@ def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
     dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, most)
 
 
-class _LogEvent:
-    """Reports as events of dask, from a worker by its scheduler to the client."""
+def _log_event(topic: str, number: int, value: Any) -> None:
+    """In a worker: report by an event of dask, by its scheduler to the client."""
+    from distributed import get_worker
 
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-
-    def __call__(self, number: int, value: Any) -> None:
-        from distributed import get_worker
-
-        get_worker().log_event(self._topic, (number, value))
+    get_worker().log_event(topic, (number, value))

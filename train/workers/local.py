@@ -15,19 +15,13 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from train.runs.import_path import safe_children
-from train.workers.calls import (
-    CallFailedError,
-    Outcome,
-    Pool,
-    UnguardedScriptError,
-    WorkerLostError,
-)
+from train.workers import calls
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 @contextmanager
-def local_pool(jobs: int) -> Iterator[Pool]:
+def local_pool(jobs: int) -> Iterator[calls.Pool]:
     """Processes of this machine, which end with the work within.
 
     Args:
@@ -41,7 +35,7 @@ def local_pool(jobs: int) -> Iterator[Pool]:
         resource_tracker.ensure_running()
     processes = _Processes(jobs)
     try:
-        yield Pool(processes.submit, _report, processes.events)
+        yield calls.Pool(processes.submit, _report, processes.events)
     finally:
         processes.end()
 
@@ -83,11 +77,11 @@ class _Processes:
         for worker in workers:
             worker.process.join()
 
-    def _run(self, call: tuple[Any, ...]) -> Outcome:
+    def _run(self, call: tuple[Any, ...]) -> calls.Outcome:
         """In a thread: the outcome of a call in a process that is idle, or a new one."""
         with self._lock:  # no process begins behind `end`
             if self._is_closed:
-                raise WorkerLostError("the workers have been ended")
+                raise calls.WorkerLostError("the workers have been ended")
             worker = self._idle.pop() if self._idle else _Worker()
             self._workers.add(worker)
         try:
@@ -116,7 +110,7 @@ class _Worker:
         end.close()  # with that of the process the pipe ends too
         self._has_begun = False
 
-    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> Outcome:
+    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> calls.Outcome:
         """The outcome of a call, whose reports are handed on.
 
         Raises:
@@ -124,7 +118,7 @@ class _Worker:
             OSError: Likewise.
         """
         self.pipe.send(call)
-        while not isinstance(message := self.pipe.recv(), Outcome):
+        while not isinstance(message := self.pipe.recv(), calls.Outcome):
             self._has_begun = True
             events.put(message)
         return message
@@ -135,8 +129,8 @@ class _Worker:
         while (code := self.process.exitcode) is None:
             time.sleep(0.01)
         if self._has_begun or code < 0:
-            return WorkerLostError("a worker process was killed")
-        return UnguardedScriptError()
+            return calls.WorkerLostError("a worker process was killed")
+        return calls.UnguardedScriptError()
 
 
 def _block_ctrl_c() -> None:
@@ -175,7 +169,7 @@ def _serve(end: "Connection[Any, Any]") -> None:
             except EOFError:
                 return
             except BaseException as error:  # code of the user ends the process
-                end.send(Outcome(error=CallFailedError(repr(error))))
+                end.send(calls.Outcome(error=calls.CallFailedError(repr(error))))
 
 
 def _end_with_parent() -> None:

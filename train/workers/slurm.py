@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,23 +73,17 @@ def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
     executor.update_parameters(**config.parameters)
     jobs = _Jobs(executor, reports)
     try:
-        yield Pool(jobs.submit, _ToFile(reports), jobs.events)
+        yield Pool(jobs.submit, partial(_report, reports), jobs.events)
     finally:
         jobs.end()
         shutil.rmtree(folder, ignore_errors=True)
 
 
-class _ToFile:
-    """Reports as files, of which each call has one."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __call__(self, number: int, value: Any) -> None:
-        """Report, whole or not at all."""
-        fresh = self._folder / f"{number}.{os.getpid()}"
-        fresh.write_text(str(int(value)))
-        fresh.rename(self._folder / str(number))
+def _report(folder: Path, number: int, value: Any) -> None:
+    """In a worker: report by a file of the call, whole or not at all."""
+    fresh = folder / f"{number}.{os.getpid()}"
+    fresh.write_text(str(int(value)))
+    fresh.rename(folder / str(number))
 
 
 class _Jobs:
