@@ -108,11 +108,9 @@ class Bench(Model):
         with run_folder(config.name, recorded, None, self.output) as folder:
             conditions = [case.condition for case in config.cases]
             evaluations = run_conditions(conditions, console)
-            figures = [
-                figure
-                for case, evaluation in zip(config.cases, evaluations, strict=True)
-                for figure in _figures(case, evaluation, config.margin)
-            ]
+            figures = list[_Figure]()
+            for case, evaluation in zip(config.cases, evaluations, strict=True):
+                figures += _figures(case, evaluation, config.margin)
             write_whole(folder / "bench.json", json.dumps(figures, indent=2) + "\n")
             markdown = _markdown(figures)
             write_whole(folder / "bench.md", markdown)

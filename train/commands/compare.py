@@ -226,6 +226,7 @@ class CompareConfig(CodeNamingModel):
                 f" references x {len(self.scenarios)} scenarios x {len(entrants)} policies x"
                 f" {swept} values are {cells}; split it"
             )
+        motions = zip(self.references, self._reference_labels(), played, strict=True)
         return [
             Condition(
                 env=self.env,
@@ -240,9 +241,7 @@ class CompareConfig(CodeNamingModel):
                 episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
-            for reference, label, scenarios in zip(
-                self.references, self._reference_labels(), played, strict=True
-            )
+            for reference, label, scenarios in motions
             for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
@@ -265,12 +264,12 @@ class CompareConfig(CodeNamingModel):
         """Names that tell references of one kind apart; None where the kind is enough."""
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
-        return [
-            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)]))
-            if kinds.count(kind) > 1
-            else None
-            for kind, reference in zip(kinds, self.references, strict=True)
-        ]
+
+        def label(kind: str, reference: Reference) -> str | None:
+            words = dict.fromkeys([*kind.split(), *_parameters(reference, known)])
+            return " ".join(words) if kinds.count(kind) > 1 else None
+
+        return list(map(label, kinds, self.references))
 
 
 @dataclass(frozen=True)
@@ -414,10 +413,8 @@ def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
     """
     seen = set[str]()
     for condition in conditions:
-        own = {
-            repr((condition.env, condition.arguments)),
-            repr((condition.policy, condition.swept, condition.reference)),
-        }
+        played = (condition.policy, condition.swept, condition.reference)
+        own = {repr((condition.env, condition.arguments)), repr(played)}
         if not own <= seen:
             seen |= own
             yield condition

@@ -103,11 +103,8 @@ class Identify(Model):
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        recorded = {
-            **self.model_dump(mode="json", exclude={"output", "on", "arm"}),
-            "scenario": scenario,
-            "hardware": hardware,
-        }
+        recorded = self.model_dump(mode="json", exclude={"output", "on", "arm"})
+        recorded |= {"scenario": scenario, "hardware": hardware}
         with run_folder("identify", recorded, self.seed, self.output) as folder:
             try:
                 with _progress(hardware, console) as progress:
@@ -122,10 +119,8 @@ class Identify(Model):
             console.print(result_table(results[0]))
             if self.repeats > 1:
                 seeds = range(self.seed, self.seed + self.repeats)
-                rows = [
-                    {"seed": seed, **result.model_dump()}
-                    for seed, result in zip(seeds, results, strict=True)
-                ]
+                found = zip(seeds, results, strict=True)
+                rows = [{"seed": seed, **own.model_dump()} for seed, own in found]
                 files.append(write_records(rows, folder / "repeats.csv"))
                 truth = float(envs[0].unwrapped.truth().model.stiffness[0])
                 console.print(_spread(pd.DataFrame(rows), results, truth))

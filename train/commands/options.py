@@ -106,11 +106,8 @@ class OnHardware(Model):
                     )
                     raise ConfigurationError(problem)
             return {}
-        options = {
-            "port": self.port,
-            "imu_port": self.imu_port,
-            "confirm": False if self.yes else None,
-        }
+        confirm = False if self.yes else None
+        options = {"port": self.port, "imu_port": self.imu_port, "confirm": confirm}
         given = {name: value for name, value in options.items() if value is not None}
         if self.mounting is None:
             chosen = Mounting(**given)
@@ -133,10 +130,8 @@ class OnHardware(Model):
             return {"env": env}
         real = environment(env).on_hardware
         if not real:
-            raise ConfigurationError(
-                f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or"
-                " --port and --mounting"
-            )
+            problem = f"there is no {env!r} on hardware, only the testbed: leave --env {env} out"
+            raise ConfigurationError(f"{problem}, or --port and --mounting")
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
@@ -148,10 +143,8 @@ class OnHardware(Model):
         if not self.arguments:
             return named or DEFAULT_SCENARIO
         if named is not None:
-            raise ConfigurationError(
-                f"scenario {named!r} is of a simulation, hardware is what it is: leave --scenario"
-                " out, or --port"
-            )
+            problem = f"scenario {named!r} is of a simulation, hardware is what it is"
+            raise ConfigurationError(f"{problem}: leave --scenario out, or --port")
         return "hardware"
 
 

@@ -44,11 +44,9 @@ def play(
         ResultsExistError: The video file exists.
         MissingExtraError: The video writer is not installed.
     """
-    env: Any = gymnasium.make(
-        condition.environment.id,
-        render_mode="human" if video is None else "rgb_array",
-        **condition.arguments,
-    )
+    mode = "human" if video is None else "rgb_array"
+    name = condition.environment.id
+    env: Any = gymnasium.make(name, render_mode=mode, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):

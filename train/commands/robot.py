@@ -211,10 +211,8 @@ def _of_gallery(name: str) -> dict[str, Any]:
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
-    joints = {
-        joint: assumed.model_dump(include=_ASSUMED)
-        for joint, assumed in gallery_joints(name).items()
-    }
+    assumed = gallery_joints(name)
+    joints = {joint: own.model_dump(include=_ASSUMED) for joint, own in assumed.items()}
     return {
         "model": model,
         "joints": joints,

@@ -15,7 +15,7 @@ from pydantic import Field
 from rich.console import Console
 
 import train.speed.contenders as loops
-from elastic_env.core.config import Model, quantity
+from elastic_env.core.config import Entries, Model, quantity
 from train.evaluate.environments import environment
 from train.runs.console import make_table
 from train.runs.escaping import write_records
@@ -45,15 +45,11 @@ class Speed(Model):
     policy: str | None = None
     """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the
     testbed; with --real-time adaptive_posture on the walker."""
-    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field(
-        [64, 256], min_length=1, max_length=100
-    )
+    num_envs: Entries[Annotated[int, Field(ge=1, le=1_000_000)]] = [64, 256]
     """Numbers of worlds."""
     others: bool = True
     """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
-    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field(
-        [2, 4], min_length=1, max_length=100
-    )
+    processes: Entries[Annotated[int, Field(ge=1, le=1024)]] = [2, 4]
     """Numbers of processes to try with them."""
     ppo: bool = True
     """Time PPO end to end too."""

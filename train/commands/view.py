@@ -110,10 +110,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
         if not hasattr(picture, "sides"):
-            raise ElasticError(
-                f"{type(picture).__name__} has no sides: see HasSides in"
-                " elastic_env.rendering.side_by_side"
-            )
+            cure = "see HasSides in elastic_env.rendering.side_by_side"
+            raise ElasticError(f"{type(picture).__name__} has no sides: {cure}")
         policy = make_policy(condition.policy, env)
         for step, now in episode(env, policy, condition, steps, console):
             if step % every == 0:
@@ -232,11 +230,8 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     """Start the viewer in a thread; it listens on a Unix socket of a path."""
     scene = SideBySide(recording.robot)
     playback = Playback(recording)
-    plugins = [
-        app.App(app.Config(show_options=False, show_inspector=False)),
-        _Poses(playback, scene),
-        _Sliders(playback),
-    ]
+    window = app.App(app.Config(show_options=False, show_inspector=False))
+    plugins = [window, _Poses(playback, scene), _Sliders(playback)]
     of_viewer, of_robots = plugin.split_plugins(plugins)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(place)
@@ -286,10 +281,8 @@ class View(WatchedEpisode):
         with show(recording, self.host, self.port) as page:
             console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
-                console.print(
-                    "who has this address sees the page and moves its sliders; nothing on the way"
-                    " is encrypted",
-                )
+                what = "sees the page and moves its sliders; nothing on the way is encrypted"
+                console.print(f"who has this address {what}")
             console.print("Ctrl-C ends it")
             _open_tab(page.access.address)
             while page.handle.is_running():

@@ -63,13 +63,8 @@ class ConstantSearch(Trainer):
         self._worlds = training_worlds(config, shares, threads)
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
-        self._optimiser = CMA(
-            mean=np.zeros(num_constants),
-            sigma=options["sigma"],
-            bounds=bounds,
-            seed=self._seed,
-            population_size=self._population,
-        )
+        mean = np.zeros(num_constants)
+        self._optimiser = CMA(mean, bounds=bounds, seed=self._seed, **options)
         self._told: list[list[float]] = []
         self._done = 0
 

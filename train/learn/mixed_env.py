@@ -50,9 +50,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise ConfigurationError("a mixture needs at least one environment")
         self.envs: list[Any] = [env.unwrapped for env in envs]
         for env in self.envs:
-            if env.autoreset_mode is not AutoresetMode.DISABLED:
-                mode = env.autoreset_mode.value
-                raise _differ(f"have autoreset_mode Disabled, got {mode}")
+            if (mode := env.autoreset_mode) is not AutoresetMode.DISABLED:
+                raise _differ(f"have autoreset_mode Disabled, got {mode.value}")
             if env.single_observation_space != self.envs[0].single_observation_space:
                 raise _differ("have the same observation")
             own = (env.task.name, env.task.num_steps)

@@ -90,11 +90,8 @@ class Scores:
     def keep(self, name: str, decisions: int, policy: _Policy) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
         tensors, description = policy
-        training = {
-            "config": self._config.model_dump(mode="json"),
-            "decisions": decisions,
-            **self._provenance,
-        }
+        recorded = self._config.model_dump(mode="json")
+        training = {"config": recorded, "decisions": decisions, **self._provenance}
         fresh = self._folder / f"{name}.new"
         shutil.rmtree(fresh, ignore_errors=True)
         save_residual(fresh, description.replace(training=training), tensors)

@@ -142,15 +142,10 @@ class TrainConfig(CodeNamingModel):
 
     def description(self, joints: list[str], **network: Any) -> ResidualDescription:
         """Description of an exported policy; `network` names its activation and output."""
-        return ResidualDescription(
-            robot=environment(self.env).robot,
-            joints=joints,
-            base=self.base,
-            base_options=self.base_options,
-            settings=self.settings,
-            clip=self.clip,
-            **network,
-        )
+        names = ("base", "base_options", "settings", "clip")
+        own = {name: getattr(self, name) for name in names}
+        robot = environment(self.env).robot
+        return ResidualDescription(robot=robot, joints=joints, **own, **network)
 
     def is_due(self, every: int, before: int, now: int) -> bool:
         """True if work that is done every so many decisions, and at the end, is due."""
@@ -205,12 +200,10 @@ def training_worlds(
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
     apart = {**environment(config.env).learned_from, **config.env_options}
-    worlds = mixed_env(
-        [condition.replace(env_options=apart) for condition in conditions],
-        [count for _, count in shares],
-        threads,
-        [config.weights.get(scenario, 1.0) for scenario, _ in shares],
-    )
+    conditions = [condition.replace(env_options=apart) for condition in conditions]
+    weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
+    sizes = [count for _, count in shares]
+    worlds = mixed_env(conditions, sizes, threads, weights)
     base = baselines.make(config.base, worlds, **config.base_options)
     settings = config.settings.model_dump()
     mode = AutoresetMode.SAME_STEP

@@ -94,10 +94,8 @@ def markdown_table(head: _Row, rules: _Row, rows: Iterable[_Row]) -> str:
 
 def script_json(value: Any) -> str:
     """JSON within a script element: nothing in it ends the element or begins a comment."""
-    text = json.dumps(
-        _visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False
-    )
-    return text.translate(_IN_SCRIPT)
+    plain = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
+    return json.dumps(_visible_data(value), **plain).translate(_IN_SCRIPT)
 
 
 def _visible_data(value: Any) -> Any:

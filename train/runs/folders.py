@@ -259,10 +259,9 @@ def _commit() -> str | None:
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str:
+        options: Any = {"cwd": here, "text": True, "timeout": 10}
         command = ["git", *arguments]
-        return subprocess.check_output(
-            command, cwd=here, text=True, timeout=10, stderr=subprocess.PIPE
-        ).strip()
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, **options).strip()
 
     try:
         is_changed = git("status", "--porcelain", "--untracked-files=no")

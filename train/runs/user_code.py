@@ -120,10 +120,8 @@ def _require_unshadowed(module: ModuleType, attribute: str) -> None:
     file = Path(f"{module.__name__.replace('.', '/')}.py")
     found = getattr(module, "__file__", None)
     if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):
-        raise ConfigurationError(
-            f"{found or 'a built-in module'} stands before your {file}; name the file itself:"
-            f" {file}:{attribute}"
-        )
+        problem = f"{found or 'a built-in module'} stands before your {file}"
+        raise ConfigurationError(f"{problem}; name the file itself: {file}:{attribute}")
 
 
 def _from_path(module: str) -> ModuleType:
