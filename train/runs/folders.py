@@ -256,15 +256,9 @@ def installed_version(package: str) -> str | None:
 
 def _commit() -> str | None:
     """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        options: Any = {"cwd": here, "text": True, "timeout": 10}
-        command = ["git", *arguments]
-        return subprocess.check_output(command, stderr=subprocess.DEVNULL, **options).strip()
-
+    command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    options: Any = {"cwd": Path(__file__).parent, "text": True, "timeout": 10}
     try:
-        is_changed = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("+" if is_changed else "")
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, **options).strip()
     except (OSError, subprocess.SubprocessError):
         return None
