@@ -3,6 +3,7 @@
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, compress
 from pathlib import Path
@@ -110,29 +111,26 @@ def _load_kept(
     return found
 
 
+@dataclass
 class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
-    def __init__(
-        self,
-        conditions: Sequence[Condition],
-        console: Console,
-        place: Executors,
-        store: Store | None,
-    ) -> None:
-        self._conditions = conditions
-        self._console = console
-        self._place = place
-        self._store = store
+    conditions: Sequence[Condition]
+    console: Console
+    place: Executors
+    store: Store | None
+
+    def __post_init__(self) -> None:
+        conditions = self.conditions
         steps = rollout.num_steps(conditions)
-        cores = place.jobs or os.cpu_count() or 1
-        batches = in_batches(conditions, cores if place.is_local else len(conditions))
+        cores = self.place.jobs or os.cpu_count() or 1
+        batches = in_batches(conditions, cores if self.place.is_local else len(conditions))
         by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
         by_steps.sort(key=lambda own: -own[0])
         self._steps = [steps for steps, _ in by_steps]
         self._batches = [batch for _, batch in by_steps]
         self._cells = [[conditions[i] for i in batch] for batch in self._batches]
-        self._keys = [] if store is None else list(map(cell_key, conditions))
+        self._keys = [] if self.store is None else list(map(cell_key, conditions))
         self._played = [0] * len(batches)
         self._tally = Tally(len(conditions))
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
@@ -142,12 +140,12 @@ class _Playing:
         """Outcomes in the order of the conditions; None for those that Ctrl-C prevented."""
         unit = "control steps"
         totals = {unit: sum(self._steps)}
-        with show_progress(self._console, totals, transient=True, unit=unit) as show:
+        with show_progress(self.console, totals, transient=True, unit=unit) as show:
             self._show = show
-            if len(self._batches) == 1 and self._place.is_local:
+            if len(self._batches) == 1 and self.place.is_local:
                 # a process of its own takes seconds to start
                 report = partial(self._report, 0)
-                threads = self._place.jobs
+                threads = self.place.jobs
                 self._end(0, Outcome(_evaluate(self._cells[0], report, threads)))
             else:
                 self._play_beside()
@@ -157,8 +155,8 @@ class _Playing:
         watch = Watch(self._report, self._end, self._say_moved)
         given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
-            folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.open(len(given), folder) as pool:
+            folder = Path(own) if self.store is None else self.store.folder.parent
+            with self.place.open(len(given), folder) as pool:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:
@@ -175,17 +173,17 @@ class _Playing:
         for number, own in zip(numbers, outcomes, strict=True):
             self._outcomes[number] = own
             self._tally.end(number, own)
-            if own.error is not None or self._store is None:
+            if own.error is not None or self.store is None:
                 continue
-            if not self._store.keep(own.value, self._keys[number]):
-                name = _name(self._conditions[number])
+            if not self.store.keep(own.value, self._keys[number]):
+                name = _name(self.conditions[number])
                 cause = "a file that it names changed while it was played"
-                self._console.print(f"{name} is not kept: {cause}")
+                self.console.print(f"{name} is not kept: {cause}")
         self._report(batch, self._steps[batch])
 
     def _say_moved(self, batch: int) -> None:
         for name in map(_name, self._cells[batch]):
-            self._console.print(f"a worker was lost; {name} is played again")
+            self.console.print(f"a worker was lost; {name} is played again")
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
@@ -205,7 +203,8 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
             batches.append([number])
             continue
         policy = (condition.policy, condition.member, condition.policy_options)
-        key = repr((policy, condition.reference_name, rollout.shared_settings(condition)))
+        settings = rollout.shared_settings(condition)
+        key = repr((policy, condition.reference_name, settings))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
             batch = []

@@ -172,7 +172,7 @@ class _PrivateViewer(web_viewer.WebViewer):
         listener: Where the viewer listens.
     """
 
-    def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
+    def __init__(self, endpoint: Any, plugins: Any, listener: socket.socket) -> None:
         self._listener = listener
         config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
         # it prints an address that is not ours

@@ -65,9 +65,8 @@ class Training(Trainer):
         self._worlds = SB3VecEnv(worlds, np.random.default_rng(seed))
         options = complete_options(config.algorithm, config.algorithm_options)
         gamma = options.get("gamma", 0.99)
-        self._normaliser = VecNormalize(
-            self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma
-        )
+        scales = {"clip_obs": config.clip, "gamma": gamma}
+        self._normaliser = VecNormalize(self._worlds, norm_reward=True, **scales)
         set_random_seed(seed)
         self._normaliser.seed(first_episode(seed))
         algorithm = algorithm_class(config.algorithm)
