@@ -173,7 +173,7 @@ def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dic
         log: Any = None
         try:
             for step in steps:
-                row = {k: own for k, own in step.info.items() if not isinstance(own, dict)}
+                row = {k: v for k, v in step.info.items() if not isinstance(v, dict)}
                 if not rows:
                     log = csv.DictWriter(file, list(row))
                     log.writeheader()

@@ -26,7 +26,7 @@ from elastic_env.joint.model_text import is_file, is_text, name_of, without_decl
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
-from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
+from elastic_env.robots import gallery
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
 from elastic_env.world.joint_task import JointPlant
 from train.commands.compare import CompareConfig, compare
@@ -118,19 +118,18 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     plots.require_matplotlib()
     require_libraries()
     arguments = robot_arguments(trial)
-    moving, config = (
-        configure_robot(**arguments, reference=reference, scenario=SCENARIO)
-        for reference in (trial.motion, trial.poses)
-    )
+    played = {**arguments, "scenario": SCENARIO}
+    moving = configure_robot(**played, reference=trial.motion)
+    config = configure_robot(**played, reference=trial.poses)
     moving.robot.plant(moving)  # refuses what its servos cannot follow
     plant = config.robot.plant(config)
-    if trial.stiffness is None and trial.model in GALLERY:
+    if trial.stiffness is None and trial.model in gallery.GALLERY:
         text = f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
         console.print(text)
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
-        played = CompareConfig(
+        compared = CompareConfig(
             name="robot",
             env=str(file),
             references=[trial.poses.model_dump(mode="json"), trial.motion],
@@ -138,7 +137,7 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
             policies=[PolicySpec(name=name) for name in POLICIES],
             seed=trial.seed,
         )
-        comparison = compare(played, console, folder / "comparison")
+        comparison = compare(compared, console, folder / "comparison")
         placed = [_placement(one) for one in comparison.evaluations]
         shares = joint_shares(plant)
         files = [
@@ -182,14 +181,14 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
 
 
 def _of_model(name: str) -> dict[str, Any]:
-    if name in GALLERY:
+    if name in gallery.GALLERY:
         return _of_gallery(name)
     if is_text(name):
         return {"model": name, "joints": {}}
     if not is_file(name):
         raise ConfigurationError(
             f"no model at {name_of(name)}; give a file of MJCF (.xml) or URDF (.urdf), a file of a"
-            f" robot (.yaml), or a robot of the gallery: {', '.join(GALLERY)}"
+            f" robot (.yaml), or a robot of the gallery: {', '.join(gallery.GALLERY)}"
         )
     if name.endswith(ENDINGS):
         return read_robot_file(name)
@@ -201,17 +200,17 @@ def _of_gallery(name: str) -> dict[str, Any]:
 
     Its own file, if nothing has to be changed in it.
     """
-    known = GALLERY[name]
-    file = gallery_file(name)
+    known = gallery.GALLERY[name]
+    file = gallery.gallery_file(name)
     end_effector = known.end_effector
     model = str(file)
     if file.suffix != ".urdf" or any(known.tip):
-        spec = gallery_robot(name, shapes=True)
+        spec = gallery.gallery_robot(name, shapes=True)
         end_effector = _TIP
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
-    assumed = gallery_joints(name)
+    assumed = gallery.gallery_joints(name)
     joints = {joint: own.model_dump(include=_ASSUMED) for joint, own in assumed.items()}
     return {
         "model": model,
