@@ -123,8 +123,10 @@ class _Playing:
     def __post_init__(self) -> None:
         conditions = self.conditions
         steps = rollout.num_steps(conditions)
-        cores = self.place.jobs or os.cpu_count() or 1
-        batches = in_batches(conditions, cores if self.place.is_local else len(conditions))
+        cores = len(conditions)
+        if self.place.is_local:
+            cores = self.place.jobs or os.cpu_count() or 1
+        batches = in_batches(conditions, cores)
         by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
         by_steps.sort(key=lambda own: -own[0])
         self._steps = [steps for steps, _ in by_steps]

@@ -85,7 +85,8 @@ class Demo(Model):
                 " them; at the end with joints that are softer than assumed (scenario soft)"
             )
             evaluations = iter(run_conditions(conditions, console))
-            static, motion, *walked = (list(islice(evaluations, len(part))) for part in parts)
+            played = [list(islice(evaluations, len(part))) for part in parts]
+            static, motion, *walked = played
             walks = list(chain(*walked))
             scored = [*motion, *walks]
             model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
@@ -94,9 +95,10 @@ class Demo(Model):
             result = identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
             fig5 = folder / "fig5_identification.png"
+            fig6 = folder / "fig6_static_errors.png"
             files = [
                 testbed_plots.draw_identification(result, points, [model], fig5),
-                testbed_plots.draw_static_errors(static, model, folder / "fig6_static_errors.png"),
+                testbed_plots.draw_static_errors(static, model, fig6),
                 comparison_figures.draw_time_series(motion, folder / "sine.png"),
             ]
             for name in ("pelvis", "zmp"):

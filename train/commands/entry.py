@@ -43,7 +43,8 @@ def start(run: Callable[[], None]) -> None:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(failures.WRONG_INPUT)
     except SystemExit as error:
-        if failures.is_unread(error):  # the console of rich ends the program with 1 by itself
+        # the console of rich ends the program with 1 by itself
+        if failures.is_unread(error):
             _end_without_output(BrokenPipeError())
         raise
     except (KeyboardInterrupt, ImportError) as error:

@@ -186,7 +186,7 @@ def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dic
                 if row["time_s"] >= next_s:
                     next_s += _SHOWN_S
                     file.flush()
-                    shown = (format(row[key] * by, form) for _, _, key, by, form in _SHOWN)
+                    shown = [format(row[key] * by, form) for *_, key, by, form in _SHOWN]
                     console.print("".join(shown))
         except BaseException:
             if rows:

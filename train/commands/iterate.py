@@ -122,7 +122,8 @@ class Iterate(Model):
 
     def _play(self, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
         trials: list[Trial] = []
-        with show_progress(console, {"trials": policy.trials + 1}, transient=True) as show:
+        totals = {"trials": policy.trials + 1}
+        with show_progress(console, totals, transient=True) as show:
 
             def keep(trial: Trial) -> None:
                 trials.append(trial)
@@ -139,8 +140,8 @@ class Iterate(Model):
         rows = []
         for trial in trials:
             for robot, metrics in enumerate(trial.metrics):
-                failed = bool(trial.failed[robot])
-                row = {"trial": trial.number, "seed": self.seed + robot, "failed": failed}
+                row: dict[str, Any] = {"trial": trial.number, "seed": self.seed + robot}
+                row["failed"] = bool(trial.failed[robot])
                 measured = zip(columns, trial.error_rms[robot].tolist(), strict=True)
                 rows.append({**row, **dict(measured), **metrics})
         return write_records(rows, path)
@@ -163,7 +164,8 @@ class Iterate(Model):
                 scenario=self.scenario,
                 training=provenance(seed),
             )
-            folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
+            is_one = len(policy.tables) == 1
+            folders.append(folder if is_one else folder / f"robot_{seed}")
             save_table(folders[-1], description, table)
         return folders
 

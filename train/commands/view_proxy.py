@@ -36,7 +36,7 @@ _TOKEN = "token="
 _CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
-_UPGRADED = re.compile("upgrade|connection|sec-websocket-(key|version|protocol|extensions)", re.I)
+_UPGRADED = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
 """Headers of a WebSocket's opening that the viewer gets."""
 _PRIVATE = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
@@ -340,7 +340,7 @@ def _for_viewer(request: Head, asked: Asked) -> Head:
     """A request as the viewer gets it: without token, cookies and Origin."""
     headers = [("Host", "viewer")]
     if asked.is_socket:
-        headers += [own for own in request.headers if _UPGRADED.fullmatch(own[0])]
+        headers += [own for own in request.headers if re.fullmatch(_UPGRADED, own[0])]
     return Head(f"GET {asked.path} HTTP/1.1", headers)
 
 

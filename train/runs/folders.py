@@ -258,7 +258,8 @@ def _commit() -> str | None:
     """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
     command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
     options: Any = {"cwd": Path(__file__).parent, "text": True, "timeout": 10}
+    options["stderr"] = subprocess.DEVNULL
     try:
-        return subprocess.check_output(command, stderr=subprocess.DEVNULL, **options).strip()
+        return subprocess.check_output(command, **options).strip()
     except (OSError, subprocess.SubprocessError):
         return None

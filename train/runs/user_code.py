@@ -34,7 +34,8 @@ class CodeNamingModel(Model):
 
 _Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
-_REFUSE: ContextVar[Callable[[str], None]] = ContextVar("refuse", default=lambda _: None)
+_Refuse = Callable[[str], None]
+_REFUSE: ContextVar[_Refuse] = ContextVar("refuse", default=lambda _: None)
 """Called with each name before its code runs."""
 _TRUST = "say --trust-code, or name a configuration of yours"
 """What the user can do who trusts the folder of a run."""
