@@ -26,7 +26,7 @@ from elastic_env.joint.model_text import is_file, is_text, name_of, without_decl
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
-from elastic_env.robots import gallery
+from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
 from elastic_env.world.joint_task import JointPlant
 from train.commands.compare import CompareConfig, compare
@@ -123,7 +123,7 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     config = configure_robot(**played, reference=trial.poses)
     moving.robot.plant(moving)  # refuses what its servos cannot follow
     plant = config.robot.plant(config)
-    if trial.stiffness is None and trial.model in gallery.GALLERY:
+    if trial.stiffness is None and trial.model in GALLERY:
         text = f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
         console.print(text)
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
@@ -181,14 +181,14 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
 
 
 def _of_model(name: str) -> dict[str, Any]:
-    if name in gallery.GALLERY:
+    if name in GALLERY:
         return _of_gallery(name)
     if is_text(name):
         return {"model": name, "joints": {}}
     if not is_file(name):
         raise ConfigurationError(
             f"no model at {name_of(name)}; give a file of MJCF (.xml) or URDF (.urdf), a file of a"
-            f" robot (.yaml), or a robot of the gallery: {', '.join(gallery.GALLERY)}"
+            f" robot (.yaml), or a robot of the gallery: {', '.join(GALLERY)}"
         )
     if name.endswith(ENDINGS):
         return read_robot_file(name)
@@ -200,17 +200,17 @@ def _of_gallery(name: str) -> dict[str, Any]:
 
     Its own file, if nothing has to be changed in it.
     """
-    known = gallery.GALLERY[name]
-    file = gallery.gallery_file(name)
+    known = GALLERY[name]
+    file = gallery_file(name)
     end_effector = known.end_effector
     model = str(file)
     if file.suffix != ".urdf" or any(known.tip):
-        spec = gallery.gallery_robot(name, shapes=True)
+        spec = gallery_robot(name, shapes=True)
         end_effector = _TIP
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
-    assumed = gallery.gallery_joints(name)
+    assumed = gallery_joints(name)
     joints = {joint: own.model_dump(include=_ASSUMED) for joint, own in assumed.items()}
     return {
         "model": model,
