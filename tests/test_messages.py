@@ -29,7 +29,7 @@ from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import make_policy
-from train.learn.algorithms import algorithm_class
+from train.learn.export import algorithm_class
 from train.learn.train_config import TrainConfig
 
 MOST = 200

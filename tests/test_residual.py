@@ -392,10 +392,8 @@ def test_the_numpy_forward_pass_is_that_of_sb3(
     """Catches a layer, an activation, a normalisation or a squashing that is not the one that
     was trained."""
     model, venv, env = trained(algorithm, **options)
-    tensors, activation, output = network_of(model, venv)
-    description = ResidualDescription(
-        robot="testbed", base="input", settings=env.settings, activation=activation, output=output
-    )
+    tensors, kind = network_of(model, venv)
+    description = ResidualDescription(robot="testbed", base="input", settings=env.settings, **kind)
     save_residual(tmp_path / "r", description, tensors)
     read, network = load_residual(tmp_path / "r")
     assert read.replace(weights_sha256=None) == description

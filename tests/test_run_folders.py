@@ -14,9 +14,10 @@ from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
-from train.commands.compare import recorded_config
+from train.commands.compare import CompareConfig
 from train.learn.run_training import resume
 from train.runs.folders import free_folder, lock_run, require_run, run_folder
+from train.runs.user_code import recorded_config
 
 
 @pytest.fixture(autouse=True)
@@ -181,7 +182,7 @@ def test_a_comparison_that_is_resumed_runs_no_code_of_its_folder(
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text(f"name: x\n{FIELDS[field].format(code)}\n")
     with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
-        recorded_config(tmp_path)
+        recorded_config(tmp_path, CompareConfig)
     assert not mark.exists()
 
 
@@ -192,7 +193,7 @@ def test_a_robot_that_is_called_like_a_residual_is_code(
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\nenv: 'residual:evil.py:ROBOT'\n")
     with pytest.raises(ConfigurationError, match="whose code would run"):
-        recorded_config(tmp_path)
+        recorded_config(tmp_path, CompareConfig)
     assert not mark.exists()
 
 
@@ -200,7 +201,9 @@ def test_a_comparison_that_is_trusted_runs_its_code(tmp_path: Path) -> None:
     """Catches a folder of one's own that cannot be gone on with."""
     mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\npolicies: ['evil.py:make', 'residual:evil']\n")
-    assert recorded_config(tmp_path, trust_code=True).policies[0].name == "evil.py:make"
+    assert (
+        recorded_config(tmp_path, CompareConfig, trust_code=True).policies[0].name == "evil.py:make"
+    )
 
 
 @pytest.mark.parametrize(
@@ -216,7 +219,10 @@ def test_a_run_with_a_link_out_of_it_is_not_gone_on_with(place: str, tmp_path: P
     if place != "config.yaml":
         (run / "config.yaml").write_text("name: x\n")
     (run / place).symlink_to("../" * place.count("/") + "../mine")
-    for go_on in (recorded_config, lambda folder: resume([folder], Console(quiet=True))):
+    for go_on in (
+        lambda folder: recorded_config(folder, CompareConfig),
+        lambda folder: resume([folder], Console(quiet=True)),
+    ):
         with pytest.raises(ConfigurationError, match=f"{place} is a link that leads out of .*run"):
             go_on(run)
     assert mine.read_text() == "name: x\n"
@@ -251,7 +257,7 @@ def test_a_run_may_be_a_link_and_have_links_to_itself(tmp_path: Path) -> None:
     (tmp_path / "run" / "config.yaml").write_text("name: x\n")
     (tmp_path / "run" / "best").symlink_to("last")
     (tmp_path / "latest").symlink_to("run")
-    assert require_run(tmp_path / "latest", "run", "compare wrote").name == "config.yaml"
+    assert require_run(tmp_path / "latest").name == "config.yaml"
 
 
 @pytest.mark.parametrize("kind", ["link", "second name", "pipe", "folder"])

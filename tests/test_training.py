@@ -34,14 +34,13 @@ from train.evaluate.episodes import evaluate
 from train.evaluate.progress import read_progress
 from train.evaluate.rollout import make_vector_env
 from train.learn.constant_search import ConstantSearch
-from train.learn.curves import Curves
 from train.learn.mixed_env import MixedVectorEnv, threads_of_each
 from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.scores import play_together
 from train.learn.train_config import TrainConfig, training_worlds
-from train.learn.training import Training
+from train.learn.training import Curves, Training
 from train.runs.folders import lock_run
 from train.workers.executors import Executors
 

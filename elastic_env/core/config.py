@@ -143,6 +143,9 @@ Locator = Annotated[_Text, Field(max_length=1000)]
 """Text that may hold a path."""
 MOST_ENTRIES = 1000
 """Entries of a list in a configuration."""
+_Entry = TypeVar("_Entry")
+Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
+"""A list of a configuration that must not be empty."""
 LARGEST_SEED = 2**63 - 1
 """Seeds of episodes are 64-bit integers."""
 _BYTES = 4

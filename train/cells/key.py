@@ -39,7 +39,8 @@ def cell_key(condition: Condition) -> str:
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
-    files = {str(file): _digest(file) for text in _texts(named) for file in named_files(text)}
+    found = [file for text in _texts(named) for file in named_files(text)]
+    files = {str(file): _digest(file) for file in found}
     whole = {"condition": content, "files": files, "versions": physics()}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 
@@ -83,7 +84,8 @@ def _source(module: str) -> Path | None:
     if found is None:
         return None
     if not parts:
-        return Path(found.origin) if found.origin and found.origin.endswith(".py") else None
+        origin = found.origin or ""
+        return Path(origin) if origin.endswith(".py") else None
     for folder in found.submodule_search_locations or ():
         for file in _files_of(Path(folder).joinpath(*parts)):
             if _is_file(file):

@@ -3,7 +3,9 @@
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import chain, compress
 from pathlib import Path
 
 from rich.console import Console
@@ -11,9 +13,9 @@ from rich.console import Console
 from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
 from train.cells.store import Store, UnfitCellError
+from train.evaluate import rollout
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
-from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
 from train.runs.console import shown_warnings, warn_once
 from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
@@ -31,10 +33,10 @@ class CellsFailedError(ElasticError):
         finished: Evaluations of the others.
     """
 
-    def __init__(self, why: Sequence[tuple[str, int]], finished: list[Evaluation]) -> None:
-        super().__init__("\n".join(dict.fromkeys(said for said, _ in why)))
+    def __init__(self, why: dict[str, int], finished: list[Evaluation]) -> None:
+        super().__init__("\n".join(why))
         self.finished = finished
-        self.exit_code = max(code for _, code in why)  # type: ignore[misc]
+        self.exit_code = max(why.values())  # type: ignore[misc]
 
 
 def run_conditions(
@@ -69,17 +71,19 @@ def run_conditions(
     kept = [None] * len(conditions)
     if store is not None and not fresh:
         kept = _load_kept(conditions, store, console)
-    missing = [condition for condition, own in zip(conditions, kept, strict=True) if own is None]
+    missing = list(compress(conditions, [own is None for own in kept]))
     if len(missing) < len(conditions):
-        console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept")
+        number = len(conditions) - len(missing)
+        console.print(f"{number} of {len(conditions)} cells are kept")
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if own is None else Outcome(own) for own in kept]
-    finished = [result.value for result in results if result is not None and result.error is None]
-    failed = [
-        _failure_text(condition, result.error, result.trace)
-        for condition, result in zip(conditions, results, strict=True)
-        if result is not None and result.error is not None
-    ]
+    finished = list[Evaluation]()
+    failed = dict[str, int]()
+    for condition, result in zip(conditions, results, strict=True):
+        if result is not None and result.error is None:
+            finished.append(result.value)
+        elif result is not None:
+            failed.update([_explain_failure(condition, result)])
     if failed:
         raise CellsFailedError(failed, finished)
     if None in results:
@@ -100,36 +104,35 @@ def _load_kept(
             found.append(None)
             unfit.append(f"{_name(condition)} ({error})")
     if unfit:
-        more = f", and {len(unfit) - _MOST_NAMED} more" if len(unfit) > _MOST_NAMED else ""
         named = "; ".join(unfit[:_MOST_NAMED])
-        said = f"kept cells that do not fit are played again: {named}{more}"
-        console.print(said, markup=False)
+        others = len(unfit) - _MOST_NAMED
+        more = f", and {others} more" if others > 0 else ""
+        console.print(f"kept cells that do not fit are played again: {named}{more}")
     return found
 
 
+@dataclass
 class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
-    def __init__(
-        self,
-        conditions: Sequence[Condition],
-        console: Console,
-        place: Executors,
-        store: Store | None,
-    ) -> None:
-        self._conditions = conditions
-        self._console = console
-        self._place = place
-        self._store = store
-        steps = num_steps(conditions)
-        cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
+    conditions: Sequence[Condition]
+    console: Console
+    place: Executors
+    store: Store | None
+
+    def __post_init__(self) -> None:
+        conditions = self.conditions
+        steps = rollout.num_steps(conditions)
+        cores = len(conditions)
+        if self.place.is_local:
+            cores = self.place.jobs or os.cpu_count() or 1
         batches = in_batches(conditions, cores)
-        steps_of = [sum(steps[number] for number in batch) for batch in batches]
-        longest_first = sorted(range(len(batches)), key=lambda batch: -steps_of[batch])
-        self._batches = [batches[batch] for batch in longest_first]
-        self._steps = [steps_of[batch] for batch in longest_first]
-        self._cells = [[conditions[number] for number in batch] for batch in self._batches]
-        self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
+        by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
+        by_steps.sort(key=lambda own: -own[0])
+        self._steps = [steps for steps, _ in by_steps]
+        self._batches = [batch for _, batch in by_steps]
+        self._cells = [[conditions[i] for i in batch] for batch in self._batches]
+        self._keys = [] if self.store is None else list(map(cell_key, conditions))
         self._played = [0] * len(batches)
         self._tally = Tally(len(conditions))
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
@@ -139,12 +142,13 @@ class _Playing:
         """Outcomes in the order of the conditions; None for those that Ctrl-C prevented."""
         unit = "control steps"
         totals = {unit: sum(self._steps)}
-        with show_progress(self._console, totals, transient=True, unit=unit) as show:
+        with show_progress(self.console, totals, transient=True, unit=unit) as show:
             self._show = show
-            if len(self._batches) == 1 and self._place.is_local:
+            if len(self._batches) == 1 and self.place.is_local:
                 # a process of its own takes seconds to start
                 report = partial(self._report, 0)
-                self._end(0, Outcome(_evaluate(self._cells[0], report, self._place.jobs)))
+                threads = self.place.jobs
+                self._end(0, Outcome(_evaluate(self._cells[0], report, threads)))
             else:
                 self._play_beside()
         return self._outcomes
@@ -153,8 +157,8 @@ class _Playing:
         watch = Watch(self._report, self._end, self._say_moved)
         given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
-            folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.open(len(given), folder) as pool:
+            folder = Path(own) if self.store is None else self.store.folder.parent
+            with self.place.open(len(given), folder) as pool:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:
@@ -171,16 +175,17 @@ class _Playing:
         for number, own in zip(numbers, outcomes, strict=True):
             self._outcomes[number] = own
             self._tally.end(number, own)
-            store = self._store
-            if own.error is None and store and not store.keep(own.value, self._keys[number]):
-                name = _name(self._conditions[number])
+            if own.error is not None or self.store is None:
+                continue
+            if not self.store.keep(own.value, self._keys[number]):
+                name = _name(self.conditions[number])
                 cause = "a file that it names changed while it was played"
-                self._console.print(f"{name} is not kept: {cause}")
+                self.console.print(f"{name} is not kept: {cause}")
         self._report(batch, self._steps[batch])
 
     def _say_moved(self, batch: int) -> None:
-        for condition in self._cells[batch]:
-            self._console.print(f"a worker was lost; {_name(condition)} is played again")
+        for name in map(_name, self._cells[batch]):
+            self.console.print(f"a worker was lost; {name} is played again")
 
 
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
@@ -196,11 +201,12 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     batches: list[list[int]] = []
     open_batch: dict[str, tuple[list[int], int]] = {}
     for number, condition in enumerate(conditions):
-        if not can_share_worlds(condition):
+        if not rollout.can_share_worlds(condition):
             batches.append([number])
             continue
         policy = (condition.policy, condition.member, condition.policy_options)
-        key = repr((policy, condition.reference_name, shared_settings(condition)))
+        settings = rollout.shared_settings(condition)
+        key = repr((policy, condition.reference_name, settings))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
             batch = []
@@ -211,11 +217,13 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     return batches
 
 
-def _failure_text(condition: Condition, error: Exception, trace: str) -> tuple[str, int]:
+def _explain_failure(condition: Condition, result: Outcome) -> tuple[str, int]:
     """Text and exit code of a failure; a defect's traceback goes to the terminal."""
-    defect = (f"this is a defect: {type(error).__name__}: {error}\n{trace}", DEFECT)
-    said, code = explain(error) or defect
-    if isinstance(error, PolicyFailedError):  # which names the cell itself
+    error = result.error
+    assert error is not None
+    defect = f"this is a defect: {type(error).__name__}: {error}\n{result.trace}"
+    said, code = explain(error) or (defect, DEFECT)
+    if isinstance(error, rollout.PolicyFailedError):  # which names the cell itself
         return said, code
     return f"{_name(condition)}: {said}", code
 
@@ -229,7 +237,7 @@ def _name(condition: Condition) -> str:
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
-    (total,) = num_steps([condition])
+    (total,) = rollout.num_steps([condition])
     say = plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}")
     return evaluate(condition, _count(lambda done: say(done / total)))
@@ -265,11 +273,8 @@ def _evaluate(
     try:
         played = evaluate_together(conditions, _count(report), num_threads)
         return [Outcome(evaluation) for evaluation in played]
-    except PolicyFailedError as error:
+    except rollout.PolicyFailedError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]
-    return [
-        outcome
-        for condition in conditions
-        for outcome in _evaluate([condition], lambda _: None, num_threads)
-    ]
+    quiet = (lambda _: None, num_threads)
+    return list(chain(*(_evaluate([one], *quiet) for one in conditions)))

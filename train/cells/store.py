@@ -69,7 +69,7 @@ class Store:
             return None
         except UnfitCellError as error:
             raise UnfitCellError(f"{file.name}: {error}") from None
-        except Exception as error:  # whatever a reader of archives makes of a foreign file
+        except Exception as error:  # of a reader of archives that meets a foreign file
             cause = f"{type(error).__name__}: {quote(str(error))}"
             raise UnfitCellError(f"{file.name}: {cause}") from None
 
@@ -100,13 +100,14 @@ class Store:
 
 def _to_bytes(evaluation: Evaluation, key: str) -> bytes:
     """An evaluation as a file of NumPy's, from which no code can run."""
+    points = {} if evaluation.points is None else vars(evaluation.points)
     arrays: Arrays = {
-        f"{_TRACE}/{name}": np.asarray(values) for name, values in evaluation.trace.items()
+        f"{part}/{name}": np.asarray(values)
+        for part, series in ((_TRACE, evaluation.trace), (_POINTS, points))
+        for name, values in series.items()
     }
-    if evaluation.points is not None:
-        arrays |= {f"{_POINTS}/{name}": values for name, values in vars(evaluation.points).items()}
-    episodes = json.dumps(evaluation.episodes, default=lambda number: number.item()).encode()
-    arrays[_EPISODES] = np.frombuffer(episodes, dtype=np.uint8)
+    episodes = json.dumps(evaluation.episodes, default=lambda number: number.item())
+    arrays[_EPISODES] = np.frombuffer(episodes.encode(), dtype=np.uint8)
     arrays[_REST] = evaluation.rest_references
     seal = {_KEY: np.array(key), _DIGEST: _digest(arrays)}
     content = io.BytesIO()
@@ -132,7 +133,8 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         size = sum(part.file_size for part in archive.infolist())
     if size > _MOST_BYTES:
-        raise UnfitCellError(f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read")
+        problem = f"unpacked it has {size} bytes, at most {_MOST_BYTES} are read"
+        raise UnfitCellError(problem)
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         found = {name: arrays[name] for name in arrays.files}
     if str(found.pop(_KEY, "")) != key:
@@ -141,8 +143,8 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
         raise UnfitCellError("its content is not what was written")
     text = found[_EPISODES]
     most = _EPISODE_BYTES * condition.episodes
-    if text.nbytes > most:
-        raise UnfitCellError(f"its episodes have {text.nbytes} bytes, at most {most} are read")
+    if (size := text.nbytes) > most:
+        raise UnfitCellError(f"its episodes have {size} bytes, at most {most} are read")
     points = _part(found, _POINTS)
     evaluation = Evaluation(
         condition,
@@ -151,21 +153,24 @@ def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
         points=StaticPoints(**points) if points else None,
         rest_references=found[_REST],
     )
-    for problem in chain(_problems_of_episodes(evaluation), _problems_of_arrays(evaluation)):
+    problems = chain(_problems_of_episodes(evaluation), _problems_of_arrays(evaluation))
+    for problem in problems:
         raise UnfitCellError(problem)
     return evaluation
 
 
 def _part(found: Arrays, name: str) -> Arrays:
     prefix = f"{name}/"
-    return {key.removeprefix(prefix): own for key, own in found.items() if key.startswith(prefix)}
+    keys = [key for key in found if key.startswith(prefix)]
+    return {key.removeprefix(prefix): found[key] for key in keys}
 
 
 def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
     """Yield why records are not those of a condition: all, in order, with finite scores."""
     condition = evaluation.condition
     episodes = evaluation.episodes
-    if not isinstance(episodes, list) or not all(isinstance(one, dict) for one in episodes):
+    are_records = isinstance(episodes, list) and {*map(type, episodes)} <= {dict}
+    if not are_records:
         yield "it has no episodes"
         return
     if len(episodes) != condition.episodes:

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ from baselines.policies import is_saved
 from elastic_env.core.config import (
     LARGEST_SEED,
     MOST_ENTRIES,
+    Entries,
     Locator,
     Model,
     Title,
@@ -27,14 +29,13 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
-from train.commands.options import reference_of
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec, cell_of
 from train.evaluate.episodes import Evaluation
 from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
-from train.runs.user_code import load_without_code
+from train.runs.user_code import CodeNamingModel, load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
@@ -58,23 +59,23 @@ class BenchCase(Model):
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        return Condition(
-            env=self.env,
-            policy=PolicySpec(name=self.policy),
-            scenario=self.scenario,
-            seed=self.seed,
-            reference=reference_of(self.env, self.reference),
-        )
+        return cell_of(self, PolicySpec(name=self.policy))
 
 
-class BenchConfig(Model):
+class BenchConfig(CodeNamingModel):
     """The rollouts of `elastic bench`."""
 
     name: Title = "bench"
     margin: float = quantity("1", 0.05, ge=0, le=100)
     """Relative amount by which a figure may exceed the accepted."""
     _kind = model_validator(mode="before")(is_a("bench"))
-    cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
+    cases: Entries[BenchCase]
+
+    @property
+    def names_of_code(self) -> list[str]:
+        """Names that may stand for code."""
+        policies = [case.policy for case in self.cases if not is_saved(case.policy)]
+        return [*policies, *(case.env for case in self.cases)]
 
 
 class Bench(Model):
@@ -100,16 +101,16 @@ class Bench(Model):
         path = configuration(self.config or USUAL, self.update)
         if self.config is None:  # it was found, and nobody named it
             cure = f"name it: elastic bench {path}"
-            config = load_without_code(path, BenchConfig, _names_of_code, cure)
+            config = load_without_code(path, BenchConfig, cure)
         else:
             config = load_yaml(path, BenchConfig)
-        with run_folder(config.name, config.model_dump(mode="json"), None, self.output) as folder:
-            evaluations = run_conditions([case.condition for case in config.cases], console)
-            figures = [
-                figure
-                for case, evaluation in zip(config.cases, evaluations, strict=True)
-                for figure in _figures(case, evaluation, config.margin)
-            ]
+        recorded = config.model_dump(mode="json")
+        with run_folder(config.name, recorded, None, self.output) as folder:
+            conditions = [case.condition for case in config.cases]
+            evaluations = run_conditions(conditions, console)
+            figures = list[_Figure]()
+            for case, evaluation in zip(config.cases, evaluations, strict=True):
+                figures += _figures(case, evaluation, config.margin)
             write_whole(folder / "bench.json", json.dumps(figures, indent=2) + "\n")
             markdown = _markdown(figures)
             write_whole(folder / "bench.md", markdown)
@@ -130,12 +131,6 @@ class Bench(Model):
             sys.exit(1)
 
 
-def _names_of_code(config: BenchConfig) -> list[str]:
-    """Names that may stand for code."""
-    policies = [case.policy for case in config.cases if not is_saved(case.policy)]
-    return [*policies, *(case.env for case in config.cases)]
-
-
 def configuration(path: Path, update: bool = False) -> Path:
     """The configuration that is meant: where the usual one does not exist, that of the package.
 
@@ -145,43 +140,42 @@ def configuration(path: Path, update: bool = False) -> Path:
     if path != USUAL or path.exists():
         return path
     if update:
-        raise ConfigurationError(f"there is no {USUAL} to update; copy {_SHIPPED} there first")
+        cure = f"copy {_SHIPPED} there first"
+        raise ConfigurationError(f"there is no {USUAL} to update; {cure}")
     return _SHIPPED
 
 
-def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[dict[str, Any]]:
-    """Figures of a rollout: measured, accepted and largest value, and what is wrong in words.
+_Figure = dict[str, Any]
+"""A figure of a rollout: measured, accepted and largest value, and what is wrong in words.
 
-    `measured` is None where the episode failed or does not have the figure.
-    """
-    (episode,) = evaluation.episodes
-    name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"
-    found = []
+`measured` is None where the episode failed or does not have the figure.
+"""
+
+
+def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
+    (episode,) = found.episodes
+    motion = found.condition.reference_name
     for metric, accepted in case.figures.items():
         measured = None if episode["termination"] else episode.get(metric)
         if measured is not None and np.isnan(measured):
             measured = None
         bound = None if accepted is None else accepted + margin * abs(accepted)
-        found.append(
-            {
-                "case": name,
-                "metric": metric,
-                "measured": measured,
-                "accepted": accepted,
-                "bound": bound,
-                "problem": _problem(metric, measured, bound, episode),
-            }
-        )
-    return found
+        yield {
+            "case": f"{case.env}, {motion}, {case.scenario}, {case.policy}",
+            "metric": metric,
+            "measured": measured,
+            "accepted": accepted,
+            "bound": bound,
+            "problem": _problem(metric, measured, bound, episode),
+        }
 
 
-def _problem(
-    metric: str, measured: float | None, bound: float | None, episode: dict[str, Any]
-) -> str:
+def _problem(metric: str, measured: Any, bound: Any, episode: dict[str, Any]) -> str:
     if episode["termination"]:
         return f"{metric} has no value: the episode ended as {episode['termination']!r}"
     if metric not in episode:
-        known = ", ".join(name for name in episode if name.endswith(("_m", "_rad", "_s", "_nm")))
+        units = ("_m", "_rad", "_s", "_nm")
+        known = ", ".join(name for name in episode if name.endswith(units))
         return f"{metric} is no metric of this episode; those are {known}"
     if measured is None:
         return f"{metric} of this episode is not a number"
@@ -197,12 +191,13 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> None:
     """Write measured figures in the place of accepted ones; what stands around them stays."""
     text = path.read_text(encoding="utf-8")
     cases = _child(yaml.compose(text), "cases").value
-    changes = [
-        (value.start_mark.index, value.end_mark.index, f"{evaluation.episodes[0][key.value]:.4g}")
-        for case, evaluation in zip(cases, evaluations, strict=True)
-        for key, value in _child(case, "figures").value
-        if key.value in evaluation.episodes[0] and not evaluation.episodes[0]["termination"]
-    ]
+    changes = []
+    for case, evaluation in zip(cases, evaluations, strict=True):
+        (episode,) = evaluation.episodes
+        for key, value in _child(case, "figures").value:
+            if key.value in episode and not episode["termination"]:
+                place = (value.start_mark.index, value.end_mark.index)
+                changes.append((*place, f"{episode[key.value]:.4g}"))
     for begin, end, value in sorted(changes, reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text)  # the user named it, maybe by a link
@@ -212,21 +207,17 @@ def _child(node: Any, name: str) -> Any:
     return next(value for key, value in node.value if key.value == name)
 
 
-def _cells(figure: dict[str, Any]) -> list[str]:
+def _cells(figure: _Figure) -> list[str]:
     """A figure in tables."""
-    numbers = [figure["measured"], figure["accepted"], figure["bound"]]
-    verdict = "falls short" if figure["problem"] else "kept"
+    case, metric, *numbers, problem = figure.values()
+    verdict = "falls short" if problem else "kept"
     if figure["bound"] is None and figure["measured"] is not None:
         verdict = "new"
-    return [
-        figure["case"],
-        figure["metric"],
-        *("-" if number is None else f"{number:.4g}" for number in numbers),
-        verdict,
-    ]
+    texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
+    return [case, metric, *texts, verdict]
 
 
-def _table(figures: list[dict[str, Any]]) -> Table:
+def _table(figures: list[_Figure]) -> Table:
     rows = []
     last = ""
     for case, metric, measured, _, bound, verdict in map(_cells, figures):
@@ -235,12 +226,13 @@ def _table(figures: list[dict[str, Any]]) -> Table:
         rows.append((f"  {metric}", measured, bound, verdict))
         last = case
     head = ["rollout and figure", "measured", "at most", ""]
-    table = make_table("short rollouts against what was accepted", head, rows, box=box.SIMPLE)
+    title = "short rollouts against what was accepted"
+    table = make_table(title, head, rows, box=box.SIMPLE)
     table.columns[-1].justify = "left"
     return table
 
 
-def _markdown(figures: list[dict[str, Any]]) -> str:
+def _markdown(figures: list[_Figure]) -> str:
     head = ("rollout", "figure", "measured", "accepted", "at most", "")
     rules = ["---", "---", "---:", "---:", "---:", "---"]
     return f"## elastic bench\n\n{markdown_table(head, rules, map(_cells, figures))}\n"

@@ -82,8 +82,9 @@ def _ended_by(*numbers: int) -> Iterator[None]:
             raise EndedError(number)
 
     handled = {}
+    is_main = threading.current_thread() is threading.main_thread()
     try:
-        for number in numbers if threading.current_thread() is threading.main_thread() else ():
+        for number in numbers if is_main else ():
             before = signal.getsignal(number)
             if before in (signal.SIG_DFL, signal.default_int_handler):
                 handled[number] = before
@@ -117,7 +118,8 @@ def _parse(arguments: list[str]) -> Any:
     from train.commands.options import name_options
 
     name = arguments[0]
-    options = getattr(importlib.import_module(f"train.commands.{name}"), name.capitalize())
+    module = importlib.import_module(f"train.commands.{name}")
+    options = getattr(module, name.capitalize())
 
     def command(given: Any) -> Any:
         return given
@@ -127,7 +129,8 @@ def _parse(arguments: list[str]) -> Any:
     # box of tyro's
     command.__annotations__["given"] = Annotated[options, tyro.conf.arg(name="")]
     with name_options():
-        return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
+        program = f"elastic {name}"
+        return tyro.cli(command, prog=program, args=arguments[1:], config=_STYLE)
 
 
 _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
@@ -137,21 +140,27 @@ def _parse_overview(arguments: list[str]) -> Any:
     """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
     members: Any = []
     for name in COMMANDS:
-        kind = dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)})
+        described = {"__doc__": _help_of(name)}
+        kind = dataclasses.make_dataclass(name, [], namespace=described)
         members.append(Annotated[kind, tyro.conf.subcommand(name)])
-    description = (
-        "Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help`"
-        " explains each, `elastic --version` says which version this is."
-    )
     union = functools.reduce(operator.or_, members)
-    return tyro.cli(union, prog="elastic", args=arguments, config=_STYLE, description=description)
+    cli = functools.partial(tyro.cli, description=_OVERVIEW, config=_STYLE)
+    return cli(union, prog="elastic", args=arguments)
+
+
+_OVERVIEW = (
+    "Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help`"
+    " explains each, `elastic --version` says which version this is."
+)
 
 
 def _help_of(name: str) -> str | None:
     """The docstring of a command, from its source."""
-    source = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
-    classes = (node for node in source.body if isinstance(node, ast.ClassDef))
-    return next(ast.get_docstring(node) for node in classes if node.name == name.capitalize())
+    source = Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef) and node.name == name.capitalize():
+            return ast.get_docstring(node)
+    raise AssertionError
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -182,6 +191,7 @@ def run_program(work: Callable[[], None]) -> None:
             sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
-            name = signal.Signals(number).name
-            _print_last("interrupted" if number == signal.SIGINT else f"ended by {name}", error)
-            os._exit(128 + number)  # worker processes must not keep the terminal waiting
+            said = f"ended by {signal.Signals(number).name}"
+            _print_last("interrupted" if number == signal.SIGINT else said, error)
+            # worker processes must not keep the terminal waiting
+            os._exit(128 + number)

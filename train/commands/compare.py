@@ -12,7 +12,15 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from baselines.policies import is_saved
-from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, load_yaml, quantity
+from elastic_env.core.config import (
+    LARGEST_SEED,
+    MOST_ENTRIES,
+    Entries,
+    Model,
+    Title,
+    load_yaml,
+    quantity,
+)
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
@@ -44,7 +52,7 @@ from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
-from train.runs.user_code import TRUST, load_without_code
+from train.runs.user_code import CodeNamingModel, recorded_config
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -60,21 +68,25 @@ class Sweep(Model):
     label: Title | None = None
     """Label of the axis; None for the option's name."""
 
+    @property
+    def title(self) -> str:
+        """Label, or name of the option."""
+        return self.label or self.option
 
-class CompareConfig(Model):
+
+_USUAL_POLICIES = [PolicySpec(name=name) for name in ("uncompensated", "input")]
+
+
+class CompareConfig(CodeNamingModel):
     """A comparison, as read from `configs/*.yaml`."""
 
     name: str = Field(pattern=r"^[\w.-]*\w$", max_length=100)
     """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
-    references: list[GivenReference] = Field(min_length=1, max_length=MOST_ENTRIES)
+    references: Entries[GivenReference]
     """Motions, see `Condition.reference`; default the environment's."""
-    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
-    policies: list[PolicySpec] = Field(
-        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")],
-        min_length=1,
-        max_length=MOST_ENTRIES,
-    )
+    scenarios: Entries[Title] = ["nominal"]
+    policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
     """Episodes per cell."""
@@ -114,10 +126,12 @@ class CompareConfig(Model):
         if not isinstance(name, str):
             return values
         known = environment(name)
-        references = _motions_of_map(values.get("map"), known) or [known.default_reference]
-        return {"references": references, **values}
+        default = [known.default_reference]
+        motions = _motions_of_map(values.get("map"), known)
+        return {"references": motions or default, **values}
 
-    _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
+    # the last one runs first
+    _kind = model_validator(mode="before")(is_a("comparison"))
 
     @field_validator("policies", mode="before")
     @classmethod
@@ -132,6 +146,12 @@ class CompareConfig(Model):
             raise ConfigurationError(problem)
         return self
 
+    @property
+    def names_of_code(self) -> list[str]:
+        """Names that may stand for code."""
+        names = [policy.name for policy in self.policies]
+        return [self.env, *(name for name in names if not is_saved(name))]
+
     def _problems(self) -> Iterator[str]:
         """Yield what is wrong with single parts, or between them."""
         titles = [policy.title for policy in self.policies]
@@ -142,33 +162,34 @@ class CompareConfig(Model):
             yield "a sweep needs a policy that it varies; level: true leaves all of them out of it"
         require_drawn(self.scenarios, self.ranges)
         require_known("policy of the figures", self.figure_policies, titles)
-        require_known("scenario with episodes of its own", self.scenario_episodes, self.scenarios)
-        require_known("reference with scenarios of its own", self.reference_scenarios, references)
-        once: dict[str, list[Any]] = {
-            "reference": references,
-            "scenario": self.scenarios,
-            "value of the sweep": self.sweep.values if self.sweep else [],
-        }
-        for name, scenarios in self.reference_scenarios.items():
+        known = self.scenarios
+        own = self.reference_scenarios
+        episodes = self.scenario_episodes
+        require_known("scenario with episodes of its own", episodes, known)
+        require_known("reference with scenarios of its own", own, references)
+        once: dict[str, list[Any]] = {"reference": references, "scenario": known}
+        once["value of the sweep"] = self.sweep.values if self.sweep else []
+        for name, scenarios in own.items():
             once[f"scenario of {name!r}"] = scenarios
-            require_known(f"scenario of {name!r}", scenarios, self.scenarios)
+            require_known(f"scenario of {name!r}", scenarios, known)
             if not scenarios:
                 yield f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
         for what, values in once.items():
             for value in _repeated(values):
                 yield f"the {what} {quote(value)} stands twice; its episodes would count double"
-        for name, episodes in self.scenario_episodes.items():
-            if not 1 <= episodes <= MOST_EPISODES:
+        for name, count in episodes.items():
+            if not 1 <= count <= MOST_EPISODES:
                 bounds = f">= 1 and <= {MOST_EPISODES}"
-                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(episodes)}"
+                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"
         for name, scenarios in self.groups.items():
-            require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
-            if name in self.scenarios or not scenarios or _repeated(scenarios):
+            require_known(f"scenario of the group {name!r}", scenarios, known)
+            if name in known or not scenarios or _repeated(scenarios):
                 yield (
                     f"group {name!r} must have a name that no scenario has, and scenarios, each"
                     f" once; got {quote(scenarios)}"
                 )
-        if self.leaderboard and (self.sweep or self.map or environment(self.env).is_real):
+        is_real = environment(self.env).is_real
+        if self.leaderboard and (self.sweep or self.map or is_real):
             yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"
 
     def _problems_of_map(self) -> Iterator[str]:
@@ -205,6 +226,7 @@ class CompareConfig(Model):
                 f" references x {len(self.scenarios)} scenarios x {len(entrants)} policies x"
                 f" {swept} values are {cells}; split it"
             )
+        motions = zip(self.references, self._reference_labels(), played, strict=True)
         return [
             Condition(
                 env=self.env,
@@ -219,9 +241,7 @@ class CompareConfig(Model):
                 episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
-            for reference, label, scenarios in zip(
-                self.references, self._reference_labels(), played, strict=True
-            )
+            for reference, label, scenarios in motions
             for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
@@ -244,12 +264,12 @@ class CompareConfig(Model):
         """Names that tell references of one kind apart; None where the kind is enough."""
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
-        return [
-            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)]))
-            if kinds.count(kind) > 1
-            else None
-            for kind, reference in zip(kinds, self.references, strict=True)
-        ]
+
+        def label(kind: str, reference: Reference) -> str | None:
+            words = dict.fromkeys([*kind.split(), *_parameters(reference, known)])
+            return " ".join(words) if kinds.count(kind) > 1 else None
+
+        return list(map(label, kinds, self.references))
 
 
 @dataclass(frozen=True)
@@ -293,17 +313,18 @@ def compare(
         require_libraries()
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
-    with _folder(config, output, resumes) as folder:
+    with _open_run(config, output, resumes) as folder:
         store = Store(folder / CELLS) if report else None
         with _finished_kept(folder, console):
             evaluations = run_conditions(conditions, console, executors, store, fresh)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
         cells = merge_seeds(evaluations)
         robots = robot_scores(evaluations)
-        axis = None if config.sweep is None else config.sweep.label or config.sweep.option
+        axis = config.sweep and config.sweep.title
         maps = [] if config.map is None else heat_maps(evaluations, config.map)
         rows = changes(evaluations, config.groups) if report else []
-        if config.leaderboard or maps:  # which find the best policy of each column or cell
+        # these find the best policy of each column or cell
+        if config.leaderboard or maps:
             rows = [row for row in rows if not row.is_rival]
         board = []
         if config.leaderboard:
@@ -321,9 +342,8 @@ def compare(
         if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
         if report:
-            files += write_report(
-                Results(config.name, evaluations, rows, folder, axis, maps, board, robots)
-            )
+            parts = (rows, folder, axis, maps, board, robots)
+            files += write_report(Results(config.name, evaluations, *parts))
     print_summary(cells, console)
     print_robots(robots, console)
     print_changes(rows, console)
@@ -332,39 +352,17 @@ def compare(
     return Comparison(folder, evaluations, files)
 
 
-def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
-    """The configuration of a run that is gone on with.
-
-    Args:
-        folder: Of the run.
-        trust_code: Whether code of one's own that it names may run: it may lie in the folder.
-
-    Raises:
-        ConfigurationError: The folder is no comparison, or names code that is not trusted.
-    """
-    file = require_run(folder, "run", "compare wrote")
-    if trust_code:
-        return load_yaml(file, CompareConfig)
-    return load_without_code(file, CompareConfig, _names_of_code, TRUST)
-
-
-def _names_of_code(config: CompareConfig) -> list[str]:
-    """Names that may stand for code."""
-    policies = [policy.name for policy in config.policies if not is_saved(policy.name)]
-    return [config.env, *policies]
-
-
 @contextmanager
-def _folder(config: CompareConfig, output: Path | None, resumes: bool) -> Iterator[Path]:
+def _open_run(config: CompareConfig, output: Path | None, resumes: bool) -> Iterator[Path]:
     """The folder of a run, new or gone on with, for this program alone."""
-    content = config.model_dump(mode="json")
+    recorded = (config.model_dump(mode="json"), config.seed)
     if not resumes or output is None:
-        with run_folder(config.name, content, config.seed, output) as folder, lock_run(folder):
-            yield folder
+        with run_folder(config.name, *recorded, output) as new, lock_run(new):
+            yield new
         return
-    require_run(output, "run", "compare wrote")
+    require_run(output)
     with lock_run(output):
-        describe(output, content, config.seed)
+        describe(output, *recorded)
         yield output
 
 
@@ -377,12 +375,13 @@ def _finished_kept(folder: Path, console: Console) -> Iterator[None]:
         if error.finished:
             write_summary(merge_seeds(error.finished), folder / "summary.md")
             kept = write_episodes(error.finished, folder / "episodes.csv")
-            console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md")
+            number = len(error.finished)
+            console.print(f"the other {number} cells are in {kept} and summary.md")
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
         if any((folder / CELLS).glob("*.npz")):
-            go_on = f"go on with: elastic compare --resume {folder}"
-            error.add_note(f"finished cells are kept; {go_on}")
+            cure = f"go on with: elastic compare --resume {folder}"
+            error.add_note(f"finished cells are kept; {cure}")
         raise
 
 
@@ -403,8 +402,8 @@ def try_out(conditions: Sequence[Condition]) -> None:
             raise ConfigurationError(f"{error}; {cure}") from None
         if not hasattr(policy, "predict"):
             name = condition.policy.name
-            got = type(policy).__name__
-            raise ConfigurationError(f"policy {name!r} has no method predict(), got {got}")
+            got = f"no method predict(), got {type(policy).__name__}"
+            raise ConfigurationError(f"policy {name!r} has {got}")
 
 
 def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
@@ -414,10 +413,8 @@ def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
     """
     seen = set[str]()
     for condition in conditions:
-        own = {
-            repr((condition.env, condition.arguments)),
-            repr((condition.policy, condition.swept, condition.reference)),
-        }
+        played = (condition.policy, condition.swept, condition.reference)
+        own = {repr((condition.env, condition.arguments)), repr(played)}
         if not own <= seen:
             seen |= own
             yield condition
@@ -433,8 +430,9 @@ def _motions_of_map(axes: Any, known: Environment) -> list[Any]:
 
 
 def _parameters(reference: Reference, known: Environment) -> list[str]:
-    given = reference.items() if isinstance(reference, dict) else []
-    return [f"{name}={value}" for name, value in given if name not in ("kind", known.motion)]
+    given = reference if isinstance(reference, dict) else {}
+    others = [name for name in given if name not in ("kind", known.motion)]
+    return [f"{name}={given[name]}" for name in others]
 
 
 class Compare(Model):
@@ -485,21 +483,23 @@ class Compare(Model):
     def run(self, console: Console) -> None:
         """Compare."""
         if self.resume is not None and self.output is not None:
-            raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
+            problem = "a run goes on in its own folder: --resume takes no --output"
+            raise ConfigurationError(problem)
         if self.resume is None and self.fresh:
-            raise ConfigurationError("--fresh needs --resume; a new run plays all of its cells")
+            problem = "--fresh needs --resume; a new run plays all of its cells"
+            raise ConfigurationError(problem)
         if self.config is not None:
             config = load_yaml(self.config, CompareConfig)
         elif self.resume is not None:
-            config = recorded_config(self.resume, self.trust_code)
+            config = recorded_config(self.resume, CompareConfig, self.trust_code)
         else:
-            raise ConfigurationError(
-                "name a configuration or, with --resume, the run to go on with"
-            )
+            problem = "name a configuration or, with --resume, the run to go on with"
+            raise ConfigurationError(problem)
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}
-            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
+            simulated = {"scenario_episodes": {}, "groups": {}}
+            config = config.replace(scenarios=["hardware"], **simulated, **real)
         executors = Executors(self.on, self.jobs)
         output = self.resume or self.output
         is_resumed = self.resume is not None

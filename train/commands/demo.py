@@ -1,23 +1,22 @@
 """`elastic demo`: the paper's experiments (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
+from baselines.identification.identify import Identification, identify_points
 from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.rollout import make_vector_env
-from train.figures import plots
-from train.figures.comparison_figures import cells_together, draw_picture, draw_signals
-from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
+from train.figures import comparison_figures, plots, testbed_plots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
@@ -53,7 +52,8 @@ _WALK = CompareConfig(
     references=[3],
     policies=_policies("uncompensated", "input_output", "input_wrench"),
 )
-_SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its base alone
+# where the model is right, a residual leaves its base alone
+_SOFT_WALK = CompareConfig(
     name="demo",
     env="walker",
     references=[3],
@@ -74,10 +74,10 @@ class Demo(Model):
     def run(self, console: Console) -> None:
         """Run, print the tables beside the paper's figures, and say where the pictures are."""
         plots.require_matplotlib()
-        walking = [*_SLOW_WALK.conditions(), *_WALK.conditions(), *_SOFT_WALK.conditions()]
-        parts = [_STATIC.conditions(), _MOTION.conditions(), walking]
-        conditions = [condition for part in parts for condition in part]
-        recorded = {"conditions": [condition.model_dump(mode="json") for condition in conditions]}
+        shown = (_STATIC, _MOTION, _SLOW_WALK, _WALK, _SOFT_WALK)
+        parts = [config.conditions() for config in shown]
+        conditions = list(chain(*parts))
+        recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
             console.print(
                 "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic"
@@ -85,21 +85,25 @@ class Demo(Model):
                 " them; at the end with joints that are softer than assumed (scenario soft)"
             )
             evaluations = iter(run_conditions(conditions, console))
-            static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
+            played = [list(islice(evaluations, len(part))) for part in parts]
+            static, motion, *walked = played
+            walks = list(chain(*walked))
             scored = [*motion, *walks]
             model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
             points = static[0].points
             assert points is not None
-            result = identification.identify_points(points, [make_gravity(model)])
+            result = identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
             known = static[0].condition.environment
+            fig5 = folder / "fig5_identification.png"
+            fig6 = folder / "fig6_static_errors.png"
             files = [
-                draw_identification(result, points, [model], folder / "fig5_identification.png"),
-                draw_static_errors(static, model, folder / "fig6_static_errors.png"),
-                draw_picture("time", known.curves, motion, folder / "sine.png"),
+                testbed_plots.draw_identification(result, points, [model], fig5),
+                testbed_plots.draw_static_errors(static, model, fig6),
+                comparison_figures.draw_picture("time", known.curves, motion, folder / "sine.png"),
             ]
-            for walk in cells_together(walks):
-                files += draw_signals(walk, folder)
+            for walk in comparison_figures.cells_together(walks):
+                files += comparison_figures.draw_signals(walk, folder)
             files += [
                 folder / "identification.json",
                 write_episodes(scored, folder / "episodes.csv"),
@@ -115,18 +119,21 @@ class Demo(Model):
 _HEAD = ("quantity", "here", "paper")
 
 
-def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
+def _testbed_table(result: Identification, static: Sequence[Evaluation]) -> Table:
+    stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+    line = f"{result.line_stiffness_nm_per_rad:.1f}"
     rows = [
         ("true stiffness of the plant [N·m/rad]", "1001", "-"),
-        ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
+        ("identified stiffness [N·m/rad]", stiffness, "1001"),
         ("  95 % interval", interval, "-"),
-        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
+        ("  plain line", line, "1001"),
         ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
         ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
     ]
-    for evaluation, paper in zip(static, ("-56.2 to +41.7", "-3.7 to +7.1"), strict=True):
-        error = 1e3 * static_errors(evaluation)
+    ranges = ("-56.2 to +41.7", "-3.7 to +7.1")
+    for evaluation, paper in zip(static, ranges, strict=True):
+        error = 1e3 * testbed_plots.static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
     return make_table("the paper's testbed experiments, Figs. 5 and 6", _HEAD, rows)
@@ -147,4 +154,5 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
         name = f"{walked}, {condition.policy.title} [mrad]"
         rows.append((name, " and ".join(peaks) or "fell", paper))
-    return make_table("the paper's walks, Figs. 7 and 8: largest roll and pitch", _HEAD, rows)
+    title = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
+    return make_table(title, _HEAD, rows)

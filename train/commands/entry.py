@@ -7,8 +7,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from train.runs import failures
 from train.runs.escaping import visible
-from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explain, is_interrupt, is_unread
 from train.runs.import_path import ShadowedError, leave, safe_children
 
 _UNREAD = 128 + signal.SIGPIPE
@@ -41,13 +41,14 @@ def start(run: Callable[[], None]) -> None:
             sys.stdout.flush()
     except ShadowedError as error:
         sys.stderr.write(f"error: {error}\n")
-        sys.exit(WRONG_INPUT)
+        sys.exit(failures.WRONG_INPUT)
     except SystemExit as error:
-        if is_unread(error):  # the console of rich ends the program with 1 by itself
+        # the console of rich ends the program with 1 by itself
+        if failures.is_unread(error):
             _end_without_output(BrokenPipeError())
         raise
     except (KeyboardInterrupt, ImportError) as error:
-        if not is_interrupt(error):
+        if not failures.is_interrupt(error):
             raise
         sys.stderr.write("interrupted\n")
         os._exit(130)
@@ -72,14 +73,15 @@ def _have_streams() -> None:
     """Open standard streams where the program began without them: libraries ask what they are."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r"))
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(nowhere, "w" if number else "r"))
 
 
 def _end_without_output(error: OSError) -> None:
     """End where nobody reads, or where the disk is full, which is said if it can be."""
     is_closed = isinstance(error, BrokenPipeError)
     if not is_closed:
-        said, _ = explain(error) or (str(error), SYSTEM_FAILED)
+        said, _ = failures.explain(error) or (str(error), failures.SYSTEM_FAILED)
         with contextlib.suppress(OSError):
             sys.stderr.write(visible(f"error: {said}\n"))
             sys.stderr.flush()
@@ -87,7 +89,7 @@ def _end_without_output(error: OSError) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nowhere, stream)
-    sys.exit(_UNREAD if is_closed else SYSTEM_FAILED)
+    sys.exit(_UNREAD if is_closed else failures.SYSTEM_FAILED)
 
 
 if __name__ == "__main__":

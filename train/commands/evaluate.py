@@ -6,13 +6,7 @@ from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
 from train.commands.compare import CompareConfig, compare
-from train.commands.options import (
-    MotionOrDefault,
-    OnHardware,
-    Stiffness,
-    name_options,
-    reference_of,
-)
+from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
 from train.evaluate.conditions import MOST_EPISODES, PolicySpec
 from train.runs.console import print_files
 
@@ -61,14 +55,15 @@ class Evaluate(Model):
     def run(self, console: Console) -> None:
         """Play a comparison of one cell."""
         options = {} if self.stiffness is None else {"stiffness": self.stiffness}
+        motion = {} if self.reference is None else {"references": [self.reference]}
         with name_options():
             config = CompareConfig(
                 name="evaluate",
-                references=[reference_of(self.env, self.reference)],
                 scenarios=[self.on.scenario(self.scenario)],
                 policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes,
                 seed=self.seed,
+                **motion,
                 **self.on.environment(self.env),
             )
         finished = compare(config, console, self.output, report=False)

@@ -5,13 +5,14 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any
 
 import gymnasium
 import tyro
 from rich.console import Console
+from rich.markup import escape
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, quantity
@@ -26,10 +27,9 @@ from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
-from train.commands.options import MotionOrDefault, OnHardware, reference_of
-from train.evaluate.conditions import PolicySpec
-from train.evaluate.environments import environment
-from train.evaluate.rollout import control_steps, make_policy
+from train.commands.options import MotionOrDefault, OnHardware
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.rollout import ControlStep, control_steps, make_policy
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 
@@ -55,9 +55,10 @@ class Scan(Model):
         for rate in RATES if self.baudrate is None else (self.baudrate,):
             with DynamixelBus(self.port, rate) as bus:
                 for servo in bus.scan():
-                    model = servo_models().get(servo.model_number)
+                    number = servo.model_number
+                    model = servo_models().get(number)
                     name = model.name if model is not None else "not known here"
-                    cells = (rate, servo.servo_id, servo.model_number, name, servo.firmware)
+                    cells = (rate, servo.servo_id, number, name, servo.firmware)
                     rows.append([str(cell) for cell in cells])
         if not rows:
             console.print(
@@ -100,10 +101,11 @@ class Check(Model):
             names = ("roll", "pitch", "yaw")
             angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in names)
             checks.append(BusCheck("IMU", f"{angles} rad"))
-        rows = [(one.what, one.value, "fine" if one.is_good else one.cure) for one in checks]
-        table = make_table(f"check of {self.port}", ["", "", "what to do"], rows, left=3)
-        for row, one in zip(table.rows, checks, strict=True):
-            row.style = "" if one.is_good else "bold yellow"
+        table = make_table(f"check of {self.port}", ["", "", "what to do"], [], left=3)
+        for one in checks:
+            cells = (one.what, one.value, "fine" if one.is_good else one.cure)
+            style = "" if one.is_good else "bold yellow"
+            table.add_row(*map(escape, cells), style=style)
         console.print(table)
         if not all(one.is_good for one in checks):
             sys.exit(3)
@@ -130,24 +132,23 @@ class Run(Model):
     def run(self, console: Console) -> None:
         """Play one episode and show it; log.csv keeps every step, also of one that is cut short."""
         if not (arguments := self.on.arguments):
-            raise ConfigurationError(
-                "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
-            )
-        reference = reference_of("hardware", self.reference)
+            problem = "--port is needed; see: elastic hardware scan PORT, elastic hardware emulate"
+            raise ConfigurationError(problem)
         spec = PolicySpec(name=self.policy)
-        name = environment("hardware").id
-        env: Any = gymnasium.make(name, disable_env_checker=True, reference=reference, **arguments)
-        recorded = {"policy": spec.model_dump(mode="json"), "reference": reference, **arguments}
+        played = Condition(env="hardware", policy=spec, reference=self.reference)
+        arguments = {"reference": played.reference, **arguments}
+        name = played.environment.id
+        env: Any = gymnasium.make(name, disable_env_checker=True, **arguments)
+        recorded = {"policy": spec.model_dump(mode="json"), **arguments}
         with contextlib.closing(env):
             policy = make_policy(spec, env)
             with run_folder("hardware", recorded, None, self.output) as folder:
-                metrics: dict[str, Any] = {}
-                with _open_log(folder / "log.csv", console) as log:
-                    for step in control_steps(env, policy, None):
-                        log.write(step.info)
-                        metrics = step.info.get("episode_metrics", metrics)
-                (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml")
+                steps = control_steps(env, policy, None)
+                metrics = _keep_log(steps, folder / "log.csv", console)
+                text = json.dumps(metrics, indent=2)
+                (folder / "metrics.json").write_text(f"{text}\n")
+        files = "log.csv (every step), metrics.json, config.yaml"
+        console.print(f"Results in {folder}: {files}")
 
 
 _SHOWN = (
@@ -163,46 +164,37 @@ _SHOWN = (
 """Columns on the console: title, unit, signal, factor and format."""
 
 
-class _Log:
-    """The rows of log.csv, and once a second a line on the console and all rows on the disk."""
-
-    def __init__(self, file: TextIO, console: Console) -> None:
-        self.num_rows = 0
-        self._file = file
-        self._console = console
-        self._writer: csv.DictWriter[str] | None = None
-        self._next_s = _SHOWN_S
-
-    def write(self, info: dict[str, Any]) -> None:
-        row = {key: value for key, value in info.items() if not isinstance(value, dict)}
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(row))
-            self._writer.writeheader()
-            for heading in (0, 1):
-                cells = [f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in _SHOWN]
-                self._console.print("".join(cells))
-        self._writer.writerow(row)
-        self.num_rows += 1
-        if row["time_s"] >= self._next_s:
-            self._next_s += _SHOWN_S
-            self._file.flush()
-            cells = [format(row[key] * factor, form) for _, _, key, factor, form in _SHOWN]
-            self._console.print("".join(cells))
-
-
-@contextlib.contextmanager
-def _open_log(path: Path, console: Console) -> Iterator[_Log]:
-    """A log that stays whatever ends the episode."""
+def _keep_log(steps: Iterable[ControlStep], path: Path, console: Console) -> dict[str, Any]:
+    """Write every step, whatever ends the episode, and show a line once a second; the metrics."""
+    metrics: dict[str, Any] = {}
+    rows = 0
+    next_s = _SHOWN_S
     with path.open("w", newline="") as file:
-        log = _Log(file, console)
+        log: Any = None
         try:
-            yield log
+            for step in steps:
+                row = {k: v for k, v in step.info.items() if not isinstance(v, dict)}
+                if not rows:
+                    log = csv.DictWriter(file, list(row))
+                    log.writeheader()
+                    widths = [len(format(0, form)) for *_, form in _SHOWN]
+                    for titles in list(zip(*_SHOWN, strict=True))[:2]:
+                        console.print("".join(map(str.rjust, titles, widths)))
+                log.writerow(row)
+                rows += 1
+                metrics = step.info.get("episode_metrics", metrics)
+                if row["time_s"] >= next_s:
+                    next_s += _SHOWN_S
+                    file.flush()
+                    shown = [format(row[key] * by, form) for *_, key, by, form in _SHOWN]
+                    console.print("".join(shown))
         except BaseException:
-            if log.num_rows:
-                console.print(f"cut short; the {log.num_rows} steps until then are in {path}")
+            if rows:
+                console.print(f"cut short; the {rows} steps until then are in {path}")
             else:
                 path.unlink()
             raise
+    return metrics
 
 
 class Emulate(Model):
@@ -246,9 +238,10 @@ class Emulate(Model):
 
     def run(self, console: Console) -> None:
         """Emulate until Ctrl-C."""
-        switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
+        known = Faults.model_fields
+        switches = [name for name in known if known[name].annotation is bool]
         require_known("fault", self.fault, switches)
-        shares = self.model_dump(include={"unheard", "lost", "late", "corrupted", "truncated"})
+        shares = self.model_dump(include=set(known))
         config = EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
@@ -257,7 +250,8 @@ class Emulate(Model):
             seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )
-        with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
+        ends = contextlib.suppress(KeyboardInterrupt)
+        with RunningEmulator(config) as emulator, ends:
             console.print(f"servos {', '.join(map(str, self.ids))} at {emulator.port}")
             console.print(f"IMU at {emulator.imu_port}")
             console.print(

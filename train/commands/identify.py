@@ -68,9 +68,8 @@ class Identify(Model):
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
         if self.second_mass == 1.0:
-            raise ValueError(
-                "second_mass must differ from 1: two equal masses do not separate anything"
-            )
+            problem = "second_mass must differ from 1: two equal masses do not separate anything"
+            raise ValueError(problem)
         return self
 
     def run(
@@ -93,9 +92,8 @@ class Identify(Model):
         if others:
             options = [option_name((name,)) for name in others if name != "on"]
             names = ", ".join([*options, *["--port and the like"] * ("on" in others)])
-            raise ConfigurationError(
-                f"options of the testbed: {names}; leave them out beside --robot and --log"
-            )
+            problem = f"options of the testbed: {names}; leave them out beside --robot and --log"
+            raise ConfigurationError(problem)
         return run_arm_identification(self.arm, console, **given)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
@@ -105,11 +103,8 @@ class Identify(Model):
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        recorded = {
-            **self.model_dump(mode="json", exclude={"output", "on", "arm"}),
-            "scenario": scenario,
-            "hardware": hardware,
-        }
+        recorded = self.model_dump(mode="json", exclude={"output", "on", "arm"})
+        recorded |= {"scenario": scenario, "hardware": hardware}
         with run_folder("identify", recorded, self.seed, self.output) as folder:
             try:
                 with _progress(hardware, console) as progress:
@@ -117,19 +112,15 @@ class Identify(Model):
             finally:
                 for env in envs:
                     env.close()
-            results[0].save(folder / "identification.json")
+            files = [folder / "identification.json", folder / "identification.png"]
+            results[0].save(files[0])
             models = [env.unwrapped.assumed_model for env in envs]
-            files = [
-                folder / "identification.json",
-                draw_identification(results[0], points[0], models, folder / "identification.png"),
-            ]
+            draw_identification(results[0], points[0], models, files[1])
             console.print(result_table(results[0]))
             if self.repeats > 1:
                 seeds = range(self.seed, self.seed + self.repeats)
-                rows = [
-                    {"seed": seed, **result.model_dump()}
-                    for seed, result in zip(seeds, results, strict=True)
-                ]
+                found = zip(seeds, results, strict=True)
+                rows = [{"seed": seed, **own.model_dump()} for seed, own in found]
                 files.append(write_records(rows, folder / "repeats.csv"))
                 truth = float(envs[0].unwrapped.truth().model.stiffness[0])
                 console.print(_spread(pd.DataFrame(rows), results, truth))
@@ -140,17 +131,14 @@ class Identify(Model):
     def _require_real_joint(self, hardware: Mapping[str, Any]) -> None:
         """Refuse options that do not go with a real joint."""
         if hardware.get("imu_port") is None:
-            raise ConfigurationError(
-                "an identification on hardware needs the link's angle: name the IMU with --imu-port"
-            )
+            needed = "an identification on hardware needs the link's angle"
+            raise ConfigurationError(f"{needed}: name the IMU with --imu-port")
         if self.stiffness is not None or self.repeats > 1:
-            raise ConfigurationError(
-                "stiffness and repeats are of a simulated joint; leave them out on hardware"
-            )
+            problem = "stiffness and repeats are of a simulated joint; leave them out on hardware"
+            raise ConfigurationError(problem)
         if self.second_mass is not None and not hardware.get("confirm", True):
-            raise ConfigurationError(
-                "somebody must change the mass between the runs: a second_mass excludes --yes"
-            )
+            problem = "somebody must change the mass between the runs: a second_mass excludes --yes"
+            raise ConfigurationError(problem)
 
 
 @contextmanager
@@ -205,12 +193,8 @@ def identified_environments(options: Identify) -> list[Any]:
             "stiffness": options.stiffness,
         }
     arguments["reference"] = {"kind": "hold", "positions": options.positions}
-    return [
-        gymnasium.make_vec(
-            name, vectorization_mode="vector_entry_point", pendulum=pendulum, **arguments
-        )
-        for pendulum in pendulums
-    ]
+    arguments["vectorization_mode"] = "vector_entry_point"
+    return [gymnasium.make_vec(name, pendulum=own, **arguments) for own in pendulums]
 
 
 def _spread(table: pd.DataFrame, results: Sequence[Identification], truth: float) -> str:

@@ -143,9 +143,8 @@ def run_arm_identification(
         ResultsExistError: The output folder holds results.
     """
     if options.robot is None:
-        raise ConfigurationError(
-            "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
-        )
+        problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
+        raise ConfigurationError(problem)
     if options.log is None and (not options.plan or options.measured_by is None):
         raise ConfigurationError(
             "give the CSV file of static poses by --log, or plan the first poses by --plan 40"
@@ -186,7 +185,8 @@ def run_arm_identification(
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
     console.print(result_table(result))
-    for line in (summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)):
+    written = [f"wrote {path}" for path in files]
+    for line in (summed_up(fit), *remarks(result), *written):
         console.print(line)
     return result
 
@@ -280,16 +280,19 @@ def _candidates(setting: _Setting, console: Console) -> PoseLog:
             "the model has no shapes that MuJoCo can read: check the proposed poses for contacts"
             " yourself"
         )
-    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(setting.seed))
+    generator = np.random.default_rng(setting.seed)
+    return candidate_poses(setting.arm, shapes, setting.log, generator)
 
 
 def shaped_model(path: str) -> mujoco.MjModel:
     """The model with its collision shapes, or without them where MuJoCo cannot read them."""
     plain = compiled_model(path)
+
+    def read() -> mujoco.MjModel:
+        return mujoco.MjSpec.from_file(path).compile()
+
     try:
-        shaped = from_mujoco(
-            lambda: mujoco.MjSpec.from_file(path).compile(), "the shapes of the model", "read"
-        )
+        shaped = from_mujoco(read, "the shapes of the model", "read")
     except ConfigurationError:
         return plain
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
@@ -318,7 +321,9 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
-    log = None if options.log is None else read_log(Path(options.log), ranges, options.measured_by)
+    log = None
+    if options.log is not None:
+        log = read_log(Path(options.log), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
     arm = StaticArm(model, joints, options.end_effector, options.payload)
     arm.require_gravity()
@@ -329,7 +334,8 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
             f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or"
             " body"
         )
-    setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
+    elastic = _elastic_joints(options.joints, log.joints)
+    setting = _Setting(options, arm, log, elastic, seed)
     if options.log is not None and not setting.seeks_geometry:
         require_poses(setting.model(log))
     return setting
@@ -358,11 +364,12 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     model = setting.model(candidates)
     noise = USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
-    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
+    prior = np.eye(len(start))
+    plan = plan_poses(model, start, noise, prior, candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
     spread = np.sqrt(np.diag(np.linalg.inv(plan.information))[own])
     half = 1.96 * spread * model.scale[own] / start[own]
-    rows = [(j, _percent(float(width))) for j, width in zip(setting.elastic, half, strict=True)]
+    rows = list(zip(setting.elastic, map(_percent, half.tolist()), strict=True))
     head = ["joint", "expected ± of K"]
     console.print(make_table(f"{len(plan.theta)} proposed poses", head, rows))
     console.print(
@@ -382,8 +389,7 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
 
 
 def _stiffness(joint: JointStiffness) -> float | None:
-    has_interval = None not in (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
-    return joint.stiffness_nm_per_rad if has_interval else None
+    return None if _interval(joint) == "–" else joint.stiffness_nm_per_rad
 
 
 def _interval(joint: JointStiffness) -> str:

@@ -1,11 +1,11 @@
 """`elastic identify --geometry`: encoders, geometry and stiffness of an arm from markers."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import mujoco
-import numpy as np
 import tyro
 from rich import box
 from rich.console import Console
@@ -80,12 +80,15 @@ def identify_geometry(
     """
     model = spec.compile()
     problem, tree = pose_problem(options, model, log, elastic, end_effector)
-    parts = split(len(log), options.holdout, options.folds, seed) if options.holdout else []
+    parts = []
+    if options.holdout:
+        parts = split(len(log), options.holdout, options.folds, seed)
     recorded = {**options.model_dump(mode="json"), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
         total = 1 + (num_fits(problem, parts) if parts else 0)
         with show_progress(console, {"fits": total}, transient=True) as show:
-            held_out = judge(problem, parts, seed, lambda done: show(0, done)) if parts else None
+            report = partial(show, 0)
+            held_out = judge(problem, parts, seed, report) if parts else None
             fit = fit_geometry(problem)
             show(0, total)
         result = describe_geometry(fit, held_out)
@@ -108,11 +111,9 @@ def pose_problem(
     for joint in options.free:
         if joint not in log.joints:
             raise unknown_name("joint of the log", joint, log.joints)
-    held = {
-        model.joint(j).name: float(model.qpos0[model.jnt_qposadr[j]])
-        for j in range(model.njnt)
-        if model.joint(j).name not in log.joints
-    }
+    joints = [model.joint(number) for number in range(model.njnt)]
+    others = [joint for joint in joints if joint.name not in log.joints]
+    held = {joint.name: float(joint.qpos0[0]) for joint in others}
     tree = Tree.of(model, log.joints, held)
     names = [end_effector]
     if log.kind == "markers":
@@ -140,33 +141,24 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     """Print held-out errors, stiffness, and what the poses do not tell."""
     if result.held_out is not None:
         console.print(verdict(result.held_out), highlight=False)
-        rows = [
-            [
-                error.name,
-                *(f"{value:.2f}" for value in (error.rms_mm, error.mean_mm, error.worst_mm)),
-            ]
-            for error in result.held_out.errors
-        ]
-        title = f"error of markers at {result.held_out.held_out} poses that were held out"
-        console.print(
-            make_table(title, ["prediction", "rms [mm]", "mean", "worst"], rows, box=box.SIMPLE)
-        )
-        points = ", ".join(
-            f"{point.poses} poses {point.rms_mm:.1f} mm" for point in result.held_out.curve
-        )
-        console.print(f"by the number of poses: {points}", highlight=False)
-    rows = [
-        [
-            joint.joint,
-            "rigid"
-            if np.isinf(joint.stiffness_nm_per_rad)
-            else f"{joint.stiffness_nm_per_rad:.4g}",
-            _number(joint.stiffness_low_nm_per_rad),
-            _number(joint.stiffness_high_nm_per_rad),
-        ]
-        for joint in result.joints
-    ]
-    console.print(f"unexplained: {result.noise_mm:.2f} mm in each coordinate of a marker")
+        rows = []
+        for error in result.held_out.errors:
+            values = (error.rms_mm, error.mean_mm, error.worst_mm)
+            rows.append([error.name, *(f"{value:.2f}" for value in values)])
+        number = result.held_out.held_out
+        title = f"error of markers at {number} poses that were held out"
+        head = ["prediction", "rms [mm]", "mean", "worst"]
+        console.print(make_table(title, head, rows, box=box.SIMPLE))
+        curve = result.held_out.curve
+        points = [f"{point.poses} poses {point.rms_mm:.1f} mm" for point in curve]
+        console.print(f"by the number of poses: {', '.join(points)}", highlight=False)
+    rows = []
+    for joint in result.joints:
+        stiffness = _number(joint.stiffness_nm_per_rad).replace("inf", "rigid")
+        ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
+        rows.append([joint.joint, stiffness, *map(_number, ends)])
+    noise = f"{result.noise_mm:.2f} mm"
+    console.print(f"unexplained: {noise} in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"
     console.print(make_table(title, ["joint", "K", "from", "to"], rows, box=box.SIMPLE))
     if result.numbers < len(result.parameters):

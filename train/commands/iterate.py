@@ -18,9 +18,8 @@ from baselines.options import PolicyOptions
 from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.robot_model import WalkerModel
-from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, reference_of
-from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.environments import Column
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
+from train.evaluate.conditions import Condition, PolicySpec, cell_of
 from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.chart import trials_chart
@@ -84,14 +83,10 @@ class Iterate(Model):
     @property
     def condition(self) -> Condition:
         """The cell in which it learns."""
-        base = {} if self.base is None else {"learned_base": self.base}
-        return Condition(
-            env=self.env,
-            policy=PolicySpec(name="iterative", options={**base, "learning": self.gains}),
-            reference=reference_of(self.env, self.reference),
-            scenario=self.scenario,
-            seed=self.seed,
-        )
+        options: dict[str, Any] = {"learning": self.gains}
+        if self.base is not None:
+            options["learned_base"] = self.base
+        return cell_of(self, PolicySpec(name="iterative", options=options))
 
     def run(self, console: Console) -> list[Trial]:
         """Learn, play a last trial with what was learned, write the run, and print the trials.
@@ -109,79 +104,81 @@ class Iterate(Model):
         with closing(make_vector_env(condition, self.robots)) as env:
             policy: IterativeLearner = make_policy(condition.policy, env)
             with run_folder("iterate", recorded, self.seed, self.output) as folder:
-                trials = _trials(self, env, policy, console)
+                trials = self._play(env, policy, console)
                 columns = condition.environment.judged
-                chart = trials_chart(trials, columns, f"Learned on the robot, {self.scenario}")
+                title = f"Learned on the robot, {self.scenario}"
+                chart = trials_chart(trials, columns, title)
                 files = [
-                    _write_trials(trials, policy, self.seed, folder / "trials.csv"),
+                    self._write(trials, policy.names, folder / "trials.csv"),
                     plots.draw_chart(chart, folder / "trials.png"),
                 ]
-                policies = _save(self, env, policy, folder)
-        console.print(trials_table(trials, columns, condition))
+                policies = self._save(env, policy, folder)
+        console.print(trials_table(trials, condition))
         for path in files:
             console.print(f"wrote {path}")
         for path in policies:
             console.print(f"play it as iterative:{path}")
         return trials
 
+    def _play(self, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
+        trials: list[Trial] = []
+        totals = {"trials": policy.trials + 1}
+        with show_progress(console, totals, transient=True) as show:
 
-def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
-    trials: list[Trial] = []
-    with show_progress(console, {"trials": policy.trials + 1}, transient=True) as show:
+            def keep(trial: Trial) -> None:
+                trials.append(trial)
+                show(0, len(trials))
 
-        def keep(trial: Trial) -> None:
-            trials.append(trial)
-            show(0, len(trials))
+            policy.rehearse(env, self.seed, keep)
+            signals = learned_signals(env.unwrapped.assumed_model, self.gains)
+            keep(Stage(env, self.seed).trial(policy, signals, policy.trials))
+        return trials
 
-        policy.rehearse(env, options.seed, keep)
-        signals = learned_signals(env.unwrapped.assumed_model, options.gains)
-        keep(Stage(env, options.seed).trial(policy, signals, policy.trials))
-    return trials
+    def _write(self, trials: Sequence[Trial], names: Sequence[str], path: Path) -> Path:
+        """One row per robot and trial: what the sensors showed, and the metrics."""
+        columns = [f"measured_{name}" for name in names]
+        rows = []
+        for trial in trials:
+            for robot, metrics in enumerate(trial.metrics):
+                row: dict[str, Any] = {"trial": trial.number, "seed": self.seed + robot}
+                row["failed"] = bool(trial.failed[robot])
+                measured = zip(columns, trial.error_rms[robot].tolist(), strict=True)
+                rows.append({**row, **dict(measured), **metrics})
+        return write_records(rows, path)
+
+    def _save(self, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
+        """Write the offsets of every robot: into the folder for one, else into folders by seed."""
+        model = env.unwrapped.assumed_model
+        chosen = PolicyOptions(learned_base=self.base)
+        base = learned_base(chosen, isinstance(model, WalkerModel))
+        folders = []
+        for robot, table in enumerate(policy.tables):
+            seed = self.seed + robot
+            description = TableDescription(
+                robot=env.unwrapped.task.name,
+                base=base,
+                learning=self.gains,
+                signals=list(policy.names),
+                motion=motion_of(env),
+                control_period_s=model.control_period_s,
+                scenario=self.scenario,
+                training=provenance(seed),
+            )
+            is_one = len(policy.tables) == 1
+            folders.append(folder if is_one else folder / f"robot_{seed}")
+            save_table(folders[-1], description, table)
+        return folders
 
 
-def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
+def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
     """Judged metrics of every trial, means over the robots that did not fail, and failures."""
-    title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
-    head = ["trial", *(column.label for column in columns), condition.environment.failures]
+    known = condition.environment
+    title = f"{known.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in known.judged), known.failures]
     rows = []
     for trial in trials:
-        survived = pd.DataFrame(trial.metrics)[~trial.failed]
-        means = [column.scale * survived[column.metric].mean() for column in columns]
-        scores = [f"{m:.{column.decimals}f}" for m, column in zip(means, columns, strict=True)]
+        means = pd.DataFrame(trial.metrics)[~trial.failed].mean(numeric_only=True)
+        scores = [f"{c.scale * means[c.metric]:.{c.decimals}f}" for c in known.judged]
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)
-
-
-def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
-    """One row per robot and trial: what the sensors showed, and the metrics."""
-    rows = []
-    for trial in trials:
-        for robot, metrics in enumerate(trial.metrics):
-            row = {"trial": trial.number, "seed": seed + robot, "failed": bool(trial.failed[robot])}
-            for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True):
-                row[f"measured_{name}"] = rms
-            rows.append({**row, **metrics})
-    return write_records(rows, path)
-
-
-def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
-    """Write the offsets of every robot: to the folder itself for one, else to folders by seed."""
-    model = env.unwrapped.assumed_model
-    base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
-    folders = []
-    for robot, table in enumerate(policy.tables):
-        seed = options.seed + robot
-        description = TableDescription(
-            robot=env.unwrapped.task.name,
-            base=base,
-            learning=options.gains,
-            signals=list(policy.names),
-            motion=motion_of(env),
-            control_period_s=model.control_period_s,
-            scenario=options.scenario,
-            training=provenance(seed),
-        )
-        folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
-        save_table(folders[-1], description, table)
-    return folders

@@ -101,21 +101,20 @@ class OnHardware(Model):
             for name in ("imu_port", "yes", "patient"):
                 if getattr(self, name):
                     option = "--" + name.replace("_", "-")
-                    raise ConfigurationError(
+                    problem = (
                         f"{option} is for a real testbed: name its servo's port too, with --port"
                     )
+                    raise ConfigurationError(problem)
             return {}
-        options = {
-            "port": self.port,
-            "imu_port": self.imu_port,
-            "confirm": False if self.yes else None,
-        }
+        confirm = False if self.yes else None
+        options = {"port": self.port, "imu_port": self.imu_port, "confirm": confirm}
         given = {name: value for name, value in options.items() if value is not None}
         if self.mounting is None:
             chosen = Mounting(**given)
         else:
             chosen = load_yaml(self.mounting, Mounting, given)
-        values = chosen.model_dump(include={*chosen.model_fields_set, *options, "limits"})
+        named = {*chosen.model_fields_set, *options, "limits"}
+        values = chosen.model_dump(include=named)
         if self.patient:
             values["limits"] |= PATIENT_LIMITS
             values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
@@ -131,10 +130,8 @@ class OnHardware(Model):
             return {"env": env}
         real = environment(env).on_hardware
         if not real:
-            raise ConfigurationError(
-                f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or"
-                " --port and --mounting"
-            )
+            problem = f"there is no {env!r} on hardware, only the testbed: leave --env {env} out"
+            raise ConfigurationError(f"{problem}, or --port and --mounting")
         return {"env": real, "env_options": arguments}
 
     def scenario(self, named: str | None) -> str:
@@ -146,16 +143,9 @@ class OnHardware(Model):
         if not self.arguments:
             return named or DEFAULT_SCENARIO
         if named is not None:
-            raise ConfigurationError(
-                f"scenario {named!r} is of a simulation, hardware is what it is: leave --scenario"
-                " out, or --port"
-            )
+            problem = f"scenario {named!r} is of a simulation, hardware is what it is"
+            raise ConfigurationError(f"{problem}: leave --scenario out, or --port")
         return "hardware"
-
-
-def reference_of(env: str, reference: Any) -> Any:
-    """The reference, or the environment's default for None."""
-    return environment(env).default_reference if reference is None else reference
 
 
 _OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "policy"}
@@ -164,7 +154,8 @@ _OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "poli
 
 def option_name(path: ParameterPath) -> str:
     """A parameter as the option that sets it."""
-    return "--" + _OF_ONE.get(str(path[0]), str(path[0])).replace("_", "-") if path else ""
+    name = str(path[0]) if path else ""
+    return f"--{_OF_ONE.get(name, name).replace('_', '-')}" if path else ""
 
 
 @contextmanager

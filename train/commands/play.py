@@ -2,7 +2,7 @@
 
 import io
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -20,12 +20,13 @@ from elastic_env.core.errors import (
     missing_extra,
     shorten,
 )
-from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options, reference_of
-from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
-from train.evaluate.environments import environment
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options
+from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec, cell_of
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
+_Step = tuple[int, Mapping[str, Any]]
+"""Number and info of a control step."""
 
 
 def play(
@@ -43,11 +44,9 @@ def play(
         ResultsExistError: The video file exists.
         MissingExtraError: The video writer is not installed.
     """
-    env: Any = gymnasium.make(
-        condition.environment.id,
-        render_mode="human" if video is None else "rgb_array",
-        **condition.arguments,
-    )
+    mode = "human" if video is None else "rgb_array"
+    name = condition.environment.id
+    env: Any = gymnasium.make(name, render_mode=mode, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):
@@ -55,11 +54,14 @@ def play(
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
-        steps_of_it = (step for step, _ in episode(env, policy, condition, steps, console))
+        played = episode(env, policy, condition, steps, console)
         if video is None:
-            _window(steps_of_it, period)
+            _window(played, period)
         else:
-            _film(env, steps_of_it, steps, period, video, console)
+            bar = {"total": steps, "console": console, "transient": True}
+            shown = track(played, "filming", **bar)
+            _film(env, shown, period, video)
+            console.print(f"wrote {video}")
 
 
 def steps_within(task: Any, max_s: float | None) -> int:
@@ -76,7 +78,8 @@ def steps_within(task: Any, max_s: float | None) -> int:
         return task.num_steps
     if not max_s > 0.0:
         raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
-    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
+    steps = max_s / task.assumed_model.control_period_s
+    return max(round(min(steps, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
@@ -88,7 +91,7 @@ def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
 
 def episode(
     env: Any, policy: Any, condition: Condition, steps: int, console: Console
-) -> Iterator[tuple[int, Mapping[str, Any]]]:
+) -> Iterator[_Step]:
     """Play step by step; yields number and info of each step, and says so where the episode fails.
 
     Args:
@@ -101,24 +104,20 @@ def episode(
     for step in islice(control_steps(env, policy, condition.seed, condition), steps):
         yield step.number, step.info
         if step.terminated:
-            console.print(
-                f"the episode ended after {step.info['time_s']:.2f} s: {step.info['termination']}"
-            )
+            when = f"after {step.info['time_s']:.2f} s"
+            console.print(f"the episode ended {when}: {step.info['termination']}")
 
 
-def _window(episode: Iterator[int], period: float) -> None:
+def _window(episode: Iterable[_Step], period: float) -> None:
     begin = time.perf_counter()
-    for step in episode:
+    for step, _ in episode:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
 
 
-def _film(
-    env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console
-) -> None:
+def _film(env: Any, episode: Iterable[_Step], period: float, video: Path) -> None:
     if video.exists() or video.is_symlink():
-        raise ResultsExistError(
-            f"{shorten(video)} exists and is not overwritten; name another file"
-        )
+        problem = f"{shorten(video)} exists and is not overwritten; name another file"
+        raise ResultsExistError(problem)
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
     try:
@@ -138,7 +137,7 @@ def _film(
     else:
         writer = imageio.get_writer(video, fps=1.0 / frame_s)
     with writer:
-        for step in track(episode, "filming", total=steps, console=console, transient=True):
+        for step, _ in episode:
             if step % every == 0:
                 writer.append_data(env.render())
                 frames += 1
@@ -146,7 +145,6 @@ def _film(
         video.write_bytes(memory.getbuffer())
     else:
         _require_whole(video, frames)
-    console.print(f"wrote {video}")
 
 
 def _require_whole(video: Path, frames: int) -> None:
@@ -162,10 +160,9 @@ def _require_whole(video: Path, frames: int) -> None:
     except RuntimeError:
         found = 0
     if found != frames:
-        raise SystemFailedError(
-            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full:"
-            " free some space, then play again"
-        )
+        problem = f"{video} is not whole, {found} of {frames} frames can be read"
+        cure = "the disk may be full: free some space, then play again"
+        raise SystemFailedError(f"{problem}; {cure}")
 
 
 class WatchedEpisode(Model):
@@ -188,17 +185,12 @@ class WatchedEpisode(Model):
     @property
     def condition(self) -> Condition:
         """The cell that is played."""
-        reference = self.reference
-        if reference is None:
-            reference = environment(self.env).watched_reference
         with name_options():
-            return Condition(
-                env=self.env,
-                policy=PolicySpec(name=self.policy),
-                scenario=self.scenario,
-                seed=self.seed,
-                reference=reference_of(self.env, reference),
-            )
+            played = cell_of(self, PolicySpec(name=self.policy))
+        watched = played.environment.watched_reference
+        if self.reference is None and watched is not None:
+            return played.replace(reference=watched)
+        return played
 
 
 class Play(WatchedEpisode):

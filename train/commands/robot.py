@@ -22,7 +22,6 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read
 from elastic_env.core.errors import ConfigurationError, ElasticError, quote
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
-from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.friction import dry_friction
 from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
@@ -121,20 +120,18 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     plots.require_matplotlib()
     require_libraries()
     arguments = robot_arguments(trial)
-    moving, config = (
-        configure_robot(**arguments, reference=reference, scenario=SCENARIO)
-        for reference in (trial.motion, trial.poses)
-    )
+    played = {**arguments, "scenario": SCENARIO}
+    moving = configure_robot(**played, reference=trial.motion)
+    config = configure_robot(**played, reference=trial.poses)
     moving.robot.plant(moving)  # refuses what its servos cannot follow
     plant = config.robot.plant(config)
     if trial.stiffness is None and trial.model in GALLERY:
-        console.print(
-            f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
-        )
+        text = f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
+        console.print(text)
     recorded = trial.model_dump(mode="json", exclude={"output", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
-        played = CompareConfig(
+        compared = CompareConfig(
             name="robot",
             env=str(file),
             references=[trial.poses.model_dump(mode="json"), trial.motion],
@@ -142,7 +139,7 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
             policies=[PolicySpec(name=name) for name in POLICIES],
             seed=trial.seed,
         )
-        comparison = compare(played, console, folder / "comparison")
+        comparison = compare(compared, console, folder / "comparison")
         placed = [_placement(one) for one in comparison.evaluations]
         shares = joint_shares(plant)
         files = [
@@ -177,9 +174,8 @@ def robot_arguments(trial: Robot) -> dict[str, Any]:
         arguments["joints"] = dict(read_mapping(Path(stiffness)))
     elif stiffness is not None:
         if not stiffness > 0.0:
-            raise ConfigurationError(
-                f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
-            )
+            problem = f"stiffness must be > 0 N·m/rad or a file of joints, got {quote(stiffness)}"
+            raise ConfigurationError(problem)
         arguments["joints"] = {"*": stiffness}
     if trial.end_effector is not None:
         arguments["end_effector"] = trial.end_effector
@@ -216,23 +212,18 @@ def _of_gallery(name: str) -> dict[str, Any]:
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
+    assumed = gallery_joints(name)
+    joints = {joint: own.model_dump(include=_ASSUMED) for joint, own in assumed.items()}
     return {
         "model": model,
-        "joints": {name: _settings(joint) for name, joint in gallery_joints(name).items()},
+        "joints": joints,
         "end_effector": end_effector,
         "home": dict(known.home),
     }
 
 
-def _settings(joint: ElasticJoint) -> dict[str, Any]:
-    """An elastic joint as a file has it."""
-    assert joint.servo is not None
-    names = ("stiffness", "damping", "rotor_inertia")
-    gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit", "speed_limit")
-    return {
-        **{name: getattr(joint, name) for name in names},
-        "servo": {name: getattr(joint.servo, name) for name in gains},
-    }
+_ASSUMED = {"stiffness", "damping", "rotor_inertia", "servo"}
+"""What is known of a joint of the gallery, as a file has it."""
 
 
 def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
@@ -277,7 +268,8 @@ def _placement(evaluation: Evaluation) -> dict[str, Any]:
 def rest_poses(plant: JointPlant) -> Array:
     """The static poses of a reference, (poses, n) [rad]."""
     plan = plant.motion.plan(np.random.default_rng(0), plant.true.control_period_s)
-    return plan.q[np.unique(plan.rest, return_index=True)[1][int(plan.rest.min() < 0) :]]
+    numbers, first = np.unique(plan.rest, return_index=True)
+    return plan.q[first[numbers >= 0]]
 
 
 def joint_shares(plant: JointPlant) -> pd.DataFrame:
@@ -350,7 +342,8 @@ def picture(config: JointRobotConfig, plant: JointPlant) -> Image:
     tool = plant.end_effector
     assert tool is not None
     known = plant.assumed
-    in_series = known.rest_stiffness("tendon").tolist()  # spring and servo: the command leads both
+    # spring and servo: the command leads both
+    in_series = known.rest_stiffness("tendon").tolist()
     compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
     q_ref = rest_poses(plant)
     order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
@@ -389,10 +382,11 @@ def _placed_table(placed: Sequence[dict[str, Any]]) -> Table:
     rows = []
     for motion in dict.fromkeys(one["motion"] for one in placed):
         errors = [1e3 * one["error_rms_m"] for one in placed if one["motion"] == motion]
-        best = min((error for error in errors[1:] if not np.isnan(error)), default=np.nan)
+        best = pd.Series(errors[1:]).min()  # of those that did not fail
         left = best / errors[0] if errors[0] > 0.0 else np.nan
+        share = "-" if np.isnan(left) else f"{100.0 * left:.1f} %"
         cells = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
-        rows.append([motion, *cells, "-" if np.isnan(left) else f"{100.0 * left:.1f} %"])
+        rows.append([motion, *cells, share])
     head = ["motion", *POLICIES, "left by the best"]
     return make_table("end effector, rms error [mm]", head, rows, **_STYLE)
 

@@ -14,22 +14,13 @@ import numpy as np
 from pydantic import Field
 from rich.console import Console
 
-from elastic_env.core.config import Model, quantity
+import train.speed.contenders as loops
+from elastic_env.core.config import Entries, Model, quantity
 from train.evaluate.environments import environment
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
-from train.speed.contenders import (
-    IN_PROCESSES,
-    IN_THIS_PROCESS,
-    Contender,
-    ForeignLoop,
-    PPOLoop,
-    RawWorlds,
-    ScalarLoop,
-    VectorLoop,
-)
 from train.speed.real_time import PERCENTILES, play_against_the_clock
 
 _PPO_PROCESSES = 2
@@ -54,15 +45,11 @@ class Speed(Model):
     policy: str | None = None
     """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the
     testbed; with --real-time adaptive_posture on the walker."""
-    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field(
-        [64, 256], min_length=1, max_length=100
-    )
+    num_envs: Entries[Annotated[int, Field(ge=1, le=1_000_000)]] = [64, 256]
     """Numbers of worlds."""
     others: bool = True
     """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
-    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field(
-        [2, 4], min_length=1, max_length=100
-    )
+    processes: Entries[Annotated[int, Field(ge=1, le=1024)]] = [2, 4]
     """Numbers of processes to try with them."""
     ppo: bool = True
     """Time PPO end to end too."""
@@ -104,21 +91,26 @@ class Speed(Model):
         console.print(f"wrote {path}")
 
 
+_TIMES = {"latency": "from due to command", "policy": "in the policy"}
+
+
 def measure_real_time(config: Speed, console: Console) -> Path:
     """Time a policy against the clock, print its latencies, and write them as JSON."""
     recorded = config.model_dump(mode="json", include={"env", "policy", "seconds"})
     with run_folder("speed", recorded, 0, config.output) as folder:
-        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
+        length = f"{config.seconds:g} s"
+        console.print(f"recording an episode, then {length} against the clock")
         found = play_against_the_clock(config.env, config.policy, config.seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(found, indent=2) + "\n")
-    title = f"{found['policy']} on the {config.env}, once in {found['period_us']:.0f} µs"
+    period = f"once in {found['period_us']:.0f} µs"
+    title = f"{found['policy']} on the {config.env}, {period}; times in µs"
     rows = [
         (label, *(f"{found[f'{key}_{name}_us']:.0f}" for name in PERCENTILES))
-        for label, key in (("from due to command", "latency"), ("in the policy", "policy"))
+        for key, label in _TIMES.items()
     ]
     head = ["", "median", "99 %", "99.9 %", "longest"]
-    console.print(make_table(f"{title}; times in µs", head, rows))
+    console.print(make_table(title, head, rows))
     share = 100.0 * found["late_share"]
     console.print(f"late: {found['late']} of {found['cycles']} cycles, {share:.3f} %")
     if not found["is_real_time"]:
@@ -129,9 +121,11 @@ def measure_real_time(config: Speed, console: Console) -> Path:
 def measure_throughput(config: Speed, console: Console) -> Path:
     """Time all contenders, print their ratios, and write them as JSON and CSV."""
     if config.others or config.ppo:
-        importlib.import_module("stable_baselines3")  # what is missing is said before the work
-    VectorLoop(config.env, 1, 1, config.policy)
-    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
+        # what is missing is said before the work
+        importlib.import_module("stable_baselines3")
+    loops.VectorLoop(config.env, 1, 1, config.policy)
+    unused = {"output", "profile", "real_time", "seconds"}
+    recorded = config.model_dump(mode="json", exclude=unused)
     with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))
@@ -143,16 +137,11 @@ def measure_throughput(config: Speed, console: Console) -> Path:
             (folder / "profile.txt").write_text(text)
             console.print(text)
     title = f"{config.env}: control steps per second, medians of one interleaved run"
-    rows = [
-        (
-            one["contender"],
-            str(one["num_envs"]),
-            f"{one['steps_per_s']:,.0f}",
-            f"{one['ratio']:.3f}",
-            one["against"],
-        )
-        for one in results
-    ]
+    rows = []
+    for one in results:
+        worlds = str(one["num_envs"])
+        figures = (f"{one['steps_per_s']:,.0f}", f"{one['ratio']:.3f}")
+        rows.append((one["contender"], worlds, *figures, one["against"]))
     table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
     table.columns[-1].justify = "left"
     console.print(table)
@@ -176,11 +165,12 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
     try:
         for turn in range(rates.size):
             number = turn % len(contenders)
-            rates[turn // len(contenders), number] = contenders[number].run(config.steps)
+            rates.flat[turn] = contenders[number].run(config.steps)
             progress((turn + 1) / rates.size)
     finally:
         for contender in contenders:
             contender.close()
+    names = [f"{contender.title}, {contender.num_envs}" for contender in contenders]
     medians = np.median(rates[1:], axis=0)
     ratios = np.median(rates[1:] / rates[1:, against], axis=0)
     return [
@@ -191,55 +181,52 @@ def measure(config: Speed, progress: Callable[[float], None]) -> list[dict[str, 
             "threads": config.threads_used,
             "steps_per_s": float(medians[number]),
             "ratio": float(ratios[number]),
-            "against": f"{contenders[other].title}, {contenders[other].num_envs}",
+            "against": names[against[number]],
         }
-        for number, (contender, other) in enumerate(zip(contenders, against, strict=True))
+        for number, contender in enumerate(contenders)
     ]
 
 
-def _contenders(config: Speed) -> tuple[list[Contender], list[int]]:
+def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
     """Contenders, and for each the number of the one that it is compared with.
 
     The two are beside each other in turn, where that one is for it alone.
     """
     env = config.env
     policy = config.looped_policy
-    contenders: list[Contender] = []
+    contenders: list[loops.Contender] = []
     against: list[int] = []
     for n in config.num_envs:
         threads = min(config.threads_used, n)
-        loop = VectorLoop(env, n, threads)
+        loop = loops.VectorLoop(env, n, threads)
+        with_policy = loops.VectorLoop(env, n, threads, policy)
+        with_network = loops.VectorLoop(env, n, threads, policy, residual=True)
         against += [len(contenders) + 1] * 4
-        contenders += [
-            loop,
-            RawWorlds(loop, threads),
-            VectorLoop(env, n, threads, policy),
-            VectorLoop(env, n, threads, policy, residual=True),
-        ]
+        contenders += [loop, loops.RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
-        scalar = ScalarLoop(env)
+        scalar = loops.ScalarLoop(env)
         against += [len(contenders) + 1] * 2
-        contenders += [scalar, RawWorlds(scalar, 1)]
-        counted = [(kind, n) for n in config.processes for kind in IN_PROCESSES]
-        foreign = [*counted, *((kind, config.processes[0]) for kind in IN_THIS_PROCESS)]
+        contenders += [scalar, loops.RawWorlds(scalar, 1)]
+        foreign = [(kind, n) for n in config.processes for kind in loops.IN_PROCESSES]
+        foreign += [(kind, config.processes[0]) for kind in loops.IN_THIS_PROCESS]
         against += [0] * len(foreign)
-        contenders += [ForeignLoop(env, kind, n) for kind, n in foreign]
+        contenders += [loops.ForeignLoop(env, kind, n) for kind, n in foreign]
     if config.ppo:
         against += [len(contenders)] * 2
-        contenders += [
-            PPOLoop(env, policy, 64, config.threads_used),
-            PPOLoop(env, policy, _PPO_PROCESSES, 1, processes=True),
-        ]
+        contenders.append(loops.PPOLoop(env, policy, 64, config.threads_used))
+        contenders.append(loops.PPOLoop(env, policy, _PPO_PROCESSES, None))
     return contenders, against
 
 
 def profile(config: Speed) -> str:
     """Profile of the vector environment with its policy, as text."""
     n = config.num_envs[0]
-    loop = VectorLoop(config.env, n, min(config.threads_used, n), config.looped_policy)
+    threads = min(config.threads_used, n)
+    loop = loops.VectorLoop(config.env, n, threads, config.looped_policy)
     loop.run(config.steps)
     profiler = cProfile.Profile()
     profiler.runcall(loop.run, config.steps * config.rounds)
     text = io.StringIO()
-    pstats.Stats(profiler, stream=text).strip_dirs().sort_stats("cumulative").print_stats(40)
+    stats = pstats.Stats(profiler, stream=text).strip_dirs()
+    stats.sort_stats("cumulative").print_stats(40)
     return text.getvalue()

@@ -58,9 +58,10 @@ class Train(Model):
         given = {"seeds": self.seeds, "decisions": self.decisions}
         changes = {name: value for name, value in given.items() if value is not None}
         if self.resume and (changes or self.output is not None):
-            raise ConfigurationError(
+            problem = (
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
+            raise ConfigurationError(problem)
         executors = Executors(self.on, self.jobs)
         if self.resume:
             folders = resume(self.resume, console, executors, self.trust_code)

@@ -110,10 +110,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
         if not hasattr(picture, "sides"):
-            raise ElasticError(
-                f"{type(picture).__name__} has no sides: see HasSides in"
-                " elastic_env.rendering.side_by_side"
-            )
+            cure = "see HasSides in elastic_env.rendering.side_by_side"
+            raise ElasticError(f"{type(picture).__name__} has no sides: {cure}")
         policy = make_policy(condition.policy, env)
         for step, now in episode(env, policy, condition, steps, console):
             if step % every == 0:
@@ -158,7 +156,8 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
             end_s = play.recording.times_s[-1]
-            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, LARGEST_FACTOR)
+            most = LARGEST_FACTOR
+            _, play.factor = imgui.SliderFloat(_FACTOR, play.factor, 0.0, most)
             _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, end_s)
             _, play.paused = imgui.Checkbox("pause", play.paused)
         imgui.End()
@@ -173,10 +172,11 @@ class _PrivateViewer(web_viewer.WebViewer):
         listener: Where the viewer listens.
     """
 
-    def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
+    def __init__(self, endpoint: Any, plugins: Any, listener: socket.socket) -> None:
         self._listener = listener
         config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=0)
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address that is not ours
+        # it prints an address that is not ours
+        with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(config, endpoint, plugins=plugins)
 
     def _start_server(self) -> None:
@@ -230,11 +230,8 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     """Start the viewer in a thread; it listens on a Unix socket of a path."""
     scene = SideBySide(recording.robot)
     playback = Playback(recording)
-    plugins = [
-        app.App(app.Config(show_options=False, show_inspector=False)),
-        _Poses(playback, scene),
-        _Sliders(playback),
-    ]
+    window = app.App(app.Config(show_options=False, show_inspector=False))
+    plugins = [window, _Poses(playback, scene), _Sliders(playback)]
     of_viewer, of_robots = plugin.split_plugins(plugins)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(place)
@@ -276,17 +273,16 @@ class View(WatchedEpisode):
 
     def run(self, console: Console) -> None:
         """Play an episode, then show it until Ctrl-C."""
-        listen(self.host, self.port).close()  # what cannot be is said before the episode
+        # what cannot be is said before the episode
+        listen(self.host, self.port).close()
         condition = self.condition
         console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)
         with show(recording, self.host, self.port) as page:
             console.print(f"the page is at {page.access.address}", highlight=False)
             if not page.access.is_local:
-                console.print(
-                    "who has this address sees the page and moves its sliders; nothing on the way"
-                    " is encrypted",
-                )
+                what = "sees the page and moves its sliders; nothing on the way is encrypted"
+                console.print(f"who has this address {what}")
             console.print("Ctrl-C ends it")
             _open_tab(page.access.address)
             while page.handle.is_running():

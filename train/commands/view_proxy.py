@@ -17,7 +17,8 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Sequence
+from asyncio import StreamReader, StreamWriter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
@@ -25,8 +26,7 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote
 LOOPBACK = "127.0.0.1"
 """The address of a page unless somebody asks for another one."""
 
-_FIRST_PORT = 8080
-_PORTS_TRIED = 20
+_FIRST_PORTS = range(8080, 8100)
 _LARGEST_PORT = 65535
 _LARGEST_HEAD = 32768
 """Of a request or a response [bytes]."""
@@ -36,14 +36,7 @@ _TOKEN = "token="
 _CURE = "open the address that elastic view has printed"
 _UPLOAD = "/drop"
 _SOCKETS = ("/ui", "/state")
-_UPGRADED = (
-    "Upgrade",
-    "Connection",
-    "Sec-WebSocket-Key",
-    "Sec-WebSocket-Version",
-    "Sec-WebSocket-Protocol",
-    "Sec-WebSocket-Extensions",
-)
+_UPGRADED = "(?i)upgrade|connection|sec-websocket-(key|version|protocol|extensions)"
 """Headers of a WebSocket's opening that the viewer gets."""
 _PRIVATE = (
     ("Cross-Origin-Resource-Policy", "same-origin"),
@@ -53,8 +46,6 @@ _PRIVATE = (
 )
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(:(?P<port>\d+))?")
 _CLOSED = (asyncio.IncompleteReadError, TimeoutError, OSError)
-
-Header = tuple[str, str]
 
 
 class RefusedError(Exception):
@@ -71,7 +62,7 @@ class Head:
     """
 
     line: str
-    headers: Sequence[Header]
+    headers: Sequence[tuple[str, str]]
 
     @staticmethod
     def parse(data: bytes) -> "Head":
@@ -163,18 +154,19 @@ class Access:
         self._require_own_host(request)
         parts = [part for part in query.split("&") if part]
         others = [part for part in parts if not part.startswith(_TOKEN)]
-        tokens = [part.removeprefix(_TOKEN) for part in parts if part.startswith(_TOKEN)]
-        has_address = any(map(self._is_token, tokens))
-        has_cookie = any(map(self._is_token, self._cookies(request)))
+        has_address = self._has_token(parts, _TOKEN)
+        cookies = ";".join(request.values("Cookie")).split(";")
+        has_cookie = self._has_token(map(str.strip, cookies), f"{self.cookie}=")
         _require(has_address or has_cookie, f"the token is missing: {_CURE}")
         is_socket = bool(request.values("Upgrade"))
         _require(path.rstrip("/").lower() != _UPLOAD, "this page takes no uploads")
-        has_body = request.values("Content-Length") or request.values("Transfer-Encoding")
+        has_body = any(map(request.values, ("Content-Length", "Transfer-Encoding")))
         is_download = method == "GET" and not has_body
         _require(is_download, "this page only answers GET without a body")
         is_known = not is_socket or path in _SOCKETS
         _require(is_known, f"WebSockets are {', '.join(_SOCKETS)}")
-        return Asked(f"{path}?{'&'.join(others)}" if others else path, is_socket, has_address)
+        query = "&".join(others)
+        return Asked(f"{path}?{query}" if query else path, is_socket, has_address)
 
     def _require_own_host(self, request: Head) -> None:
         hosts = [host.lower() for host in request.values("Host")]
@@ -198,15 +190,10 @@ class Access:
             names |= {socket.gethostname().lower()}
         return name in names
 
-    def _is_token(self, value: str) -> bool:
-        return secrets.compare_digest(value.encode(), self.token.encode())
-
-    def _cookies(self, request: Head) -> list[str]:
-        cookies = [
-            cookie.strip() for line in request.values("Cookie") for cookie in line.split(";")
-        ]
-        prefix = f"{self.cookie}="
-        return [one.removeprefix(prefix) for one in cookies if one.startswith(prefix)]
+    def _has_token(self, parts: Iterable[str], prefix: str) -> bool:
+        """True if one of some parts is the token behind a prefix."""
+        own = f"{prefix}{self.token}".encode()
+        return any(secrets.compare_digest(part.encode(), own) for part in parts)
 
 
 def _require(holds: bool, reason: str) -> None:
@@ -239,9 +226,8 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         SystemFailedError: The port is taken, or this machine has no such address.
     """
     if not 0 <= port <= _LARGEST_PORT:
-        raise ConfigurationError(
-            f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
-        )
+        problem = f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
+        raise ConfigurationError(problem)
     kind = {"type": socket.SOCK_STREAM, "flags": socket.AI_PASSIVE}
     try:
         family = socket.getaddrinfo(host or None, port, **kind)[0][0]
@@ -251,9 +237,10 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
             f" {quote(host)}"
         ) from None
     problem = OSError()
-    for one in [port] if port else [*range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED), 0]:
+    both = host == "::"
+    for one in [port] if port else [*_FIRST_PORTS, 0]:
         try:
-            return socket.create_server((host, one), family=family, dualstack_ipv6=host == "::")
+            return socket.create_server((host, one), family=family, dualstack_ipv6=both)
         except OSError as error:
             problem = error
     raise SystemFailedError(
@@ -287,12 +274,12 @@ class Proxy:
         self._listener.close()
 
     def _run(self) -> None:
+        place = {"sock": self._listener, "limit": _LARGEST_HEAD}
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            limit = _LARGEST_HEAD
-            runner.run(asyncio.start_server(self._answer, sock=self._listener, limit=limit))
+            runner.run(asyncio.start_server(self._answer, **place))
             self._loop.run_forever()
 
-    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _answer(self, reader: StreamReader, writer: StreamWriter) -> None:
         """One connection, which is for one request."""
         with contextlib.suppress(*_CLOSED):
             try:
@@ -306,13 +293,10 @@ class Proxy:
         writer.close()
 
     async def _pass_on(
-        self,
-        request: Head,
-        asked: Asked,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
+        self, request: Head, asked: Asked, reader: StreamReader, writer: StreamWriter
     ) -> None:
-        viewer, to_viewer = await asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
+        opened = asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
+        viewer, to_viewer = await opened
         try:
             to_viewer.write(_for_viewer(request, asked).encode())
             answer = Head.parse(await viewer.readuntil(b"\r\n\r\n"))
@@ -331,34 +315,32 @@ class Proxy:
 
     def _for_browser(self, answer: Head, asked: Asked) -> Head:
         """An answer that no other page may read, and with the cookie where a page begins."""
-        left_out = () if asked.is_socket else ("connection",)
-        headers = [
-            (name, value)
-            for name, value in answer.headers
-            if not _opens_page(name) and name.lower() not in left_out
-        ]
+        headers = [own for own in answer.headers if not _opens_page(own[0])]
         headers += _PRIVATE
         if not asked.is_socket:
+            headers = [own for own in headers if own[0].lower() != "connection"]
             headers.append(("Connection", "close"))
         if asked.has_address:
-            kind = "Path=/; HttpOnly; SameSite=Strict"
-            headers.append(("Set-Cookie", f"{self._access.cookie}={self._access.token}; {kind}"))
+            kept = f"{self._access.cookie}={self._access.token}"
+            cookie = f"{kept}; Path=/; HttpOnly; SameSite=Strict"
+            headers.append(("Set-Cookie", cookie))
         return Head(answer.line, headers)
 
 
-async def _read_head(reader: asyncio.StreamReader) -> Head:
+async def _read_head(reader: StreamReader) -> Head:
     try:
         async with asyncio.timeout(_HEAD_S):
             return Head.parse(await reader.readuntil(b"\r\n\r\n"))
     except asyncio.LimitOverrunError:
-        raise RefusedError(f"a request may have {_LARGEST_HEAD} bytes of headers") from None
+        most = f"a request may have {_LARGEST_HEAD} bytes of headers"
+        raise RefusedError(most) from None
 
 
 def _for_viewer(request: Head, asked: Asked) -> Head:
     """A request as the viewer gets it: without token, cookies and Origin."""
     headers = [("Host", "viewer")]
     if asked.is_socket:
-        headers += [(name, value) for name in _UPGRADED for value in request.values(name)]
+        headers += [own for own in request.headers if re.fullmatch(_UPGRADED, own[0])]
     return Head(f"GET {asked.path} HTTP/1.1", headers)
 
 
@@ -379,7 +361,7 @@ def _refusal(reason: str) -> bytes:
     return Head("HTTP/1.1 403 Forbidden", headers).encode() + body.encode()
 
 
-async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+async def _copy(source: StreamReader, target: StreamWriter) -> None:
     while data := await source.read(_LARGEST_HEAD):
         target.write(data)
         await target.drain()

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
@@ -133,10 +133,10 @@ class Condition(Model):
     policy: PolicySpec
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
-    reference: GivenReference = "hold"
+    reference: GivenReference = None
     """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the
-    environment."""
+    three durations [s], or a mapping with `step_period` and further arguments of the environment;
+    None for the environment's default."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
@@ -158,6 +158,14 @@ class Condition(Model):
     def swept_values(self, names: Iterable[str]) -> list[str]:
         """Varied values as tables show them; - of what does not vary here."""
         return [f"{self.swept[n]:g}" if n in self.swept else "-" for n in names]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _environment_has_a_default(cls, values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("reference") is None:
+            known = environment(values.get("env", "testbed"))
+            values = {**values, "reference": known.default_reference}
+        return values
 
     @property
     def environment(self) -> Environment:
@@ -216,6 +224,12 @@ class Condition(Model):
     def track(self) -> Track:
         """Needs of the policy, by its specification or by its name."""
         return self.policy.track or track(self.policy.name, self.environment.walks)
+
+
+def cell_of(options: Any, policy: PolicySpec) -> Condition:
+    """The cell of a policy that options name by their env, scenario, reference and seed."""
+    names = ("env", "scenario", "reference", "seed")
+    return Condition(policy=policy, **{name: getattr(options, name) for name in names})
 
 
 def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:

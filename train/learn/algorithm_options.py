@@ -37,7 +37,7 @@ def _network(*parts: str) -> Any:
 
     def require(given: Any) -> Any:
         named = given if isinstance(given, dict) else dict.fromkeys(parts, given)
-        if named.keys() != set(parts) or not all(_are_widths(widths) for widths in named.values()):
+        if named.keys() != set(parts) or not all(map(_are_widths, named.values())):
             raise ValueError(
                 f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <="
                 f" {_WIDEST}, or a mapping of such lists by {' and '.join(parts)}, got"
@@ -49,17 +49,15 @@ def _network(*parts: str) -> Any:
 
 
 def _are_widths(given: Any) -> bool:
-    is_list = isinstance(given, list) and len(given) <= _MOST_LAYERS
-    return is_list and all(type(width) is int and 1 <= width <= _WIDEST for width in given)
+    if not isinstance(given, list) or len(given) > _MOST_LAYERS:
+        return False
+    return all(type(width) is int and 1 <= width <= _WIDEST for width in given)
 
 
 def _entropy_weight(given: Any) -> Any:
     """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
     if isinstance(given, str):
-        prefix, _, first = given.partition("_")
-        is_right = (
-            prefix == "auto" and re.fullmatch(r"|[0-9]{1,3}(\.[0-9]{1,9})?", first) is not None
-        )
+        is_right = re.fullmatch(r"auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?", given)
     else:
         is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
     if not is_right:
@@ -83,7 +81,8 @@ class _Options(Model):
     def _none_is_set_by_us(cls, values: Any) -> Any:
         given = [name for name in _OURS if name in values]
         if given:
-            raise ValueError("; ".join(f"leave out {name!r}: {_OURS[name]}" for name in given))
+            cures = [f"leave out {name!r}: {_OURS[name]}" for name in given]
+            raise ValueError("; ".join(cures))
         return values
 
 
@@ -95,7 +94,7 @@ class _NetworkOptions(Model):
     """Logarithm of the first standard deviation of the residual, which is in ±1."""
     use_expln: bool = False
     share_features_extractor: bool = False
-    optimizer_kwargs: dict[str, Any] = {}
+    optimizer_kwargs: dict[str, Any] | None = None
 
 
 class _ActorCriticNetwork(_NetworkOptions):
@@ -103,6 +102,7 @@ class _ActorCriticNetwork(_NetworkOptions):
 
     net_arch: _network("pi", "vf") = [64, 64]  # pyright: ignore[reportInvalidTypeForm]
     """Widths of the hidden layers of both networks, or of actor (pi) and value (vf)."""
+    share_features_extractor: bool = True
     ortho_init: bool = True
     full_std: bool = True
     squash_output: bool = False
@@ -116,6 +116,8 @@ class _SACNetwork(_NetworkOptions):
         "qf": [256, 256],
     }
     """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
+    activation_fn: Literal["Tanh", "ReLU"] = "ReLU"
+    log_std_init: float = quantity("1", -3.0, ge=-20, le=2)
     clip_mean: float = quantity("1", 2.0, ge=0, le=100)
     """Bound of the mean before tanh."""
     n_critics: int = quantity("1", 2, ge=1, le=16)
@@ -146,7 +148,7 @@ class _OnPolicy(_StableBaselines):
     use_sde: bool = False
     sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6)
     """Decisions between draws of the noise."""
-    policy_kwargs: _ActorCriticNetwork | None = None
+    policy_kwargs: _ActorCriticNetwork = _ActorCriticNetwork()
 
 
 class _PPO(_OnPolicy):
@@ -189,7 +191,7 @@ class _SAC(_StableBaselines):
     """Entropy at which a learned weight aims."""
     n_steps: int = quantity("1", 1, ge=1, le=1000)
     """Decisions of a return."""
-    policy_kwargs: _SACNetwork | None = None
+    policy_kwargs: _SACNetwork = _SACNetwork()
 
 
 class _CMAES(Model):
@@ -203,7 +205,7 @@ class _OnesOwn(_Options, extra="allow"):
     """Options of a class of one's own, which itself checks those that are not among these."""
 
 
-_MODELS: dict[str, type[Model]] = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
+_MODELS = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
 
 
 def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -213,3 +215,10 @@ def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any
         ModelError: One does not exist, is set by the training itself, or is beyond its bound.
     """
     return _MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)
+
+
+def complete_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of an algorithm with our defaults; A2C and a class of one's own keep theirs."""
+    if algorithm not in ("PPO", "SAC", CONSTANTS):
+        return dict(options)
+    return _MODELS[algorithm](**options).model_dump()

@@ -11,14 +11,19 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from elastic_env.core.errors import ElasticError, shorten
 from elastic_env.core.files import flush, read_bounded
 from elastic_env.core.json_text import LARGEST_JSON
+from elastic_env.core.signals import Array
 
 _DIGESTS = "sha256.json"
 _MOST_BYTES = 2 * 10**9
 """Size of a file of a checkpoint, such as a replay buffer."""
+_ARRAY = "array"
 
 
 @contextmanager
@@ -73,7 +78,8 @@ def require_whole(checkpoint: Path) -> None:
         if name not in digests:
             raise damage_error(checkpoint, f"{name} is not of it")
         if digests[name] != found[name]:
-            raise damage_error(checkpoint, f"the content of {name} is not what was written")
+            problem = f"the content of {name} is not what was written"
+            raise damage_error(checkpoint, problem)
 
 
 def damage_error(checkpoint: Path, why: object) -> ElasticError:
@@ -94,9 +100,39 @@ def _digests(checkpoint: Path) -> dict[str, str]:
     for file in sorted(checkpoint.iterdir()):
         if file.name != _DIGESTS:
             if (size := file.stat().st_size) > _MOST_BYTES:
-                raise ValueError(
-                    f"{shorten(file.name)} must have at most {_MOST_BYTES:.0e} bytes, not {size:g}"
-                )
+                most = f"at most {_MOST_BYTES:.0e} bytes"
+                raise ValueError(f"{shorten(file.name)} must have {most}, not {size:g}")
             with file.open("rb") as content:
                 found[file.name] = hashlib.file_digest(content, "sha256").hexdigest()
     return found
+
+
+def write_state(folder: Path, name: str, state: Any) -> None:
+    """Write a state as `name.npz` and `name.json`."""
+    arrays: dict[str, Array] = {}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays[key := f"a{len(arrays)}"] = value
+            return {_ARRAY: key}
+        if isinstance(value, dict):
+            return {name: plain(part) for name, part in value.items()}
+        return [plain(part) for part in value] if isinstance(value, list) else value
+
+    text = json.dumps(plain(state))
+    np.savez(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+    (folder / f"{name}.json").write_text(text)
+
+
+def read_state(folder: Path, name: str) -> Any:
+    """A state that `write_state` wrote; runs no code from the files."""
+    with np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
+
+        def whole(value: Any) -> Any:
+            if isinstance(value, dict):
+                if set(value) == {_ARRAY}:
+                    return arrays[value[_ARRAY]]
+                return {name: whole(part) for name, part in value.items()}
+            return [whole(part) for part in value] if isinstance(value, list) else value
+
+        return whole(json.loads((folder / f"{name}.json").read_text()))

@@ -15,11 +15,11 @@ from cmaes import CMA
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from train.learn.algorithm_options import complete_options
 from train.learn.finite import require_finite
-from train.learn.train_config import TrainConfig, first_episode, joints_of, training_worlds
+from train.learn.train_config import first_episode, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
-_DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
 _TOLD = "told.json"
 _FALL_COST = 1e6
 """Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its
@@ -45,9 +45,9 @@ class ConstantSearch(Trainer):
         ConfigurationError: Names or options that do not exist, or fewer worlds than candidates.
     """
 
-    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
-        options = {**_DEFAULTS, **config.algorithm_options}
-        super().__init__(config, seed, folder, threads)
+    def _prepare(self, threads: int) -> None:
+        config = self.config
+        options = complete_options(config.algorithm, config.algorithm_options)
         self._population = options["population_size"]
         needed = len(config.scenarios) * self._population
         episodes = config.worlds // needed
@@ -57,22 +57,16 @@ class ConstantSearch(Trainer):
                 f" {needed}, got worlds: {config.worlds}"
             )
         self._episodes = episodes
-        self._first = first_episode(seed)
-        shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
+        self._first = first_episode(self._seed)
+        worlds = episodes * self._population
+        shares = [(scenario, worlds) for scenario in config.scenarios]
         self._worlds = training_worlds(config, shares, threads)
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
-        self._optimiser = CMA(
-            mean=np.zeros(num_constants),
-            sigma=options["sigma"],
-            bounds=bounds,
-            seed=seed,
-            population_size=self._population,
-        )
+        mean = np.zeros(num_constants)
+        self._optimiser = CMA(mean, bounds=bounds, seed=self._seed, **options)
         self._told: list[list[float]] = []
         self._done = 0
-        folder.mkdir(parents=True, exist_ok=True)
-        self._go_on()
 
     @property
     def done(self) -> int:
@@ -111,7 +105,8 @@ class ConstantSearch(Trainer):
         own = self._first + generation * self._episodes + np.arange(self._episodes)
         self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
         # worlds in the order scenario, candidate, episode
-        residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
+        of_one = np.repeat(candidates, self._episodes, axis=0)
+        residuals = np.tile(of_one, (scenarios, 1))
         total = np.zeros(n)
         alive = np.ones(n, dtype=np.bool_)
         while alive.any():
@@ -120,7 +115,8 @@ class ConstantSearch(Trainer):
             total += np.where(alive, reward - _FALL_COST * terminated, 0.0)
             self._done += int(alive.sum())
             alive &= ~(terminated | truncated)
-        return -total.reshape(scenarios, self._population, self._episodes).mean(axis=(0, 2))
+        sums = total.reshape(scenarios, self._population, self._episodes)
+        return -sums.mean(axis=(0, 2))
 
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
         """The mean of the distribution as a network whose output does not depend on its input."""

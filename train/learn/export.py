@@ -1,28 +1,65 @@
-"""Trained SB3 models as residual folders: weights for a NumPy forward pass without torch."""
+"""Algorithms of SB3 by name, and their models as residual folders, which play without torch."""
 
 import pickle
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import stable_baselines3
 from gymnasium.spaces.utils import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from baselines.residual.residual_policy import save_residual
-from elastic_env.core.errors import ConfigurationError, shorten
-from train.learn.algorithms import algorithm_class
+from elastic_env.core.errors import ConfigurationError, ElasticError, quote, shorten, unknown_name
+from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig, joints_of, training_worlds
 from train.runs.folders import provenance
+from train.runs.user_code import named_object
 
 Tensors = dict[str, npt.NDArray[Any]]
 
 
-def network_of(
-    model: BaseAlgorithm, normaliser: Any | None
-) -> tuple[Tensors, str, Literal["clip", "tanh"]]:
-    """Weights, activation and output of the network that a model acts by deterministically.
+def algorithm_class(name: str) -> Any:
+    """Class of an algorithm: A2C, PPO or SAC of SB3, "module:Class" or "FILE.py:Class".
+
+    Raises:
+        ConfigurationError: It does not exist.
+    """
+    if ":" in name:
+        try:
+            return named_object(name)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"algorithm {name!r}: {error}") from error
+    known = ("A2C", "PPO", "SAC")
+    if name not in known:
+        raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])
+    return getattr(stable_baselines3, name)
+
+
+@contextmanager
+def name_options(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
+    """Name algorithm and options in what it raises while it is built from them.
+
+    Raises:
+        ConfigurationError: It does not take them.
+    """
+    try:
+        yield
+    except (ElasticError, OSError):
+        raise
+    except Exception as error:
+        raise ConfigurationError(
+            f"{algorithm} cannot be built with algorithm_options {quote(dict(options))}: "
+            f"{error or type(error).__name__}"
+        ) from error
+
+
+def network_of(model: BaseAlgorithm, normaliser: Any) -> tuple[Tensors, dict[str, Any]]:
+    """Weights of the network that a model acts by deterministically; its activation and output.
 
     Args:
         model: With an actor as PPO and A2C have it, or as SAC and TQC have it.
@@ -39,16 +76,14 @@ def network_of(
         layers = [*policy.actor.latent_pi, policy.actor.mu]
         output = "tanh"
     else:
-        raise ConfigurationError(
-            f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC"
-        )
+        problem = f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC"
+        raise ConfigurationError(problem)
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     activations = {type(layer) for layer in layers if not isinstance(layer, nn.Linear)}
     names = {nn.Tanh: "tanh", nn.ReLU: "relu"}
     if len(activations) != 1 or not activations <= set(names):
-        raise ConfigurationError(
-            f"activations must be all Tanh or all ReLU, got {sorted(map(str, activations))}"
-        )
+        problem = f"activations must be all Tanh or all ReLU, got {sorted(map(str, activations))}"
+        raise ConfigurationError(problem)
     tensors: Tensors = {}
     for i, layer in enumerate(linear):
         tensors[f"weight{i}"] = layer.weight.detach().cpu().numpy().astype(np.float32)
@@ -58,7 +93,7 @@ def network_of(
     if normaliser is not None:
         tensors["mean"] = normaliser.obs_rms.mean.copy()
         tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
-    return tensors, names[activations.pop()], output  # type: ignore[return-value]
+    return tensors, {"activation": names[activations.pop()], "output": output}
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
@@ -68,8 +103,8 @@ def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     does = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()
-    last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))
-    given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
+    layers = sum(name.startswith("bias") for name in tensors)
+    given = tensors["weight0"].shape[1], len(tensors[f"bias{layers - 1}"])
     if given != (sees, does):
         raise ConfigurationError(
             f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on"
@@ -109,20 +144,16 @@ def export_zip(
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
         statistics = pickle.loads(normaliser.read_bytes()) if normaliser else None
-        tensors, activation, kind = network_of(model, statistics)
+        tensors, network = network_of(model, statistics)
     except ConfigurationError:
         raise
     except Exception as error:  # whatever a pickle of something else leads to
-        files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
-        raise ConfigurationError(
-            f"{files} is no model that SB3's {config.algorithm} saved: {error}"
-        ) from error
+        files = " with ".join(map(str, filter(None, (path, normaliser))))
+        problem = f"{files} is no model that SB3's {config.algorithm} saved: {error}"
+        raise ConfigurationError(problem) from error
     joints = _joints_that_fit(tensors, config)
-    training = {
-        "config": config.model_dump(mode="json"),
-        **provenance(None),
-        "exported_from": path.name,
-    }
-    description = config.description(joints, activation=activation, output=kind, training=training)
+    recorded = config.model_dump(mode="json")
+    training = {"config": recorded, **provenance(None), "exported_from": path.name}
+    description = config.description(joints, training=training, **network)
     save_residual(output, description, tensors)
     return output

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import groupby
+from itertools import chain, groupby, pairwise, repeat
 from typing import Any
 
 import gymnasium
@@ -50,12 +50,12 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise ConfigurationError("a mixture needs at least one environment")
         self.envs: list[Any] = [env.unwrapped for env in envs]
         for env in self.envs:
-            if env.autoreset_mode is not AutoresetMode.DISABLED:
-                mode = env.autoreset_mode.value
-                raise _differ(f"have autoreset_mode Disabled, got {mode}")
+            if (mode := env.autoreset_mode) is not AutoresetMode.DISABLED:
+                raise _differ(f"have autoreset_mode Disabled, got {mode.value}")
             if env.single_observation_space != self.envs[0].single_observation_space:
                 raise _differ("have the same observation")
-            if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
+            own = (env.task.name, env.task.num_steps)
+            if own != (self.task.name, self.task.num_steps):
                 raise _differ("have the same task and motion")
             if env.assumed_model.joints != self.assumed_model.joints:
                 raise _differ(
@@ -63,21 +63,19 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
                     ' scenarios with "ideal", where no friction is assumed, apart from the others'
                 )
         self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
-        sizes = [env.num_envs for env in envs]
-        ends = np.cumsum(sizes).tolist()
-        self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        self.num_envs = ends[-1]
-        self._weights = np.ones(self.num_envs) if weights is None else np.array(weights)
-        if self._weights.shape != (self.num_envs,):
-            raise ConfigurationError(
-                f"weights must be one per world, {self.num_envs}, got {len(self._weights)}"
-            )
+        ends = np.cumsum([0, *(env.num_envs for env in envs)]).tolist()
+        self._worlds = [slice(*span) for span in pairwise(ends)]
+        n = self.num_envs = ends[-1]
+        self._weights = np.ones(n) if weights is None else np.array(weights)
+        if self._weights.shape != (n,):
+            got = len(self._weights)
+            raise ConfigurationError(f"weights must be one per world, {n}, got {got}")
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space
         self.single_action_space = envs[0].single_action_space
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, n)
+        self.action_space = batch_space(self.single_action_space, n)
 
     @property
     def assumed_model(self) -> RobotModel:
@@ -107,18 +105,18 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             if not mask[worlds].any():
                 return np.asarray(env.task.observe())
             own = None if seeds is None else list(seeds[worlds])
-            return np.asarray(env.reset(seed=own, options={"reset_mask": mask[worlds]})[0])
+            observation, _ = env.reset(seed=own, options={"reset_mask": mask[worlds]})
+            return np.asarray(observation)
 
         return np.concatenate(self._side_by_side(begun)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One step in every world; the info is that of worlds that end."""
         results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
-        observation, reward, terminated, truncated = (
-            np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
-        )
+        *parts, infos = zip(*results, strict=True)
+        observation, reward, terminated, truncated = map(np.concatenate, parts)
         ended = terminated | truncated
-        info = self._info([result[4] for result in results], ended) if ended.any() else {}
+        info = self._info(infos, ended) if ended.any() else {}
         return observation, self._weights * reward, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -132,15 +130,18 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             return [function(self.envs[0], self._worlds[0])]
         return list(self._threads.map(function, self.envs, self._worlds))
 
-    def _info(self, infos: list[dict[str, Any]], ended: BoolArray) -> dict[str, Any]:
+    def _info(self, infos: Sequence[Any], ended: BoolArray) -> dict[str, Any]:
         metrics: dict[str, Array] = {}
         for info, worlds in zip(infos, self._worlds, strict=True):
             if ended[worlds].any():
                 for name, values in info["episode_metrics"].items():
-                    whole = metrics.setdefault(name, np.zeros(self.num_envs, dtype=values.dtype))
-                    whole[worlds] = values
-        termination = np.concatenate([info["termination"] for info in infos])
-        return {"termination": termination, "episode_metrics": metrics, "_episode_metrics": ended}
+                    empty = np.zeros(self.num_envs, dtype=values.dtype)
+                    metrics.setdefault(name, empty)[worlds] = values
+        return {
+            "termination": np.concatenate([info["termination"] for info in infos]),
+            "episode_metrics": metrics,
+            "_episode_metrics": ended,
+        }
 
 
 def mixed_env(
@@ -160,13 +161,11 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    pairs = zip(conditions, sizes, strict=True)
-    shares = [list(share) for _, share in groupby(pairs, lambda own: shared_settings(own[0]))]
+    worlds = list(chain(*map(repeat, conditions, sizes)))
+    shares = [list(share) for _, share in groupby(worlds, shared_settings)]
     threads = threads_of_each(_cores(num_threads), len(shares))
-    envs = []
-    for share, own in zip(shares, threads, strict=True):
-        worlds = [condition for condition, size in share for _ in range(size)]
-        envs.append(make_shared_env(worlds, own, AutoresetMode.DISABLED))
+    mode = AutoresetMode.DISABLED
+    envs = [make_shared_env(*own, mode) for own in zip(shares, threads, strict=True)]
     of_worlds = None if weights is None else np.repeat(weights, sizes).tolist()
     return MixedVectorEnv(envs, num_threads, of_worlds)
 

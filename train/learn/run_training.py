@@ -10,16 +10,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from elastic_env.core.config import load_yaml
 from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig
 from train.learn.trainer import Trainer
 from train.runs.console import make_table
-from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
+from train.runs.folders import lock_part, lock_run, require_name, run_folder
 from train.runs.progress import Show, show_progress
-from train.runs.user_code import TRUST, load_without_code
+from train.runs.user_code import recorded_config
 from train.workers.calls import Outcome, Watch, run_calls
 from train.workers.executors import Executors
 
@@ -37,9 +36,15 @@ class Run:
     folder: Path
 
     @property
+    def here(self) -> "Run":
+        """The same with the whole path of its folder, for workers."""
+        return Run(self.config, self.folder.resolve())
+
+    @property
     def is_complete(self) -> bool:
         """True if all training seeds have come to their end."""
-        return all(_is_complete(self.folder / f"seed_{seed}") for seed in self.config.seeds)
+        seeds = self.config.seeds
+        return all(_is_complete(self.folder / f"seed_{seed}") for seed in seeds)
 
 
 def start(
@@ -70,7 +75,8 @@ def start(
             own = output
             if output is not None and len(configs) > 1:
                 own = output / require_name(config.name)
-            made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
+            recorded = config.model_dump(mode="json")
+            made = run_folder(config.name, recorded, config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
             held.enter_context(lock_run(runs[-1].folder))
         _train(runs, console, executors)
@@ -96,7 +102,8 @@ def resume(
         ConfigurationError: A folder is no training run, another program works on it, or its
             algorithm is not trusted.
     """
-    runs = [Run(_recorded_config(folder, trust_code), folder) for folder in folders]
+    configs = [recorded_config(own, TrainConfig, trust_code) for own in folders]
+    runs = list(map(Run, configs, folders))
     with ExitStack() as held:
         for run in runs:
             held.enter_context(lock_run(run.folder))
@@ -104,39 +111,26 @@ def resume(
     return [run.folder for run in runs]
 
 
-def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
-    """The configuration of a run that is gone on with."""
-    file = require_run(folder, "training run", "train printed")
-    if trust_code:
-        return load_yaml(file, TrainConfig)
-    return load_without_code(file, TrainConfig, _names_of_code, TRUST)
-
-
-def _names_of_code(config: TrainConfig) -> list[str]:
-    """Names that may stand for code; that of the base never does."""
-    return [config.algorithm, config.env]
-
-
 def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
         text = f"training in {run.folder}; if it stops: elastic train --resume {run.folder}"
         if run.is_complete:
-            text = (
-                f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
-            )
+            cure = "to learn for longer, start a new run with --decisions"
+            text = f"{run.folder} is complete; {cure}"
         console.print(text, soft_wrap=True)
     calls = [(run, seed) for run in runs for seed in run.config.seeds]
     names = [f"seed {seed}" for _, seed in calls]
     if len(runs) > 1:
         names = [f"{run.folder.name}, seed {seed}" for run, seed in calls]
-    totals = {name: run.config.decisions for name, (run, _) in zip(names, calls, strict=True)}
+    decisions = [run.config.decisions for run, _ in calls]
+    totals = dict(zip(names, decisions, strict=True))
     with show_progress(console, totals, unit="decisions") as show:
         if executors == ONE_BY_ONE:
             for number, (run, seed) in enumerate(calls):
-                _train_seed(run.config, seed, run.folder, 0, partial(show, number))
+                _train_seed(run, seed, 0, partial(show, number))
         else:
             threads = executors.threads_per_call(len(calls))
-            given = [(run.config, seed, run.folder.resolve(), threads) for run, seed in calls]
+            given = [(run.here, seed, threads) for run, seed in calls]
             watch = _watch(names, console, show)
             with executors.open(len(given), runs[0].folder) as pool:
                 # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint
@@ -165,20 +159,19 @@ def _watch(names: Sequence[str], console: Console, show: Show) -> Watch:
 def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> None:
     """The first error of a seed, when the others have ended."""
     for name, outcome in zip(names, outcomes, strict=True):
-        if outcome is not None and outcome.error is not None:
-            outcome.error.add_note(f"in the training of {name}; the other seeds have ended")
-            raise outcome.error
+        if outcome is not None and (error := outcome.error) is not None:
+            error.add_note(f"in the training of {name}; the other seeds have ended")
+            raise error
 
 
-def _train_seed(
-    config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]
-) -> None:
+def _train_seed(run: Run, seed: int, threads: int, report: Callable[[int], None]) -> None:
     """Train a seed, or go on with it.
 
     A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed
     over, waits for it.
     """
-    own = folder / f"seed_{seed}"
+    config = run.config
+    own = run.folder / f"seed_{seed}"
     report(0)
     with lock_part(own, _PATIENCE_S):
         if not _is_complete(own):
@@ -212,7 +205,8 @@ def _table(config: TrainConfig, folder: Path) -> Table:
     for seed in config.seeds:
         rows = read_progress(folder / f"seed_{seed}", metrics, ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
-            changes = [_change(row[f"base_{c.metric}"], row[c.metric], c.scale) for c in columns]
+            both = [(row[f"base_{c.metric}"], row[c.metric], c.scale) for c in columns]
+            changes = [_change(*own) for own in both]
             table.append([str(seed), row["scenario"], *changes, f"{row['failed']:.0f}"])
     title = f"last policies on {config.base}, on episodes that training never sees"
     return make_table(title, head, table, left=2)
@@ -220,6 +214,7 @@ def _table(config: TrainConfig, folder: Path) -> Table:
 
 def _change(base: float, mine: float, scale: float) -> str:
     """Two scores and the change between them; - for one of which all episodes failed."""
-    both = " → ".join(f"{scale * score:.2f}" if isfinite(score) else "-" for score in (base, mine))
+    scores = [scale * score for score in (base, mine)]
+    both = " → ".join(f"{score:.2f}" if isfinite(score) else "-" for score in scores)
     change = mine / base - 1.0 if base else nan
     return f"{both} ({100.0 * change:+.0f} %)" if isfinite(change) else both

@@ -38,19 +38,20 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ConfigurationError(
-                f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
-            )
+            why = "SB3 restarts worlds in the same step"
+            problem = f"{why}, autoreset_mode must be SameStep, got {mode}"
+            raise ConfigurationError(problem)
         self.env = env
         self._stagger = stagger
         self._actions: Any = None
         self._reward = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, dtype=np.int64)
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        spaces = (env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, *spaces)
 
     def reset(self) -> Any:
         """Begin an episode in every world, with the seeds of the last call of `seed`."""
-        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        seeds: Any = None if self._seeds[0] is None else list(self._seeds)
         observation, _ = self.env.reset(seed=seeds)
         if self._stagger is not None:
             self.env.stagger(self._stagger)  # type: ignore[attr-defined]
@@ -88,12 +89,12 @@ class SB3VecEnv(VecEnv):
             metrics = final.get("episode_metrics", {})
             scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
-                own = {
-                    name: values[world].item() for name, values in metrics.items() if scored[world]
-                }
+                ended = metrics if scored[world] else {}
+                own = {name: values[world].item() for name, values in ended.items()}
+                is_cut = bool(truncated[world] and not terminated[world])
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
-                    "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
+                    "TimeLimit.truncated": is_cut,
                     "episode_metrics": own,
                 }
                 if own or self._stagger is None:
@@ -121,9 +122,8 @@ class SB3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Worlds have no attributes of their own."""
-        raise NotImplementedError(
-            "the worlds of a vector environment have no attributes of their own"
-        )
+        problem = "the worlds of a vector environment have no attributes of their own"
+        raise NotImplementedError(problem)
 
     def env_method(
         self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any

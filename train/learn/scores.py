@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -80,18 +81,17 @@ class Scores:
             self.best = score
             self.keep("best", decisions, policy)
         shutil.rmtree(current)
-        found = dict(zip(columns, (ratios.mean(axis=0) - 1.0).tolist(), strict=True))
-        known = {f"{name}_change": change for name, change in found.items() if np.isfinite(change)}
-        return {**known, "failed": float(failed.sum())}
+        found = {"failed": float(failed.sum())}
+        for name, ratio in zip(columns, ratios.mean(axis=0).tolist(), strict=True):
+            if np.isfinite(ratio):
+                found[f"{name}_change"] = ratio - 1.0
+        return found
 
     def keep(self, name: str, decisions: int, policy: _Policy) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
         tensors, description = policy
-        training = {
-            "config": self._config.model_dump(mode="json"),
-            "decisions": decisions,
-            **self._provenance,
-        }
+        recorded = self._config.model_dump(mode="json")
+        training = {"config": recorded, "decisions": decisions, **self._provenance}
         fresh = self._folder / f"{name}.new"
         shutil.rmtree(fresh, ignore_errors=True)
         save_residual(fresh, description.replace(training=training), tensors)
@@ -114,7 +114,8 @@ class Scores:
 
     def _play(self, policy: str, metrics: list[str]) -> _Scored:
         """Scores of a policy in every scenario."""
-        conditions = [self._config.condition(name, policy) for name in self._config.scenarios]
+        names = self._config.scenarios
+        conditions = [self._config.condition(name, policy) for name in names]
         results = play_together(conditions, metrics, self._threads)
         means = [
             [np.mean(some) if len(some) else np.nan for some in scores[~failed].T]
@@ -126,7 +127,7 @@ class Scores:
 def _append(table: pd.DataFrame, path: Path) -> None:
     """Add rows to a table of evaluations, as `Scores.forget_after` leaves it."""
     before = _text_of(path)
-    rows = table.to_csv(index=False, header=not before, na_rep="nan", lineterminator="\n")
+    rows = table.to_csv(index=False, header=not before, na_rep="nan")
     write_whole(path, before + rows)
 
 
@@ -162,7 +163,8 @@ def play_together(
         For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
     """
     sizes = [condition.episodes for condition in conditions]
-    seeds = [condition.seed + i for condition in conditions for i in range(condition.episodes)]
+    spans = [range(own.seed, own.seed + own.episodes) for own in conditions]
+    seeds = [*chain(*spans)]
     values = np.full((len(seeds), len(metrics)), np.nan)
     failed = np.zeros(len(seeds), dtype=np.bool_)
     playing = np.ones_like(failed)
@@ -171,7 +173,8 @@ def play_together(
         for step in control_steps(worlds, policy, seeds):
             first = playing & step.is_over
             if first.any():
-                scores = np.stack([step.info["episode_metrics"][name] for name in metrics], axis=1)
+                found = step.info["episode_metrics"]
+                scores = np.stack([found[name] for name in metrics], axis=1)
                 values[first] = scores[first]
                 failed[first] = step.terminated[first]
                 playing &= ~first

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 import baselines
 from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
+from elastic_env.core.config import Entries, Locator, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
@@ -23,6 +23,7 @@ from train.evaluate.environments import environment
 from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
+from train.runs.user_code import CodeNamingModel
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
@@ -36,14 +37,14 @@ _TRAINING_SEED_STRIDE = 100_000
 _MOST_DECISIONS = 10**12
 
 
-class TrainConfig(Model):
+class TrainConfig(CodeNamingModel):
     """A training: worlds, base policy, algorithm, and how long."""
 
     name: Title = "train"
     env: str = "walker"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
+    scenarios: Entries[Title] = ["nominal"]
     """Scenarios whose worlds are learned from together, in equal shares."""
     weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = {}
     """How much the rewards of single scenarios count, at most 10⁶; 1 where nothing is said."""
@@ -71,9 +72,7 @@ class TrainConfig(Model):
     """Worlds, shared out to the scenarios."""
     decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
     """Decisions of all worlds together."""
-    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(
-        default=[0], min_length=1, max_length=MOST_ENTRIES
-    )
+    seeds: Entries[Annotated[int, Field(ge=0, lt=2**32)]] = [0]
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
@@ -121,38 +120,32 @@ class TrainConfig(Model):
         return seeds
 
     @property
-    def motion(self) -> Any:
-        """The reference, or the environment's default."""
-        if self.reference is not None:
-            return self.reference
-        return environment(self.env).default_reference
+    def names_of_code(self) -> list[str]:
+        """Names that may stand for code; that of the base never does."""
+        return [self.algorithm, self.env]
 
     def condition(self, scenario: str, policy: str) -> Condition:
         """A cell in which a policy is evaluated; where nothing is drawn, it has one episode."""
-        is_one = environment(self.env).is_deterministic(scenario, self.motion)
         options = self.base_options if policy == self.base else {}
-        return Condition(
+        condition = Condition(
             env=self.env,
             policy=PolicySpec(name=policy, options=options),
             scenario=scenario,
-            reference=self.motion,
+            reference=self.reference,
             ranges=self.ranges,
             env_options=self.env_options,
-            episodes=1 if is_one else self.evaluation_episodes,
+            episodes=self.evaluation_episodes,
             seed=EVALUATION_SEED,
         )
+        is_one = condition.environment.is_deterministic(scenario, condition.reference)
+        return condition.replace(episodes=1) if is_one else condition
 
     def description(self, joints: list[str], **network: Any) -> ResidualDescription:
         """Description of an exported policy; `network` names its activation and output."""
-        return ResidualDescription(
-            robot=environment(self.env).robot,
-            joints=joints,
-            base=self.base,
-            base_options=self.base_options,
-            settings=self.settings,
-            clip=self.clip,
-            **network,
-        )
+        names = ("base", "base_options", "settings", "clip")
+        own = {name: getattr(self, name) for name in names}
+        robot = environment(self.env).robot
+        return ResidualDescription(robot=robot, joints=joints, **own, **network)
 
     def is_due(self, every: int, before: int, now: int) -> bool:
         """True if work that is done every so many decisions, and at the end, is due."""
@@ -167,11 +160,11 @@ class TrainConfig(Model):
         """
         count = len(self.scenarios)
         if self.worlds < 2 * count:
-            raise ConfigurationError(
-                f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
-            )
+            problem = f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}"
+            raise ConfigurationError(problem)
         whole, rest = divmod(self.worlds, count)
-        return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
+        sizes = [whole + (number < rest) for number in range(count)]
+        return list(zip(self.scenarios, sizes, strict=True))
 
 
 _WORLD_BYTES = 100_000
@@ -207,13 +200,11 @@ def training_worlds(
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
     apart = {**environment(config.env).learned_from, **config.env_options}
-    worlds = mixed_env(
-        [condition.replace(env_options=apart) for condition in conditions],
-        [count for _, count in shares],
-        threads,
-        [config.weights.get(scenario, 1.0) for scenario, _ in shares],
-    )
+    conditions = [condition.replace(env_options=apart) for condition in conditions]
+    weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
+    sizes = [count for _, count in shares]
+    worlds = mixed_env(conditions, sizes, threads, weights)
     base = baselines.make(config.base, worlds, **config.base_options)
-    return ResidualVectorWrapper(
-        worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump()
-    )
+    settings = config.settings.model_dump()
+    mode = AutoresetMode.SAME_STEP
+    return ResidualVectorWrapper(worlds, base, autoreset_mode=mode, **settings)

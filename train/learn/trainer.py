@@ -32,6 +32,9 @@ class Trainer(ABC):
         self._seed = seed
         self._scores = Scores(config, seed, folder, threads)
         self._kept: int | None = None
+        self._prepare(threads)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
         """Learn to the end of the configuration's decisions; `progress` is told the decisions done.
@@ -68,7 +71,7 @@ class Trainer(ABC):
         self._kept = self.done
 
     def _go_on(self) -> None:
-        """Go on from the checkpoint, if there is one; the last step of making a trainer.
+        """Go on from the checkpoint, if there is one.
 
         Raises:
             ElasticError: The checkpoint is not what was written.
@@ -78,24 +81,15 @@ class Trainer(ABC):
             require_whole(path)
             try:
                 self._read(path)
-            except (
-                KeyError,
-                IndexError,
-                TypeError,
-                ValueError,
-                RecursionError,
-                RuntimeError,
-            ) as error:
+            except (LookupError, TypeError, ValueError, RuntimeError) as error:
                 raise damage_error(path, f"{type(error).__name__}: {error}") from error
             self._kept = self.done
         self._scores.forget_after(self.done)
 
     def _divergence_text(self, quantity: str) -> str:
         """The sentence for a quantity that is no longer finite."""
-        kept = (
-            f"the checkpoint of decision {self._kept} is kept in"
-            f" {shorten(self.folder / CHECKPOINT)}"
-        )
+        place = shorten(self.folder / CHECKPOINT)
+        kept = f"the checkpoint of decision {self._kept} is kept in {place}"
         if self._kept is None:
             kept = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
         return (
@@ -103,6 +97,10 @@ class Trainer(ABC):
             f" {self._seed}; {kept}; begin anew with a smaller learning_rate or log_std_init, or"
             " smaller weights of the reward"
         )
+
+    @abstractmethod
+    def _prepare(self, threads: int) -> None:
+        """Make the worlds, on some threads, and what learns in them."""
 
     @abstractmethod
     def _write(self, checkpoint: Path) -> None:

@@ -18,41 +18,28 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual.settings import ResidualDescription
-from train.learn.algorithms import algorithm_class, name_options
-from train.learn.curves import Curves
-from train.learn.export import network_of
+from train.learn.algorithm_options import complete_options
+from train.learn.checkpoint import read_state, write_state
+from train.learn.export import algorithm_class, name_options, network_of
 from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.state import read_state, write_state
 from train.learn.train_config import (
     FIRST_TRAINING_SEED,
-    TrainConfig,
     first_episode,
     joints_of,
     training_worlds,
 )
 from train.learn.trainer import Trainer
 
-_COMMON = {"gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512}
-_PPO = {
-    "n_steps": 32,
-    "n_epochs": 10,
-    "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
-}
-_SAC_NETWORKS = {"net_arch": {"pi": [64, 64], "qf": [256, 256]}}
-_SAC = {"buffer_size": 200_000, "learning_starts": 2_000, "train_freq": 4, "gradient_steps": 8}
-_DEFAULTS: dict[str, dict[str, Any]] = {
-    "PPO": {**_COMMON, **_PPO},
-    "SAC": {**_COMMON, **_SAC, "policy_kwargs": _SAC_NETWORKS},
-}
 _OF_MODEL = ("num_timesteps", "_n_updates", "_episode_num")
 """Attributes of an algorithm of SB3 that a training goes on from."""
-_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_REPLAY = "observations next_observations actions rewards dones timeouts"
 
 
 class Training(Trainer):
@@ -68,33 +55,31 @@ class Training(Trainer):
         ConfigurationError: Names or options that do not exist.
     """
 
-    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
+    def _prepare(self, threads: int) -> None:
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
-        super().__init__(config, seed, folder, threads)
+        config = self.config
+        seed = self._seed
         worlds = training_worlds(config, config.shares, threads)
         self._joints = joints_of(worlds)
         self._worlds = SB3VecEnv(worlds, np.random.default_rng(seed))
-        self._seed = seed
-        options = _merge(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
+        options = complete_options(config.algorithm, config.algorithm_options)
         gamma = options.get("gamma", 0.99)
-        self._normaliser = VecNormalize(
-            self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma
-        )
+        scales = {"clip_obs": config.clip, "gamma": gamma}
+        self._normaliser = VecNormalize(self._worlds, norm_reward=True, **scales)
         set_random_seed(seed)
         self._normaliser.seed(first_episode(seed))
         algorithm = algorithm_class(config.algorithm)
-        with name_options(config.algorithm, config.algorithm_options), warnings.catch_warnings():
-            # a rollout whose last minibatch is smaller is no mistake
-            warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-            self.model: Any = algorithm(
-                "MlpPolicy", self._normaliser, device="cpu", seed=None, **_with_activation(options)
-            )
+        options = {**_with_activation(options), "device": "cpu", "seed": None}
+        with name_options(config.algorithm, config.algorithm_options):
+            with warnings.catch_warnings():
+                # a rollout whose last minibatch is smaller is no mistake
+                smaller = "You have specified a mini-batch size"
+                warnings.filterwarnings("ignore", smaller, UserWarning)
+                self.model: Any = algorithm("MlpPolicy", self._normaliser, **options)
             self._learning_rate = float(self.model.lr_schedule(1.0))
             self._shrink_last_layer()
         self.model.action_space.seed(seed)
-        folder.mkdir(parents=True, exist_ok=True)
-        self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
         """Learn to the end, and raise here what TensorBoard's thread could not write."""
@@ -129,8 +114,9 @@ class Training(Trainer):
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
         try:
-            self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
-        except ValueError:  # of a distribution of torch whose parameters are nan, for one
+            portion = self._portion()
+            self.model.learn(portion, reset_num_timesteps=before == 0, log_interval=1)
+        except ValueError:  # such as of a distribution whose parameters are nan
             self._require_finite_weights()
             raise
         self._require_finite_weights()
@@ -138,8 +124,9 @@ class Training(Trainer):
     def _require_finite_weights(self) -> None:
         for name, tensor in self.model.policy.state_dict().items():
             require_finite(f"{name} of the network", tensor.numpy())
-        for name, rms in zip(("observations", "returns"), self._statistics, strict=True):
-            require_finite(f"the variance of the {name}", rms.var)
+        observations, returns = self._statistics
+        require_finite("the variance of the observations", observations.var)
+        require_finite("the variance of the returns", returns.var)
 
     def _write(self, checkpoint: Path) -> None:
         parameters = io.BytesIO()  # torch itself calls a full disk an internal error
@@ -191,9 +178,8 @@ class Training(Trainer):
         if isinstance(model, OffPolicyAlgorithm):
             buffer: Any = model.replay_buffer
             size = buffer.buffer_size if buffer.full else buffer.pos
-            state["replay"] = {
-                name: getattr(buffer, name)[:size] for name in _REPLAY if hasattr(buffer, name)
-            }
+            kept = [name for name in _REPLAY.split() if hasattr(buffer, name)]
+            state["replay"] = {name: getattr(buffer, name)[:size] for name in kept}
             state["replay_at"] = [buffer.pos, bool(buffer.full)]
         return state
 
@@ -225,18 +211,15 @@ class Training(Trainer):
     def _begin_episodes(self) -> None:
         """End all episodes and begin others, seeded by the training seed and the decisions done."""
         model = self.model
-        if isinstance(
-            model, OffPolicyAlgorithm
-        ):  # the last transitions are of episodes that are cut
+        if isinstance(model, OffPolicyAlgorithm):
+            # the last transitions are of episodes that are cut
             buffer: Any = model.replay_buffer
             last = buffer.pos - 1
-            buffer.timeouts[last] = np.logical_or(
-                buffer.timeouts[last], np.logical_not(buffer.dones[last])
-            )
+            is_cut = np.logical_not(buffer.dones[last])
+            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], is_cut)
         entropy = np.random.SeedSequence((self._seed, self.done))
-        self._worlds.begin_with(
-            FIRST_TRAINING_SEED + int(entropy.generate_state(1)[0]), np.random.default_rng(entropy)
-        )
+        first = FIRST_TRAINING_SEED + int(entropy.generate_state(1)[0])
+        self._worlds.begin_with(first, np.random.default_rng(entropy))
         model._last_obs = self._normaliser.reset()
         model._last_original_obs = self._normaliser.get_original_obs()
         model._last_episode_starts = np.ones(self.config.worlds, dtype=np.bool_)
@@ -248,7 +231,7 @@ class Training(Trainer):
 
     def _portion(self) -> int:
         """Decisions of one call of `learn`: a rollout of PPO; SAC goes on to its next update."""
-        if isinstance(self.model, OffPolicyAlgorithm):  # whose n_steps are those of its returns
+        if isinstance(self.model, OffPolicyAlgorithm):  # n_steps are those of returns
             return self.config.worlds
         return self.config.worlds * self.model.n_steps
 
@@ -262,8 +245,8 @@ class Training(Trainer):
 
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
         """The present policy, as it is exported."""
-        tensors, activation, output = network_of(self.model, self._normaliser)
-        return tensors, self.config.description(self._joints, activation=activation, output=output)
+        tensors, network = network_of(self.model, self._normaliser)
+        return tensors, self.config.description(self._joints, **network)
 
     def _show(self, changes: Mapping[str, float]) -> None:
         for name, change in changes.items():
@@ -295,11 +278,6 @@ def _thread_raises_here() -> Iterator[None]:
         threading.excepthook = before
 
 
-def _merge(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    policy = {**defaults.get("policy_kwargs", {}), **(given.get("policy_kwargs") or {})}
-    return {**defaults, **given, **({"policy_kwargs": policy} if policy else {})}
-
-
 def _with_activation(options: dict[str, Any]) -> dict[str, Any]:
     """Options with the activation's class in the place of its name."""
     policy = dict(options.get("policy_kwargs") or {})
@@ -309,8 +287,50 @@ def _with_activation(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _to_lists(value: Any) -> Any:
-    return [_to_lists(part) for part in value] if isinstance(value, tuple) else value
+    return list(map(_to_lists, value)) if isinstance(value, tuple) else value
 
 
 def _to_tuples(value: Any) -> Any:
-    return tuple(_to_tuples(part) for part in value) if isinstance(value, list) else value
+    return tuple(map(_to_tuples, value)) if isinstance(value, list) else value
+
+
+_REWARD = "rollout/reward_per_decision"
+_MISLEADING = "rollout/ep_rew_mean"
+"""Sum of rewards of an episode: each is a penalty, so that an episode which ends early would
+look better.
+"""
+
+
+class Curves(Logger):
+    """SB3's logger with the reward per decision in the place of that per episode.
+
+    It is the mean over the last whole episodes. Those that were cut short to spread the worlds over
+    the motion do not count, since their decisions are of its beginning alone.
+
+    Args:
+        folder: Of TensorBoard's files.
+        model: Whose episodes they are.
+        worlds: In which it learns.
+    """
+
+    def __init__(self, folder: str, model: Any, worlds: SB3VecEnv) -> None:
+        super().__init__(folder, [make_output_format("tensorboard", folder)])
+        self._model = model
+        self._worlds = worlds
+
+    def dump(self, step: int = 0) -> None:
+        """Write what was recorded; see SB3."""
+        self.name_to_value.pop(_MISLEADING, None)
+        self.name_to_excluded.pop(_MISLEADING, None)
+        episodes = self._model.ep_info_buffer
+        if episodes:
+            decisions = sum(episode["l"] for episode in episodes)
+            self.record(_REWARD, sum(episode["r"] for episode in episodes) / decisions)
+        super().dump(step)
+
+    def finish(self, step: int) -> None:
+        """Write the reward per decision of the present episodes, where no whole one has ended."""
+        reward = self._worlds.reward_per_decision
+        if not self._model.ep_info_buffer and reward is not None:
+            self.record(_REWARD, reward)
+            self.dump(step)

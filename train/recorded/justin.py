@@ -211,7 +211,7 @@ def _problem(
     sites = [(f"{side}_hand", model.site(f"{side}_hand")) for side in sides]
     places = [(name, int(site.bodyid[0]), site.pos.copy()) for name, site in sites]
     problem = GeometryProblem(
-        model=GeometryModel.of(_tree(spec, joints), model.opt.gravity, places),
+        model=GeometryModel.of(_tree(spec, joints), joints, model.opt.gravity, places),
         theta=poses.theta[:, columns],
         measured=poses.measured[:, markers],
         joints=joints,

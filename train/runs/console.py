@@ -26,32 +26,32 @@ class PlainConsole(Console):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(emoji=False, **options)  # a policy of the user may be called mine:zero
+        # a policy of the user may be called mine:zero
+        super().__init__(emoji=False, **options)
 
     def print(self, *objects: Any, markup: bool = False, **options: Any) -> None:
         """Print texts as they are: without markup, colours or line breaks of our own."""
         if all(isinstance(part, str | Text) for part in objects):
             options = {"soft_wrap": True, "highlight": False, **options}
-        highlight = options.get("highlight")
-        parts = [
-            self.render_str(part, markup=markup, highlight=highlight)
-            if isinstance(part, str)
-            else part
-            for part in objects
-        ]
-        super().print(*parts, **options)
+        style = {"markup": markup, "highlight": options.get("highlight")}
+
+        def plain(part: Any) -> Any:
+            return self.render_str(part, **style) if isinstance(part, str) else part
+
+        super().print(*map(plain, objects), **options)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         """Render with visible texts, and what Rich itself asks of the terminal stays."""
-        for segment in super().render(renderable, options):
-            yield segment if segment.control else Segment(visible(segment.text), segment.style)
+        for one in super().render(renderable, options):
+            yield one if one.control else Segment(visible(one.text), one.style)
 
 
-def make_table(
-    title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any
-) -> Table:
+_Row = Sequence[str]
+
+
+def make_table(title: str, head: _Row, rows: Iterable[_Row], left: int = 1, **style: Any) -> Table:
     """A table of plain texts.
 
     Args:

@@ -25,7 +25,7 @@ _COMMANDS = re.compile(
     "\ud800-\udfff]"  # halves of characters, which no stream takes
 )
 _LINK = re.compile(
-    r"\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\.", re.IGNORECASE
+    r"(?i)\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\."
 )
 """Signs of Markdown without which a text is no link and no image."""
 _BACKSLASH = re.compile(r"\\(?=[!-/:-@[-`{-~])")
@@ -63,7 +63,8 @@ def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) ->
 def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
     """Write a CSV file of rows by column; what a row does not have is empty."""
     head = list(dict.fromkeys(name for record in records for name in record))
-    return write_csv(head, ([record.get(name, "") for name in head] for record in records), path)
+    rows = [[record.get(name, "") for name in head] for record in records]
+    return write_csv(head, rows, path)
 
 
 def markdown_text(text: str) -> str:
@@ -82,18 +83,19 @@ def _escape(found: re.Match[str]) -> str:
     return f"{sign}\\" if sign == "]" else f"\\{sign}"
 
 
-def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+_Row = Sequence[str]
+
+
+def markdown_table(head: _Row, rules: _Row, rows: Iterable[_Row]) -> str:
     """A table of plain texts; `rules` say how columns are aligned, such as "---:"."""
-    lines = [map(markdown_text, head), rules, *(map(markdown_text, row) for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    above, *below = [[markdown_text(cell) for cell in row] for row in (head, *rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (above, rules, *below))
 
 
 def script_json(value: Any) -> str:
     """JSON within a script element: nothing in it ends the element or begins a comment."""
-    text = json.dumps(
-        _visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False
-    )
-    return text.translate(_IN_SCRIPT)
+    plain = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}
+    return json.dumps(_visible_data(value), **plain).translate(_IN_SCRIPT)
 
 
 def _visible_data(value: Any) -> Any:
@@ -102,7 +104,8 @@ def _visible_data(value: Any) -> Any:
         return visible(value)
     if isinstance(value, dict):
         return {key: _visible_data(part) for key, part in value.items()}
-    return [_visible_data(part) for part in value] if isinstance(value, list | tuple) else value
+    is_list = isinstance(value, list | tuple)
+    return [_visible_data(part) for part in value] if is_list else value
 
 
 def template_value(value: Any) -> Any:

@@ -12,6 +12,7 @@
 
 import ctypes
 import errno
+import re
 from collections.abc import Iterator
 
 from train.runs.import_path import ShadowedError
@@ -55,26 +56,26 @@ def explain(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, ModuleNotFoundError) and (extra := _extra_of(error)):
         return str(missing_extra(str(error.name), extra, "this")), WRONG_INPUT
     if isinstance(error, MemoryError):
-        return "there is not enough memory; take fewer worlds or fewer --jobs", SYSTEM_FAILED
+        cure = "take fewer worlds or fewer --jobs"
+        return f"there is not enough memory; {cure}", SYSTEM_FAILED
     for cause in _causes(error):
         if isinstance(cause, OSError) and cause.errno is not None:
             place = f"{shorten(cause.filename)}: " if cause.filename else ""
-            cure = _CURES.get(cause.errno)
-            return f"{place}{cause.strerror}" + (f"; {cure}" if cure else ""), SYSTEM_FAILED
+            cure = f"; {_CURES[cause.errno]}" if cause.errno in _CURES else ""
+            return f"{place}{cause.strerror}{cure}", SYSTEM_FAILED
     return None
 
 
 def is_interrupt(error: BaseException) -> bool:
     """True if it is Ctrl-C, which a loading module or a call of C may turn into another error."""
-    return any(
-        isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error)
-    )
+    return any(map(_is_of_ctrl_c, _causes(error)))
 
 
-def _quotes_interrupt(error: BaseException) -> bool:
-    """True if `ctypes` met Ctrl-C while it converted an argument: its error quotes it."""
-    names = (KeyboardInterrupt.__name__, EndedError.__name__)
-    return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
+def _is_of_ctrl_c(error: BaseException) -> bool:
+    """True if it is, or if `ctypes` met it while it converted an argument, and quotes it."""
+    if isinstance(error, ctypes.ArgumentError):
+        return re.search("KeyboardInterrupt|EndedError", str(error)) is not None
+    return isinstance(error, KeyboardInterrupt)
 
 
 def is_unread(error: BaseException) -> bool:
@@ -84,12 +85,13 @@ def is_unread(error: BaseException) -> bool:
 
 def is_full(error: BaseException) -> bool:
     """True if it comes from a disk, a quota or a limit on files that leaves no room."""
-    return any(isinstance(cause, OSError) and cause.errno in _NO_ROOM for cause in _causes(error))
+    causes = [cause for cause in _causes(error) if isinstance(cause, OSError)]
+    return any(cause.errno in _NO_ROOM for cause in causes)
 
 
 def _extra_of(error: ModuleNotFoundError) -> str:
     package = str(error.name).split(".")[0]
-    return next((extra for extra, packages in _EXTRAS.items() if package in packages), "")
+    return next((extra for extra in _EXTRAS if package in _EXTRAS[extra]), "")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

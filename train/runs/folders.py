@@ -36,7 +36,8 @@ _LOCK = ".lock"
 _RETRY_S = 0.2
 _LONGEST_HOLDER = 200
 """Characters of a lock that say who holds it."""
-_LIBRARIES = ("mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
+_RECORDED = "elastic-env mujoco gymnasium pin numpy scipy stable-baselines3 torch"
+"""Packages whose versions a run records."""
 
 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
@@ -45,13 +46,8 @@ def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> N
     write_whole(folder / _METADATA, json.dumps(provenance(seed), indent=2) + "\n")
 
 
-def require_run(folder: Path, what: str, writer: str) -> Path:
-    """The configuration of a run that is gone on with.
-
-    Args:
-        folder: Of the run.
-        what: What kind of run it has to be, in words.
-        writer: Who made such a folder, in words.
+def require_run(folder: Path) -> Path:
+    """The file with the configuration of a run that is gone on with.
 
     Raises:
         ConfigurationError: The folder has no configuration, or something in it is a link that leads
@@ -59,9 +55,8 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
     """
     file = folder / CONFIG
     if not file.is_file():
-        raise ConfigurationError(
-            f"{folder} is no {what}: it has no {CONFIG}; name the folder that {writer}"
-        )
+        problem = f"{folder} is no run: it has no {CONFIG}; name a run's folder"
+        raise ConfigurationError(problem)
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(place, name)
@@ -72,9 +67,8 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
                     " remove it"
                 )
             if not (stat.S_ISLNK(kind) or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-                raise ConfigurationError(
-                    f"{path} is neither a file nor a folder, as all of a run are; remove it"
-                )
+                problem = f"{path} is neither a file nor a folder, as all of a run are; remove it"
+                raise ConfigurationError(problem)
     return file
 
 
@@ -93,9 +87,8 @@ def free_folder(name: str, output: Path | None = None) -> Path:
         return _next_free(require_name(name)) if output is None else _empty(output)
     except OSError as error:
         cause = f"{shorten(error.filename or place)}: {error.strerror or error}"
-        raise SystemFailedError(
-            f"no folder for results can be made at {shorten(place)} ({cause}); name one by --output"
-        ) from None
+        problem = f"no folder for results can be made at {shorten(place)} ({cause})"
+        raise SystemFailedError(f"{problem}; name one by --output") from None
 
 
 def require_name(name: str) -> str:
@@ -192,11 +185,11 @@ def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def run_folder(
-    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
+    name: str, recorded: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:
     """`own_folder` for a new run, described; arguments as there and in `describe`."""
     with own_folder(name, output) as folder:
-        describe(folder, configuration, seed)
+        describe(folder, recorded, seed)
         yield folder
 
 
@@ -230,7 +223,8 @@ def _next_free(name: str) -> Path:
 
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
-        raise ResultsExistError(f"{shorten(folder)} is a file; name a folder that is new or empty")
+        cure = "name a folder that is new or empty"
+        raise ResultsExistError(f"{shorten(folder)} is a file; {cure}")
     folder.mkdir(parents=True, exist_ok=True)
     if names := sorted(path.name for path in folder.iterdir()):
         raise ResultsExistError(
@@ -248,7 +242,7 @@ def provenance(seed: int | None) -> dict[str, Any]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: installed_version(name) for name in ("elastic-env", *_LIBRARIES)},
+        "versions": {name: installed_version(name) for name in _RECORDED.split()},
     }
 
 
@@ -262,15 +256,10 @@ def installed_version(package: str) -> str | None:
 
 def _commit() -> str | None:
     """Commit of the source tree, with a + for uncommitted changes; None outside a repository."""
-    here = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(
-            ["git", *arguments], cwd=here, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
-
+    command = ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    options: Any = {"cwd": Path(__file__).parent, "text": True, "timeout": 10}
+    options["stderr"] = subprocess.DEVNULL
     try:
-        is_changed = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("+" if is_changed else "")
+        return subprocess.check_output(command, **options).strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -53,7 +53,8 @@ def _require_ours() -> None:
     for name in _OURS:
         spec = importlib.util.find_spec(name)
         own = _ROOT / name / "__init__.py"
-        found = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
+        origin = spec and spec.origin
+        found = Path(origin).resolve() if origin else None
         if found != own:
             raise ShadowedError(
                 f"{found or name} stands in the place of the package {name} of elastic-env,"

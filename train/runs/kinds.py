@@ -28,10 +28,14 @@ def is_a(kind: str) -> Callable[[Any], Any]:
 
     def check(values: Any) -> Any:
         given = set(values) if isinstance(values, dict) else set()
-        count = {name: len(given & set(keys.split())) for name, (_, keys) in TELLING.items()}
-        likely = max(count, key=lambda name: count[name])
-        if count[likely] > count[kind]:
-            raise ValueError(f"this is the configuration of a {likely}: {TELLING[likely][0]} FILE")
+
+        def count(name: str) -> int:
+            return len(given.intersection(TELLING[name][1].split()))
+
+        likely = max(TELLING, key=count)
+        if count(likely) > count(kind):
+            command = f"{TELLING[likely][0]} FILE"
+            raise ValueError(f"this is the configuration of a {likely}: {command}")
         return values
 
     return check

@@ -6,15 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
@@ -69,8 +62,8 @@ def plain_progress(
         if int(10 * share) > said and time.monotonic() - when >= least_s:
             said = int(10 * share)
             when = time.monotonic()
-            more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
-            console.print(f"  {10 * said} %{more}")
+            more = f" of the {unit}, about {duration(to_go)} to go; {note}"
+            console.print(f"  {10 * said} %{more if note else ''}")
 
     return say
 
@@ -109,17 +102,16 @@ def show_progress(
         yield count
         return
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[note]}", markup=False),
     )
-    with Progress(*columns, console=console, transient=transient) as bar:
-        tasks = [
-            bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()
-        ]
+    with progress.Progress(*columns, console=console, transient=transient) as bar:
+        begun = {"start": False, "note": ""}
+        tasks = [bar.add_task(name, total=totals[name], **begun) for name in totals]
 
         def draw(number: int, amount: int, note: str = "") -> None:
             bar.start_task(tasks[number])
@@ -158,5 +150,6 @@ class _FirstRecord(logging.Handler):
         """Print the first record."""
         if not self._is_said:
             self._is_said = True
-            with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
+            # nobody reads: no reason to end what is compiled
+            with contextlib.suppress(OSError):
                 self._console.print(record.getMessage(), soft_wrap=True)

@@ -10,62 +10,81 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextvars import ContextVar
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
 from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, quote, shorten
+from train.runs.folders import require_run
 from train.runs.import_path import look_last_in
 
-_Config = TypeVar("_Config", bound=Model)
+
+class CodeNamingModel(Model):
+    """A configuration with names that may stand for code."""
+
+    @property
+    def names_of_code(self) -> list[str]:
+        """Those names."""
+        raise NotImplementedError
+
+
+_Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
-_REFUSED_IN: ContextVar["_Untrusted | None"] = ContextVar("refused_in", default=None)
-TRUST = "say --trust-code, or name a configuration of yours"
+_Refuse = Callable[[str], None]
+_REFUSE: ContextVar[_Refuse] = ContextVar("refuse", default=lambda _: None)
+"""Called with each name before its code runs."""
+_TRUST = "say --trust-code, or name a configuration of yours"
 """What the user can do who trusts the folder of a run."""
 
 
-@dataclass(frozen=True)
-class _Untrusted:
-    """A file whose names must not run code, and what the user can do to let them."""
-
-    file: Path
-    cure: str
-
-    def error(self, name: str) -> ConfigurationError:
-        """The error for a name of the file that stands for code."""
-        return ConfigurationError(
-            f"{self.file} names {quote(name)}, whose code would run; look at it, then {self.cure}"
-        )
+def _refuse(file: Path, cure: str, name: str) -> None:
+    """Refuse a name that stands for code in a file whose names must not run any."""
+    problem = f"{file} names {quote(name)}, whose code would run"
+    raise ConfigurationError(f"{problem}; look at it, then {cure}")
 
 
-def load_without_code(
-    file: Path, kind: type[_Config], names: Callable[[_Config], Iterable[str]], cure: str
-) -> _Config:
+def load_without_code(file: Path, kind: type[_Config], cure: str) -> _Config:
     """A configuration that was found and not named by the user; nothing that it names is imported.
 
     Args:
         file: Where it was found.
         kind: Of the configuration.
-        names: Its names that may stand for code.
         cure: What the user can do who trusts it, in words.
 
     Raises:
         ConfigurationError: It is no such configuration, or names code.
     """
-    found = _Untrusted(file, cure)
-    before = _REFUSED_IN.set(found)
+    refuse = partial(_refuse, file, cure)
+    before = _REFUSE.set(refuse)
     try:
         config = load_yaml(file, kind)
     finally:
-        _REFUSED_IN.reset(before)
-    for name in names(config):
+        _REFUSE.reset(before)
+    for name in config.names_of_code:
         if ":" in name:
-            raise found.error(name)
+            refuse(name)
     return config
+
+
+def recorded_config(folder: Path, kind: type[_Config], trust_code: bool = False) -> _Config:
+    """The configuration of a run that is gone on with.
+
+    Args:
+        folder: Of the run.
+        kind: Of the configuration.
+        trust_code: Whether code that it names may run: it may lie in the folder.
+
+    Raises:
+        ConfigurationError: The folder is no such run, or names code that is not trusted.
+    """
+    file = require_run(folder)
+    if trust_code:
+        return load_yaml(file, kind)
+    return load_without_code(file, kind, _TRUST)
 
 
 def named_object(name: str) -> Any:
@@ -79,8 +98,7 @@ def named_object(name: str) -> Any:
         ConfigurationError: There is no such module, file or attribute, or it fails while it is
             imported; or code is refused here, and nothing was imported.
     """
-    if (untrusted := _REFUSED_IN.get()) is not None:
-        raise untrusted.error(name)
+    _REFUSE.get()(name)
     place, _, attribute = name.rpartition(":")
     look_last_in(Path.cwd())
     try:
@@ -91,14 +109,10 @@ def named_object(name: str) -> Any:
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
-        own = [
-            name
-            for name, found in inspect.getmembers(module, inspect.isfunction)
-            if found.__module__ == module.__name__
-        ]
-        raise ConfigurationError(
-            f"{shorten(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
-        )
+        functions = inspect.getmembers(module, inspect.isfunction)
+        own = [name for name, found in functions if found.__module__ == module.__name__]
+        known = f"its functions are: {', '.join(own) or 'none'}"
+        raise ConfigurationError(f"{shorten(place)} has no {attribute!r}; {known}")
     return getattr(module, attribute)
 
 
@@ -107,10 +121,8 @@ def _require_unshadowed(module: ModuleType, attribute: str) -> None:
     file = Path(f"{module.__name__.replace('.', '/')}.py")
     found = getattr(module, "__file__", None)
     if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):
-        raise ConfigurationError(
-            f"{found or 'a built-in module'} stands before your {file}; name the file itself:"
-            f" {file}:{attribute}"
-        )
+        problem = f"{found or 'a built-in module'} stands before your {file}"
+        raise ConfigurationError(f"{problem}; name the file itself: {file}:{attribute}")
 
 
 def _from_path(module: str) -> ModuleType:

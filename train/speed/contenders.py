@@ -1,9 +1,9 @@
 """Contenders of `elastic speed`: each plays control steps and measures how long they take."""
 
 import itertools
-import threading
 import time
 from abc import ABC, abstractmethod
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -90,11 +90,13 @@ class VectorLoop(_OurLoop):
         residual: bool = False,
     ) -> None:
         with_policy = "" if policy is None else f" with {policy}"
-        self.title = f"vector env{with_policy}{' and residual network' if residual else ''}"
+        with_network = " and residual network" if residual else ""
+        self.title = f"vector env{with_policy}{with_network}"
         self.num_envs = num_envs
         self._condition = _condition(env, policy)
         super().__init__(make_vector_env(self._condition, num_envs, threads))
-        self._policy = None if policy is None else make_policy(PolicySpec(name=policy), self.env)
+        spec = self._condition.policy
+        self._policy = None if policy is None else make_policy(spec, self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
         self._state: Any = None
@@ -109,9 +111,8 @@ class VectorLoop(_OurLoop):
     @override
     def step(self) -> None:
         if self._policy is not None:
-            self._action, self._state = self._policy.predict(
-                self._observation, self._state, self._start, True
-            )
+            seen = (self._observation, self._state, self._start)
+            self._action, self._state = self._policy.predict(*seen, deterministic=True)
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
         # a world that ends begins a step later
         self._start = self._done
@@ -152,21 +153,16 @@ class RawWorlds(Contender):
         self._model = task.model
         self._substeps = task.num_substeps
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self.states = np.stack(
-            [self._state_of(simulation, world) for world in range(self.num_envs)]
-        )
+        worlds = range(self.num_envs)
+        self.states = np.stack([self._state_of(simulation, world) for world in worlds])
 
     @override
     def run(self, steps: int) -> float:
         controls = self._loop.controls
-        workers = [
-            threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))
-        ]
-        begin = time.perf_counter()
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
+        numbers = range(len(self._data))
+        with ThreadPoolExecutor(len(numbers)) as threads:
+            begin = time.perf_counter()
+            list(threads.map(self._play, numbers, itertools.repeat(controls)))
         return self.num_envs * steps / (time.perf_counter() - begin)
 
     @override
@@ -213,10 +209,10 @@ class ForeignLoop(Contender):
 
         subprocesses = partial(SubprocVecEnv, start_method="spawn")
         makers = (AsyncVectorEnv, subprocesses, SyncVectorEnv, DummyVecEnv)
-        kinds: dict[str, Any] = dict(zip((*IN_PROCESSES, *IN_THIS_PROCESS), makers, strict=True))
+        make: Any = makers[[*IN_PROCESSES, *IN_THIS_PROCESS].index(kind)]
         self.title = kind
         self.num_envs = num_envs
-        self.env = kinds[kind]([partial(_make, env)] * num_envs)
+        self.env = make([partial(_make, env)] * num_envs)
         self.env.reset()
         one_world = getattr(self.env, "single_action_space", self.env.action_space)
         self._action = np.zeros((num_envs, *one_world.shape), dtype=np.float32)
@@ -230,11 +226,16 @@ class ForeignLoop(Contender):
 
 
 class PPOLoop(Contender):
-    """PPO end to end, collecting and learning, of a residual: in our environment, or processes."""
+    """PPO end to end, collecting and learning, of a residual.
 
-    def __init__(
-        self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False
-    ) -> None:
+    Args:
+        env: Environment.
+        policy: Base.
+        n: Worlds.
+        threads: Of our vector environment; None for a process for each world.
+    """
+
+    def __init__(self, env: str, policy: str, n: int, threads: int | None) -> None:
         import torch
         from stable_baselines3 import PPO
         from stable_baselines3.common.logger import Logger
@@ -243,21 +244,22 @@ class PPOLoop(Contender):
         from baselines.residual_env import ResidualVectorWrapper
         from train.learn.sb3_env import SB3VecEnv
 
-        where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
+        where = f"SubprocVecEnv({n})" if threads is None else "vector env"
         self.title = f"PPO with {policy}, {where}"
-        self.num_envs = num_envs
+        self.num_envs = n
         has_model = policy not in ("zero", "uncompensated", "uncompensated_open")
         acts_on = {DEFLECTION if has_model else COMMAND: None}
-        if processes:
+        if threads is None:
             maker = partial(_make_corrected, env, policy, acts_on)
-            venv: Any = SubprocVecEnv([maker] * num_envs, start_method="spawn")
+            venv: Any = SubprocVecEnv([maker] * n, start_method="spawn")
         else:
             condition = _condition(env, policy)
-            inner = make_vector_env(condition, num_envs, threads, AutoresetMode.SAME_STEP)
+            mode = AutoresetMode.SAME_STEP
+            inner = make_vector_env(condition, n, threads, mode)
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, acts_on=acts_on))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
-        self._rollout = max(PPO_DECISIONS // num_envs, 8)
+        self._rollout = max(PPO_DECISIONS // n, 8)
         self._model = PPO(
             "MlpPolicy",
             venv,
@@ -278,7 +280,8 @@ class PPOLoop(Contender):
         before = self._model.num_timesteps
         begin = time.perf_counter()
         self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
-        return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
+        decisions = self._model.num_timesteps - before
+        return decisions * self._period / (time.perf_counter() - begin)
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
@@ -293,15 +296,14 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     for i, (inputs, outputs) in enumerate(widths):
         tensors[f"weight{i}"] = 0.01 * generator.normal(size=(outputs, inputs))
         tensors[f"bias{i}"] = np.zeros(outputs)
-    description = ResidualDescription(
-        robot=env.unwrapped.task.name, base="", settings=corrected.settings
-    )
+    robot = env.unwrapped.task.name
+    description = ResidualDescription(robot=robot, base="", settings=corrected.settings)
     return ResidualPolicy(corrected, Network(description, tensors))
 
 
 def _condition(env: str, policy: str | None = None) -> Condition:
     spec = PolicySpec(name=policy or "zero")
-    return Condition(env=env, policy=spec, reference=environment(env).default_reference)
+    return Condition(env=env, policy=spec)
 
 
 def _make(env: str) -> Any:

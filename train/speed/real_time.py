@@ -2,14 +2,14 @@
 
 import contextlib
 import time
-from itertools import cycle, islice
+from itertools import islice
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.safety import realtime
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, policy_errors
@@ -43,9 +43,7 @@ def play_against_the_clock(
     """
     known = environment(env_name)
     name = policy_name or known.live_policy or known.looped_policy
-    condition = Condition(
-        env=env_name, policy=PolicySpec(name=name), reference=known.default_reference
-    )
+    condition = Condition(env=env_name, policy=PolicySpec(name=name))
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     with contextlib.closing(env):
         policy = make_policy(condition.policy, env)
@@ -53,12 +51,13 @@ def play_against_the_clock(
         cycles = max(round(seconds / period_s), 1)
         with policy_errors(condition):
             steps = list(islice(control_steps(env, policy, seed=0), max(cycles - 1, 1)))
-            observations = [steps[0].seen, *(step.observation for step in steps)][:cycles]
-            is_real_time = prefer_realtime(Priority.LOOP)
+            later = [step.observation for step in steps]
+            observations = [steps[0].seen, *later][:cycles]
+            is_real_time = realtime.prefer_realtime(realtime.Priority.LOOP)
             try:
                 latency_s, policy_s = _time(policy, observations, cycles, period_s)
             finally:
-                give_up_realtime()
+                realtime.give_up_realtime()
     figures = summarise(period_s, latency_s, policy_s)
     return {"env": env_name, "policy": name, "is_real_time": is_real_time, **figures}
 
@@ -71,8 +70,10 @@ def _time(
     policy_s = np.empty(cycles)
     state: Any = None
     begin = time.perf_counter() + period_s
-    for number, (index, observation) in enumerate(islice(cycle(enumerate(observations)), cycles)):
+    for number in range(cycles):
         due = begin + number * period_s
+        index = number % len(observations)
+        observation = observations[index]
         memory = state if index else None
         start = np.array(index == 0)
         remaining = due - time.perf_counter()

@@ -1,4 +1,4 @@
-"""Calls beside each other by any `concurrent.futures.Executor`: faults, reports and Ctrl-C.
+"""Calls beside each other, wherever their futures come from: faults, reports and Ctrl-C.
 
 A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew
 elsewhere.
@@ -12,7 +12,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +33,7 @@ Reporter = Callable[[int, Any], None]
 class WorkerLostError(SystemFailedError):
     """The worker of a call is gone: killed, preempted, or out of reach.
 
-    An executor's future raises it.
+    A future raises it.
     """
 
 
@@ -54,7 +54,7 @@ class ExecutorLostError(SystemFailedError):
 class UnguardedScriptError(ConfigurationError):
     """Workers import the script that runs here, and it would start workers again.
 
-    An executor's future raises it.
+    A future raises it.
     """
 
     def __init__(self) -> None:
@@ -84,12 +84,13 @@ class Pool:
     """Workers.
 
     Attributes:
-        executor: What runs calls. Its futures raise `WorkerLostError` where a call may begin anew.
+        submit: Runs a function with its arguments. The future that it returns raises
+            `WorkerLostError` where the call may begin anew.
         reporter: How a call reports.
         events: Where the reports arrive, as pairs of number and report.
     """
 
-    executor: Executor
+    submit: Callable[..., Future[Any]]
     reporter: Reporter
     events: "queue.SimpleQueue[Any]" = field(default_factory=queue.SimpleQueue)
 
@@ -166,87 +167,64 @@ def run_calls(
         UnguardedScriptError: Workers cannot import the script that runs here.
         KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
     """
-    run = _Run(function, arguments, pool, watch)
-    with _first_ctrl_c() if finishes else nullcontext(threading.Event()) as asked:
-        run.go(asked)
-    return run.outcomes
+    outcomes: list[Outcome | None] = [None] * len(arguments)
+    tries = [0] * len(arguments)
+    futures = dict[Future[Any], int]()
+    watch.tally.total = len(arguments)
 
-
-class _Run:
-    """Calls that are under way."""
-
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        arguments: Sequence[tuple[Any, ...]],
-        pool: Pool,
-        watch: Watch,
-    ) -> None:
-        self._function = function
-        self._arguments = arguments
-        self._pool = pool
-        self._watch = watch
-        self._futures = dict[Future[Any], int]()
-        self._tries = [0] * len(arguments)
-        self._is_ending = False
-        self.outcomes: list[Outcome | None] = [None] * len(arguments)
-        watch.tally.total = len(arguments)
-
-    def go(self, asked: threading.Event) -> None:
-        """To the end of all calls, or once `asked` to, of those that run."""
-        for number in range(len(self._arguments)):
-            self._submit(number)
-        while self._futures:
-            if asked.is_set() and not self._is_ending:
-                self._is_ending = True
-                self._cancel_waiting()
-            with suppress(queue.Empty):
-                self._take(self._pool.events.get(timeout=_WAIT_S))
-
-    def _submit(self, number: int) -> None:
-        self._tries[number] += 1
-        call = (self._function, self._arguments[number], number, Path.cwd(), everything())
+    def submit(number: int) -> None:
+        tries[number] += 1
+        place = (Path.cwd(), everything(), pool.reporter)
         try:
-            future = self._pool.executor.submit(carry_out, *call, self._pool.reporter)
+            future = pool.submit(carry_out, function, arguments[number], number, *place)
         except RuntimeError as error:  # it was shut down
             raise ExecutorLostError(f"the workers are gone: {error}") from None
-        self._futures[future] = number
-        future.add_done_callback(self._pool.events.put)
+        futures[future] = number
+        future.add_done_callback(pool.events.put)
 
-    def _cancel_waiting(self) -> None:
-        for future, number in list(self._futures.items()):
-            if number not in self._watch.tally.running and future.cancel():
-                self._futures.pop(future, None)
+    def cancel_waiting() -> None:
+        for future, number in list(futures.items()):
+            if number not in watch.tally.running and future.cancel():
+                futures.pop(future, None)
 
-    def _take(self, event: Any) -> None:
-        """A future that is done, or a report."""
-        if isinstance(event, Future):
-            if event in self._futures:
-                self._end(self._futures.pop(event), event)
-            return
-        number, report = event
-        if self.outcomes[number] is None:  # a report may come behind the end
-            self._watch.tally.running.add(number)
-        self._watch.reported(number, report)
-
-    def _end(self, number: int, future: Future[Any]) -> None:
-        outcome = _outcome(future)
-        if isinstance(
-            outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError
-        ):
+    def end(number: int, outcome: Outcome) -> None:
+        if isinstance(outcome.error, _FATAL):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
-            self._watch.tally.running.discard(number)
-            if self._is_ending:
+            watch.tally.running.discard(number)
+            if asked.is_set():
                 return
-            if self._tries[number] <= MOST_MOVES:
-                self._watch.moved(number)
-                self._submit(number)
+            if tries[number] <= MOST_MOVES:
+                watch.moved(number)
+                submit(number)
                 return
             outcome = Outcome(error=WorkerKilledError())
-        self.outcomes[number] = outcome
-        self._watch.tally.end(number, outcome)
-        self._watch.ended(number, outcome)
+        outcomes[number] = outcome
+        watch.tally.end(number, outcome)
+        watch.ended(number, outcome)
+
+    def report(number: int, value: Any) -> None:
+        if outcomes[number] is None:  # a report may come behind the end
+            watch.tally.running.add(number)
+        watch.reported(number, value)
+
+    with _first_ctrl_c() if finishes else nullcontext(threading.Event()) as asked:
+        for number in range(len(arguments)):
+            submit(number)
+        while futures:
+            if asked.is_set():
+                cancel_waiting()
+            with suppress(queue.Empty):
+                event = pool.events.get(timeout=_WAIT_S)
+                if not isinstance(event, Future):
+                    report(*event)
+                elif event in futures:
+                    end(futures.pop(event), _outcome(event))
+    return outcomes
+
+
+_FATAL = (VersionsDifferError, ExecutorLostError, UnguardedScriptError)
+"""Errors that end all calls."""
 
 
 def carry_out(
@@ -298,9 +276,10 @@ def _outcome(future: Future[Any]) -> Outcome:
     error = future.exception()
     if error is None:
         return future.result()
-    if type(error).__name__ == "KilledWorker":  # of dask, which has moved the call itself
+    if type(error).__name__ == "KilledWorker":  # of dask, which moves calls itself
         return Outcome(error=WorkerKilledError())
-    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
+    is_plain = isinstance(error, Exception)
+    return Outcome(error=error if is_plain else CallFailedError(repr(error)))
 
 
 @contextmanager
@@ -308,7 +287,8 @@ def _first_ctrl_c() -> Iterator[threading.Event]:
     """Ctrl-C sets an event; the second one does what it did before."""
     asked = threading.Event()
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or not callable(before):
         yield asked
         return
 

@@ -7,6 +7,7 @@ import uuid
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
@@ -36,9 +37,11 @@ def dask_pool(address: str) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("distributed", "cluster", "--on dask://") from None
     warn_of_public(address)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by us
+    # what is lost is said by us
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    options = {"timeout": _CONNECT_S, "set_as_default": False}
     try:
-        client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
+        client = distributed.Client(f"tcp://{address}", **options)
     except (OSError, ValueError) as error:
         raise SystemFailedError(
             f"no dask scheduler answers at {address} ({error}); start one there with: dask"
@@ -47,14 +50,15 @@ def dask_pool(address: str) -> Iterator[Pool]:
     with client:
         _prepare(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
-        pool = Pool(client.get_executor(pure=False), _LogEvent(topic))
+        executor = client.get_executor(pure=False)
+        pool = Pool(executor.submit, partial(_log_event, topic))
         client.subscribe_topic(topic, lambda event: pool.events.put(tuple(event[1])))
         try:
             yield pool
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 client.unsubscribe_topic(topic)
-                pool.executor.shutdown(wait=False)  # cancels what runs
+                executor.shutdown(wait=False)  # cancels what runs
 
 
 def warn_of_public(address: str) -> None:
@@ -68,8 +72,8 @@ def warn_of_public(address: str) -> None:
         found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return  # the connection says what is wrong
-    addresses = [str(place[0]) for *_, place in found]
-    public = [one for one in addresses if ipaddress.ip_address(one.partition("%")[0]).is_global]
+    hosts = [str(place[0]).partition("%")[0] for *_, place in found]
+    public = [host for host in hosts if ipaddress.ip_address(host).is_global]
     if public:
         warnings.warn(
             f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever"
@@ -105,13 +109,8 @@ def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
     dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, most)
 
 
-class _LogEvent:
-    """Reports as events of dask, from a worker by its scheduler to the client."""
+def _log_event(topic: str, number: int, value: Any) -> None:
+    """In a worker: report by an event of dask, by its scheduler to the client."""
+    from distributed import get_worker
 
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-
-    def __call__(self, number: int, value: Any) -> None:
-        from distributed import get_worker
-
-        get_worker().log_event(self._topic, (number, value))
+    get_worker().log_event(topic, (number, value))

@@ -1,6 +1,7 @@
 """Executors of calls, as `--on` names them: this machine, a dask cluster, jobs of Slurm."""
 
 import os
+import re
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,13 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, quote
 from train.workers.calls import Pool
 from train.workers.dask_cluster import dask_pool
-from train.workers.local import local_pool, num_processes, require_jobs
+from train.workers.local import local_pool
 from train.workers.slurm import SlurmConfig, slurm_pool
 
 _LOCAL = "local"
 _DASK = "dask://"
 _SLURM = "slurm"
+_MOST_JOBS = 1024
 
 
 @dataclass(frozen=True)
@@ -33,10 +35,12 @@ class Executors:
     jobs: int = 0
 
     def __post_init__(self) -> None:
-        require_jobs(self.jobs)
-        host, _, port = self.on.removeprefix(_DASK).rpartition(":")
-        is_dask = self.on.startswith(_DASK) and host and port.isdecimal()
-        if not (self.is_local or is_dask or self.on == _SLURM or self.on.startswith(f"{_SLURM}:")):
+        if not 0 <= self.jobs <= _MOST_JOBS:
+            bound = ">= 0" if self.jobs < 0 else f"<= {_MOST_JOBS}"
+            raise ConfigurationError(
+                f"jobs must be {bound}, 0 for one per core, got {quote(self.jobs)}"
+            )
+        if not re.fullmatch(rf"(?s){_LOCAL}|{_DASK}.+:\d+|{_SLURM}(:.*)?", self.on):
             raise ConfigurationError(
                 f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or"
                 f" {_SLURM}:FILE.yaml with what a job asks for, got {quote(self.on)}"
@@ -51,7 +55,11 @@ class Executors:
         """Threads for each of some calls: an equal share of this machine's cores; elsewhere one."""
         if not self.is_local:
             return 1
-        return max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls))
+        return max(1, (os.cpu_count() or 1) // self._processes(calls))
+
+    def _processes(self, calls: int) -> int:
+        """Processes of this machine for some calls: no more than those."""
+        return min(self.jobs or os.cpu_count() or 1, calls)
 
     def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.
@@ -61,7 +69,7 @@ class Executors:
             folder: A folder of the run, in which jobs of Slurm have their files.
         """
         if self.is_local:
-            return local_pool(self.jobs, calls)
+            return local_pool(self._processes(calls))
         if self.on.startswith(_DASK):
             return dask_pool(self.on.removeprefix(_DASK))
         _, _, file = self.on.partition(":")

@@ -7,49 +7,25 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
-from typing import Any, cast
+from typing import Any
 
-from elastic_env.core.errors import ConfigurationError, quote
 from train.runs.import_path import safe_children
-from train.workers.calls import Pool, UnguardedScriptError, WorkerLostError
+from train.workers import calls
 
-_MOST_JOBS = 1024
-
-
-def require_jobs(jobs: int) -> None:
-    """Check a number of processes.
-
-    Raises:
-        ConfigurationError: It is none.
-    """
-    if not 0 <= jobs <= _MOST_JOBS:
-        bound = ">= 0" if jobs < 0 else f"<= {_MOST_JOBS}"
-        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {quote(jobs)}")
-
-
-def num_processes(jobs: int, calls: int) -> int:
-    """Processes for some calls: `jobs`, or one per core where that is 0, and no more than calls."""
-    return min(jobs or os.cpu_count() or 1, calls)
-
-
-_LATEST_REPORT_S = 5.0
-"""Time in which the last report of a call arrives, or never."""
+_SPAWN = multiprocessing.get_context("spawn")
 
 
 @contextmanager
-def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
-    """Processes of this machine, which end with what is within.
+def local_pool(jobs: int) -> Iterator[calls.Pool]:
+    """Processes of this machine, which end with the work within.
 
     Args:
-        jobs: Processes, 0 for one per core.
-        calls: How many calls there will be; there are no more processes than that.
+        jobs: How many there are at most.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         # this is a worker that imports the script of its parent, which says why it ended
@@ -57,130 +33,104 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
     with safe_children():
         # its start lets SIGINT through; the threads that start workers block it
         resource_tracker.ensure_running()
-    events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    processes = Processes(num_processes(jobs, calls), events)
+    processes = _Processes(jobs)
     try:
-        yield Pool(processes, _report, events)
-    except BaseException:
+        yield calls.Pool(processes.submit, _report, processes.events)
+    finally:
         processes.end()
-        raise
-    processes.shutdown()
 
 
-class Processes(Executor):
-    """An executor of processes, in which a process that dies fails its own call alone.
+class _Processes:
+    """Processes, each with a pipe, and a thread for every call that runs in one.
 
-    In a `ProcessPoolExecutor` it fails all calls, and none knows whose process it was. So each
-    process here has a pool of its own, a thread that waits for it, and a pipe for its reports.
+    A process that dies fails its own call alone; in a `ProcessPoolExecutor` it would fail all of
+    them.
     """
 
-    def __init__(self, jobs: int, events: "queue.SimpleQueue[Any]") -> None:
+    def __init__(self, jobs: int) -> None:
+        self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._threads = ThreadPoolExecutor(jobs, initializer=_block_ctrl_c)
-        self._own = threading.local()
         self._lock = threading.Lock()
-        self._events = events
         self._workers = set[_Worker]()
+        self._idle = list[_Worker]()
         self._is_closed = False
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run a call in a process.
+    def submit(self, *call: Any) -> Future[Any]:
+        """Run a function with its arguments in a process.
 
         The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where
         it ended itself before it could begin.
         """
-        return self._threads.submit(self._in_process, fn, *args, **kwargs)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes when their calls have ended."""
-        self._threads.shutdown(wait, cancel_futures=cancel_futures)
-        for worker in self._workers:
-            worker.pool.shutdown(wait)
+        return self._threads.submit(self._run, call)
 
     def end(self) -> None:
-        """Stop at once: what is queued is dropped, what runs is ended."""
+        """Stop: a call that waits is dropped, one that runs is ended."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             self._is_closed = True
-            processes = [worker.process for worker in self._workers]
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join()
+            workers = list(self._workers)
+        for worker in workers:
+            if worker in self._idle:
+                worker.pipe.close()
+            else:
+                worker.process.terminate()
+        for worker in workers:
+            worker.process.join()
 
-    def _in_process(self, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """In a thread: a call in the thread's process."""
+    def _run(self, call: tuple[Any, ...]) -> calls.Outcome:
+        """In a thread: the outcome of a call in a process that is idle, or a new one."""
+        with self._lock:  # no process begins behind `end`
+            if self._is_closed:
+                raise calls.WorkerLostError("the workers have been ended")
+            worker = self._idle.pop() if self._idle else _Worker()
+            self._workers.add(worker)
         try:
-            with self._lock:  # no process begins behind `end`
-                worker = self._worker()
-                future = worker.pool.submit(_count_reports, fn, *args, **kwargs)
-            value, sent = future.result()
-            worker.wait_for(sent)
-            return value
-        except BrokenProcessPool:
-            lost = self._own.worker
-            self._own.worker = None
+            outcome = worker.run(call, self.events)
+        except (EOFError, OSError):
             with self._lock:
-                self._workers.discard(lost)
-            raise lost.why() from None
-
-    def _worker(self) -> "_Worker":
-        if self._is_closed:
-            raise WorkerLostError("the workers have been ended")
-        if getattr(self._own, "worker", None) is None:
-            self._own.worker = _Worker(self._events)
-            self._workers.add(self._own.worker)
-        return self._own.worker
+                self._workers.discard(worker)
+            raise worker.why() from None
+        self._idle.append(worker)
+        return outcome
 
 
 class _Worker:
-    """A process, and a thread that takes its reports.
+    """A process.
 
     Attributes:
-        pool: Runs calls in it.
         process: The process.
+        pipe: For calls, their reports and their outcomes; closed, it ends an idle process.
     """
 
-    def __init__(self, events: "queue.SimpleQueue[Any]") -> None:
-        context = multiprocessing.get_context("spawn")
-        reports, end = context.Pipe(duplex=False)
-        self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(end,))
+    def __init__(self) -> None:
+        self.pipe, end = _SPAWN.Pipe()
+        self.process = _SPAWN.Process(target=_serve, args=(end,))
         with safe_children():
-            self.pool.submit(_nothing)  # starts it
-        (self.process,) = cast("dict[int, SpawnProcess]", self.pool._processes).values()
+            self.process.start()
         end.close()  # with that of the process the pipe ends too
         self._has_begun = False
-        self._handed_on = 0
-        self._news = threading.Condition()
-        self._reader = threading.Thread(target=self._read, args=(reports, events), daemon=True)
-        self._reader.start()
 
-    def wait_for(self, reports: int) -> None:
-        """Wait until so many reports were handed on: a result has its own way and may be faster."""
-        with self._news:
-            self._news.wait_for(lambda: self._handed_on >= reports, timeout=_LATEST_REPORT_S)
+    def run(self, call: tuple[Any, ...], events: "queue.SimpleQueue[Any]") -> calls.Outcome:
+        """The outcome of a call, whose reports are handed on.
+
+        Raises:
+            EOFError: The process has ended.
+            OSError: Likewise.
+        """
+        self.pipe.send(call)
+        while not isinstance(message := self.pipe.recv(), calls.Outcome):
+            self._has_begun = True
+            events.put(message)
+        return message
 
     def why(self) -> Exception:
         """Why a call in it was lost."""
-        self._reader.join()
-        while (code := self.process.exitcode) is None:  # another thread is about to learn it
+        # another thread may be about to learn it
+        while (code := self.process.exitcode) is None:
             time.sleep(0.01)
         if self._has_begun or code < 0:
-            return WorkerLostError("a worker process was killed")
-        return UnguardedScriptError()
-
-    def _read(self, reports: "Connection[Any, Any]", events: "queue.SimpleQueue[Any]") -> None:
-        """In a thread: hand on what is reported, as long as the process lives."""
-        with reports, suppress(EOFError, OSError):
-            self._has_begun = reports.recv()
-            while True:
-                events.put(reports.recv())
-                with self._news:
-                    self._handed_on += 1
-                    self._news.notify_all()
-
-
-def _nothing() -> None:
-    """A first call, with which a process starts."""
+            return calls.WorkerLostError("a worker process was killed")
+        return calls.UnguardedScriptError()
 
 
 def _block_ctrl_c() -> None:
@@ -192,38 +142,34 @@ def _block_ctrl_c() -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
-_own_end: "Connection[Any, Any] | None" = None
-"""In a worker: its end of the pipe for reports."""
-
-
-_sent = 0
-"""In a worker: how many reports it has sent."""
+_own_end: "Connection[Any, Any]"
+"""In a worker: its end of the pipe."""
 
 
 def _report(number: int, value: Any) -> None:
     """In a worker: report on a call."""
-    global _sent
-    if _own_end is not None:
-        _own_end.send((number, value))
-        _sent += 1
+    _own_end.send((number, value))
 
 
-def _count_reports(fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> tuple[Any, int]:
-    """In a worker: the result of a call, and how many reports were sent up to its end."""
-    return fn(*args, **kwargs), _sent
-
-
-def _begin(end: "Connection[Any, Any]") -> None:
-    """In a worker, before its first call: the parent decides what happens.
+def _serve(end: "Connection[Any, Any]") -> None:
+    """In a worker: carry out calls; the parent decides what happens.
 
     Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes
     its workers with it, so that none of them goes on writing beside a run that was resumed.
     """
     global _own_end
+    _own_end = end
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    end.send(True)
-    _own_end = end
+    with suppress(OSError):  # the parent has ended
+        while True:
+            try:
+                function, *arguments = end.recv()
+                end.send(function(*arguments))
+            except EOFError:
+                return
+            except BaseException as error:  # code of the user ends the process
+                end.send(calls.Outcome(error=calls.CallFailedError(repr(error))))
 
 
 def _end_with_parent() -> None:

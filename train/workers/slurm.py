@@ -5,11 +5,14 @@ import queue
 import shutil
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+
+from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import SystemFailedError, missing_extra
@@ -23,30 +26,26 @@ class SlurmConfig(Model):
 
     cluster: Literal["slurm", "local"] = "slurm"
     """slurm, or local: processes of this machine in the place of jobs, to try it without Slurm."""
-    partition: Title | None = None
+    partition: Title | None = Field(default=None, serialization_alias="slurm_partition")
     """Partition; None for Slurm's default."""
-    account: Title | None = None
+    account: Title | None = Field(default=None, serialization_alias="slurm_account")
     """Account that is charged; None for Slurm's default."""
-    time_min: int = quantity("min", 60, ge=1, le=100_000)
+    time_min: int = quantity("min", 60, ge=1, le=100_000, serialization_alias="timeout_min")
     """Longest time of a job [min]."""
-    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000)
+    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000, serialization_alias="mem_gb")
     """Memory of a job [GB]."""
-    cores: int = quantity("1", 1, ge=1, le=1024)
+    cores: int = quantity("1", 1, ge=1, le=1024, serialization_alias="cpus_per_task")
     """Cores of a job."""
-    at_once: int = quantity("1", 256, ge=1, le=100_000)
+    at_once: int = quantity(
+        "1", 256, ge=1, le=100_000, serialization_alias="slurm_array_parallelism"
+    )
     """Jobs that run at the same time."""
 
+    @property
     def parameters(self) -> dict[str, Any]:
         """As submitit calls them."""
-        named = {
-            "slurm_partition": self.partition,
-            "slurm_account": self.account,
-            "slurm_array_parallelism": self.at_once,
-            "timeout_min": self.time_min,
-            "mem_gb": self.memory_gb,
-            "cpus_per_task": self.cores,
-        }
-        return {"name": "elastic", **{key: own for key, own in named.items() if own is not None}}
+        given = self.model_dump(by_alias=True, exclude={"cluster"}, exclude_none=True)
+        return {"name": "elastic", **given}
 
 
 @contextmanager
@@ -65,69 +64,55 @@ def slurm_pool(config: SlurmConfig, folder: Path) -> Iterator[Pool]:
     except ModuleNotFoundError:
         raise missing_extra("submitit", "cluster", "--on slurm") from None
     if config.cluster == "slurm" and shutil.which("sbatch") is None:
-        raise SystemFailedError(
-            "there is no Slurm here: the command sbatch was not found; start on a login node"
-        )
+        problem = "there is no Slurm here: the command sbatch was not found; start on a login node"
+        raise SystemFailedError(problem)
     folder = folder.resolve()
     reports = folder / "reports"
     reports.mkdir(parents=True, exist_ok=True)
     executor = submitit.AutoExecutor(folder, cluster=config.cluster)
-    executor.update_parameters(**config.parameters())
-    jobs = Jobs(executor, reports)
-    pool = Pool(jobs, ToFile(reports), jobs.events)
+    executor.update_parameters(**config.parameters)
+    jobs = _Jobs(executor, reports)
     try:
-        yield pool
+        yield Pool(jobs.submit, partial(_report, reports), jobs.events)
     finally:
-        jobs.shutdown(wait=True, cancel_futures=True)
+        jobs.end()
         shutil.rmtree(folder, ignore_errors=True)
 
 
-class ToFile:
-    """Reports as files, of which each call has one."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __call__(self, number: int, value: Any) -> None:
-        """Report, whole or not at all."""
-        fresh = self._folder / f"{number}.{os.getpid()}"
-        fresh.write_text(str(int(value)))
-        fresh.rename(self._folder / str(number))
+def _report(folder: Path, number: int, value: Any) -> None:
+    """In a worker: report by a file of the call, whole or not at all."""
+    fresh = folder / f"{number}.{os.getpid()}"
+    fresh.write_text(str(int(value)))
+    fresh.rename(folder / str(number))
 
 
-class Jobs(Executor):
-    """An executor that hands calls to submitit, and looks after them in a thread."""
+class _Jobs:
+    """Hands calls to submitit, and looks after them in a thread."""
 
     def __init__(self, executor: Any, reports: Path) -> None:
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._executor = executor
         self._reports = reports
         self._reported = dict[str, int]()
-        self._waiting = deque[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]]()
+        self._waiting = deque[tuple[Future[Any], tuple[Any, ...]]]()
         self._jobs = dict[Future[Any], Any]()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._look_after, daemon=True)
         self._thread.start()
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Keep a call for the next array of jobs; keyword arguments are not passed on."""
-        if kwargs:
-            raise TypeError(f"calls have no keyword arguments, got {sorted(kwargs)}")
-        if self._closed.is_set():
-            raise RuntimeError("it was shut down")
+    def submit(self, *call: Any) -> Future[Any]:
+        """Keep a function with its arguments for the next array of jobs."""
         future = Future[Any]()
-        self._waiting.append((future, fn, args))
+        self._waiting.append((future, call))
         return future
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Submit nothing any more; with `cancel_futures` jobs that are not done are cancelled."""
+    def end(self) -> None:
+        """Submit nothing any more, and cancel jobs that are not done."""
         self._closed.set()
-        if wait:
-            self._thread.join()
-        if cancel_futures:
-            for job in self._jobs.values():
-                with suppress(Exception):  # it may have ended
-                    job.cancel()
+        self._thread.join()
+        for job in self._jobs.values():
+            with suppress(Exception):  # it may have ended
+                job.cancel()
 
     def _look_after(self) -> None:
         """In a thread: submit what waits as an array, and settle what is done."""
@@ -138,21 +123,21 @@ class Jobs(Executor):
                 self._settle_done()
             except Exception as error:
                 # Slurm refuses, or the folder is full: that is the end of all calls
-                lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
-                for future in [*self._jobs, *(future for future, *_ in self._waiting)]:
+                problem = f"jobs cannot be submitted or followed: {error}"
+                lost = ExecutorLostError(problem)
+                for future in [*self._jobs, *(future for future, _ in self._waiting)]:
                     if not future.cancelled():
                         future.set_exception(lost)
                 return
 
     def _submit_waiting(self) -> None:
-        waiting = list(self._waiting)
-        calls = [call for call in waiting if not call[0].cancelled()]
+        waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        calls = {future: call for future, call in waiting if not future.cancelled()}
         if calls:
+            self._jobs |= dict.fromkeys(calls)
             with self._executor.batch():
-                jobs = [self._executor.submit(fn, *args) for _, fn, args in calls]
-            self._jobs.update(zip((future for future, *_ in calls), jobs, strict=True))
-        for _ in waiting:
-            self._waiting.popleft()
+                jobs = [self._executor.submit(*call) for call in calls.values()]
+            self._jobs |= zip(calls, jobs, strict=True)
 
     def _read_reports(self) -> None:
         for file in self._reports.iterdir():
@@ -178,5 +163,6 @@ def _settle(future: "Future[Any]", job: Any) -> None:
         return
     try:
         future.set_result(job.result())
-    except Exception as error:  # killed, out of time or memory: the call itself never raises
-        future.set_exception(WorkerLostError(f"job {job.job_id} ended without a result: {error}"))
+    except Exception as error:  # killed, out of time or memory: the call never raises
+        problem = f"job {job.job_id} ended without a result: {error}"
+        future.set_exception(WorkerLostError(problem))

@@ -32,18 +32,18 @@ def everything() -> dict[str, str]:
     return {"sources of elastic-env": _digest(_ALL), **_library_versions()}
 
 
-def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str) -> None:
+_Versions = Mapping[str, str]
+
+
+def require_same(ours: _Versions, theirs: _Versions, where: str) -> None:
     """Refuse a machine with other versions.
 
     Raises:
         VersionsDifferError: It has; the message names what differs, with both versions.
     """
     names = dict.fromkeys([*ours, *theirs])
-    different = [
-        f"{name} {theirs.get(name)} there, {ours.get(name)} here"
-        for name in names
-        if ours.get(name) != theirs.get(name)
-    ]
+    unlike = [name for name in names if ours.get(name) != theirs.get(name)]
+    different = [f"{k} {theirs.get(k)} there, {ours.get(k)} here" for k in unlike]
     if different:
         raise VersionsDifferError(
             f"all machines must have the same versions, but on {where} they differ:"
