@@ -10,16 +10,19 @@ LARGEST_JSON = 1_000_000
 """Characters of a text in JSON."""
 
 
-def parse_json(text: str) -> Any:
+def parse_json(text: str, most: int = LARGEST_JSON) -> Any:
     """Content of a text in JSON.
 
+    Args:
+        text: The text.
+        most: Characters that it may have.
+
     Raises:
-        ValueError: It is not JSON, is longer or deeper than the limits, or holds a key twice, a
+        ValueError: It is not JSON, is longer or deeper than allowed, or holds a key twice, a
             number that is not finite or too long, or text with zero bytes.
     """
-    if len(text) > LARGEST_JSON:
-        bound = f"at most {LARGEST_JSON} characters"
-        raise ValueError(f"it must have {bound}, got {len(text)}")
+    if len(text) > most:
+        raise ValueError(f"it must have at most {most} characters, got {len(text)}")
     numbers = {"parse_int": _whole, "parse_float": _real, "parse_constant": _real}
     try:
         content = json.loads(text, object_pairs_hook=_mapping, **numbers)

@@ -1,0 +1,142 @@
+"""Replay of logs that were not fitted, beside predictions that need no physics."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from baselines.identification.servo_fit import ServoFit, slow_rows
+from baselines.identification.servo_log import ServoLog
+from elastic_env.core.config import Model
+from elastic_env.core.signals import Array
+
+GOAL = "the goal itself"
+OFFSET = "a constant offset"
+LINE = "a line in the goal"
+REPLAYED = "identified"
+PREDICTIONS = (GOAL, OFFSET, LINE, REPLAYED)
+
+
+class ServoError(Model):
+    """Error of a prediction of the angle at logs that were not fitted."""
+
+    name: str
+    rms_mrad: float
+    """Root mean square over all rows with torque on, logs weighted alike."""
+    slow_mrad: float | None
+    """The same over rows of slow motion, each alike; None where nothing moves slowly."""
+
+
+class LogErrors(Model):
+    """Errors at one log."""
+
+    log: str
+    gain: float
+    rms_mrad: tuple[float, ...]
+    """One for each prediction."""
+    slow_mrad: tuple[float, ...] | None
+    slow_rows: int
+    replay_mrad: float
+    """Of the replay over all rows, those with the torque off included."""
+
+
+class ServoHoldout(Model):
+    """Errors at logs that were not fitted; a part of `identification.json`."""
+
+    fitted: tuple[str, ...]
+    replay_mrad: float
+    """Root mean square of the replay over all rows of the logs, torque off included."""
+    errors: tuple[ServoError, ...]
+    """Of the rivals, and the identification last."""
+    logs: tuple[LogErrors, ...]
+
+    @property
+    def best_rival(self) -> ServoError:
+        """The best prediction but the identification."""
+        return min(self.errors[:-1], key=lambda error: error.rms_mrad)
+
+
+def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
+    """Errors of a fit and of rivals that learn from the same logs.
+
+    Args:
+        fit: A fit to other logs.
+        held_out: Logs that it did not see.
+    """
+    errors = [predictions(fit, log) - log.position for log in held_out]
+    logs = [_of_log(log, own) for log, own in zip(held_out, errors, strict=True)]
+    slow = [own[:, slow_rows(log)] for log, own in zip(held_out, errors, strict=True)]
+    slowly = np.concatenate(slow, axis=1)
+    total = np.array([log.rms_mrad for log in logs])
+    return ServoHoldout(
+        fitted=tuple(log.name for log in fit.logs),
+        replay_mrad=float(np.sqrt(np.mean([log.replay_mrad**2 for log in logs]))),
+        errors=tuple(
+            ServoError(
+                name=name,
+                rms_mrad=float(np.sqrt(np.mean(total[:, i] ** 2))),
+                slow_mrad=_mrad(slowly[i]) if slowly.shape[1] else None,
+            )
+            for i, name in enumerate(PREDICTIONS)
+        ),
+        logs=tuple(logs),
+    )
+
+
+def predictions(fit: ServoFit, log: ServoLog) -> Array:
+    """Angles of a log by all predictions, (4, N) [rad]."""
+    fitted = [one for one in fit.logs if one.gain == log.gain and one.enabled.any()]
+    fitted = fitted or [one for one in fit.logs if one.enabled.any()]
+    offset, line = 0.0, np.array([0.0, 1.0])
+    if fitted:
+        goal = np.concatenate([one.goal[one.enabled] for one in fitted])
+        position = np.concatenate([one.position[one.enabled] for one in fitted])
+        offset = float(np.mean(position - goal))
+        line = fit_line(goal, position)
+    return np.stack(
+        [log.goal, log.goal + offset, line[0] + line[1] * log.goal, fit.replay(log)]
+    )
+
+
+def fit_line(goal: Array, position: Array) -> Array:
+    """Constant and slope of the least-squares line, (2,)."""
+    rows = np.column_stack([np.ones(len(goal)), goal])
+    return np.linalg.lstsq(rows, position, rcond=None)[0]
+
+
+def split_logs(
+    logs: Sequence[ServoLog], share: float, seed: int
+) -> tuple[list[ServoLog], list[ServoLog]]:
+    """Logs to fit and logs to hold out; of a single log its last part.
+
+    Args:
+        logs: All logs.
+        share: Share that is held out; at least one log is fitted and one held out.
+        seed: Seed of the draw.
+    """
+    if len(logs) == 1:
+        at = int(round((1.0 - share) * len(logs[0])))
+        return [logs[0].part(slice(0, at))], [logs[0].part(slice(at, None))]
+    count = min(max(1, round(share * len(logs))), len(logs) - 1)
+    order = np.random.default_rng(seed).permutation(len(logs))
+    chosen = set(order[:count].tolist())
+    return (
+        [log for i, log in enumerate(logs) if i not in chosen],
+        [log for i, log in enumerate(logs) if i in chosen],
+    )
+
+
+def _of_log(log: ServoLog, errors: Array) -> LogErrors:
+    slow = slow_rows(log)
+    on = log.enabled if log.enabled.any() else np.ones(len(log), dtype=np.bool_)
+    return LogErrors(
+        log=log.name,
+        gain=log.gain,
+        rms_mrad=tuple(_mrad(error[on]) for error in errors),
+        slow_mrad=tuple(_mrad(error[slow]) for error in errors) if slow.any() else None,
+        slow_rows=int(slow.sum()),
+        replay_mrad=_mrad(errors[-1]),
+    )
+
+
+def _mrad(errors: Array) -> float:
+    return 1e3 * float(np.sqrt(np.mean(errors**2)))

@@ -1,0 +1,66 @@
+"""Known load of one joint in a log in time: a pendulum, or the weight of a robot's links."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array
+from elastic_env.joint.supported_models import hinges_of
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall [m/s²]."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """Known load of the joint: weight that pulls by −m g l sin(q − rest), and its inertia.
+
+    Any rigid load on one hinge has this form while the joints before it stand.
+
+    Attributes:
+        torque: m g l, the largest torque of the weight [N·m]; zero without one.
+        rest: Angle at which it hangs [rad].
+        inertia: Of link and load about the joint [kg·m²]; None if it is sought.
+    """
+
+    torque: float = 0.0
+    rest: float = 0.0
+    inertia: float | None = None
+
+    @staticmethod
+    def pendulum(mass_kg: float, length_m: float) -> "Load":
+        """A point mass on a light rod that hangs at zero."""
+        return Load(GRAVITY * mass_kg * length_m, 0.0, mass_kg * length_m**2)
+
+    def pull(self, q: Array) -> Array:
+        """Torque of the weight on the joint, (...,) [N·m]; positive turns it forward."""
+        return -self.torque * np.sin(q - self.rest)
+
+    @staticmethod
+    def of_joint(model: mujoco.MjModel, joint: str) -> "Load":
+        """Links beyond a hinge of a robot whose other joints stand where the model has them.
+
+        Raises:
+            ConfigurationError: The model has no such hinge.
+        """
+        hinges = hinges_of(model)
+        if joint not in hinges:
+            raise unknown_name("joint", joint, hinges)
+        if not np.any(model.opt.gravity):
+            raise ConfigurationError("the model has no gravity, so that nothing loads the joint")
+        data = mujoco.MjData(model)
+        hinge = model.joint(joint)
+        at = int(hinge.dofadr[0])
+        pulls = []
+        for angle in (0.0, 0.5 * np.pi):
+            data.qpos[:] = model.qpos0
+            data.qpos[hinge.qposadr[0]] = angle
+            mujoco.mj_forward(model, data)
+            pulls.append(-float(data.qfrc_bias[at]))
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        inertia = float(full[at, at] - model.dof_armature[at])
+        rest = float(np.arctan2(pulls[0], -pulls[1]))
+        return Load(float(np.hypot(*pulls)), rest, inertia)

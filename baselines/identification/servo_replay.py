@@ -1,0 +1,144 @@
+r"""Motion of one joint with a position servo, replayed from the goals of a log.
+
+The motor turns the link through a stiff gear, B and I are the inertias of rotor and link:
+
+.. math:: \tau_J = \tau_m - B \ddot q, \qquad
+    I \ddot q = \tau_J + \tau(q) - d\,\dot q - \operatorname{sign}(\dot q)\,F
+
+with the dry friction F of `elastic_env.joint.friction.dry_friction`, that is
+F = F₀ + c |τ_J| + F_s exp(−(ω/ω_s)²). A DC motor under a voltage that the servo sets gives
+
+.. math:: \tau_m = \operatorname{clip}(k\,g\,(q_\mathrm{goal} - q), \pm T) - b\,\dot q
+
+where V is the supply's voltage, k the position gain for one volt and one unit of the register g, T
+the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque enabled τ_m is zero, the
+rotor's inertia stays. At rest friction balances whatever is not above F. So a joint at rest tells a
+band of torques, and motion tells the torque.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from baselines.identification.servo_log import ServoLog
+from elastic_env.core.compiled import compiled
+from elastic_env.core.signals import Array
+
+PARAMETERS = {
+    "position_gain": "N·m/rad",
+    "torque_limit": "N·m",
+    "motor_damping": "N·m·s/rad",
+    "rotor_inertia": "kg·m²",
+    "link_inertia": "kg·m²",
+    "coulomb_friction": "N·m",
+    "load_friction": "1",
+    "viscous_friction": "N·m·s/rad",
+    "static_friction": "N·m",
+    "stribeck_speed": "rad/s",
+    "zero_offset": "rad",
+    "delay": "s",
+}
+"""Parameters of a servo with their units.
+
+Position gain and torque limit are for one volt, where voltages are known, and the gain for one unit
+of the servo's register.
+"""
+NAMES = tuple(PARAMETERS)
+
+_LONGEST_STEP_S = 1.5e-3
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A log on the grid of the simulation, made once for many replays.
+
+    Attributes:
+        log: The log.
+        start: Angle and speed at the first row [rad], [rad/s].
+        middle: Times of the middles of the steps, (N − 1, s) [s].
+        known: Known torque there, (N − 1, s) [N·m].
+    """
+
+    log: ServoLog
+    start: tuple[float, float]
+    middle: Array
+    known: Array
+
+    @staticmethod
+    def of(log: ServoLog, speed: float = 0.0) -> "Replay":
+        """Prepare a log that begins with a speed [rad/s]."""
+        step = np.diff(log.time)
+        count = max(1, int(np.ceil(np.median(step) / _LONGEST_STEP_S)))
+        middle = log.time[:-1, None] + step[:, None] * (np.arange(count) + 0.5) / count
+        known = np.zeros_like(middle)
+        if log.known is not None:
+            known = np.interp(middle, log.time, log.known)
+        return Replay(log, (float(log.position[0]), speed), middle, known)
+
+    def play(self, parameters: Array) -> Array:
+        """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (12,)."""
+        log = self.log
+        goal = np.interp(self.middle - parameters[11], log.time, log.goal)
+        load = log.load
+        inertia = parameters[4] if load.inertia is None else load.inertia
+        out = np.empty(len(log.time))
+        _play(
+            np.diff(log.time),
+            goal,
+            self.known,
+            log.enabled,
+            np.array([*self.start, log.gain, log.supply, load.torque, load.rest, inertia]),
+            np.ascontiguousarray(parameters, dtype=np.float64),
+            out,
+        )
+        return out
+
+
+@compiled
+def _play(  # noqa: D417
+    steps: Array, goal: Array, known: Array, enabled: Array, setting: Array, p: Array, out: Array
+) -> None:
+    """Angles of the link at the rows, into `out`; second order in the step while it moves."""
+    q = setting[0]
+    w = setting[1]
+    gain = setting[2] * setting[3] * p[0]
+    limit = setting[3] * p[1]
+    B = p[3]
+    M = B + setting[6]
+    out[0] = q
+    substeps = goal.shape[1]
+    for k in range(len(steps)):
+        h = steps[k] / substeps
+        for j in range(substeps):
+            q += 0.5 * h * w
+            pull = 0.0
+            b = 0.0
+            if enabled[k]:
+                pull = min(max(gain * (goal[k, j] - q), -limit), limit)
+                b = p[2]
+            other = known[k, j] - setting[4] * np.sin(q - setting[5] - p[10])
+            F = p[5]
+            if p[8] > 0.0:
+                F += p[8] * np.exp(-((w / p[9]) ** 2))
+            c = p[6]
+            # torque on the gear and friction that would bring the link to rest within the step
+            load = pull - 0.5 * b * w + B * w / h
+            needed = load + other - 0.5 * p[7] * w + (M - B) * w / h
+            if abs(needed) <= F + c * abs(load):
+                w = 0.0
+                continue
+            side = 1.0 if needed > 0.0 else -1.0
+            turn = 1.0 if pull - b * w > 0.0 else -1.0
+            slope = 0.0
+            for _ in range(2):
+                s = side * c * turn
+                damping = p[7] + b * (1.0 - s)
+                slope = (pull * (1.0 - s) + other - side * F - damping * w) / (
+                    M - s * B + 0.5 * h * damping
+                )
+                if (pull - b * (w + 0.5 * h * slope) - B * slope) * turn >= 0.0:
+                    break
+                turn = -turn
+            w += h * slope
+            q += 0.5 * h * w
+        out[k + 1] = q

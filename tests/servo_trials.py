@@ -1,0 +1,118 @@
+"""How often intervals of a servo hold the truth: `python -m tests.servo_trials`.
+
+Every trial is a servo of known parameters that plays three motions: two sweeps at two gains, and
+a lift whose torque is taken off. The truth is played at a hundredth of the fit's step, and read by
+an encoder of 4096 counts a turn with noise.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from baselines.identification.servo_fit import ServoFit, fit_servo
+from baselines.identification.servo_load import Load
+from baselines.identification.servo_log import ServoLog
+from baselines.identification.servo_replay import NAMES, Replay
+from elastic_env.core.signals import Array
+
+SOUGHT = (
+    "position_gain",
+    "motor_damping",
+    "rotor_inertia",
+    "coulomb_friction",
+    "load_friction",
+    "viscous_friction",
+    "zero_offset",
+)
+"""Parameters that every trial has and that the logs tell."""
+COUNT_RAD = 2.0 * np.pi / 4096
+NOISE_RAD = 1e-3
+
+
+def draw_servo(rng: np.random.Generator) -> Array:
+    """Parameters of a small servo, as in `NAMES`, (12,)."""
+    values = dict.fromkeys(NAMES, 0.0)
+    values |= {
+        "position_gain": rng.uniform(1.5e-3, 4e-3),
+        "torque_limit": np.inf,
+        "motor_damping": rng.uniform(0.02, 0.06),
+        "rotor_inertia": rng.uniform(1e-3, 4e-3),
+        "coulomb_friction": rng.uniform(0.01, 0.05),
+        "load_friction": rng.uniform(0.1, 0.5),
+        "viscous_friction": rng.uniform(0.003, 0.012),
+        "stribeck_speed": 0.3,
+        "zero_offset": rng.uniform(-0.02, 0.02),
+        "delay": 0.004,
+    }
+    return np.array([values[name] for name in NAMES])
+
+
+def make_logs(truth: Array, rng: np.random.Generator, step_s: float = 5e-3) -> list[ServoLog]:
+    """Logs of three motions of a servo."""
+    return [
+        _record(log, truth, rng)
+        for log in _motions(step_s)
+    ]
+
+
+def _motions(step_s: float) -> Iterator[ServoLog]:
+    time = step_s * np.arange(round(6.0 / step_s))
+    on = np.ones(len(time), dtype=np.bool_)
+    load = Load.pendulum(0.5, 0.1)
+    sweep = 1.2 * np.sin(1.1 * time) + 0.5 * np.sin(4.3 * time)
+    start = np.zeros(len(time))
+    for gain in (200.0, 800.0):
+        yield ServoLog(f"sweep {gain:g}", time, sweep, start, on, gain=gain, load=load)
+    lift = 1.5 * np.sin(0.5 * np.pi * np.minimum(time / 1.5, 1.0))
+    off = time < 2.0
+    yield ServoLog("lift and drop", time, lift, start, off, gain=800.0, load=load)
+
+
+def _record(log: ServoLog, truth: Array, rng: np.random.Generator) -> ServoLog:
+    """The log as an encoder has it."""
+    fine = np.arange(log.time[0], log.time[-1] + 1e-9, (log.time[1] - log.time[0]) / 100)
+    dense = ServoLog(
+        "fine",
+        fine,
+        np.interp(fine, log.time, log.goal),
+        np.zeros(len(fine)),
+        np.interp(fine, log.time, log.enabled.astype(float)) > 0.999,
+        gain=log.gain,
+        load=log.load,
+    )
+    # the torque goes off at the row that says so
+    at = np.minimum(np.searchsorted(log.time, fine + 1e-12, side="right") - 1, len(log.time) - 1)
+    dense = replace(dense, enabled=log.enabled[at])
+    q = Replay.of(dense).play(truth)[::100][: len(log.time)]
+    q = q + NOISE_RAD * rng.normal(size=len(q))
+    return replace(log, position=np.round(q / COUNT_RAD) * COUNT_RAD)
+
+
+def holds(fit: ServoFit, truth: Array) -> dict[str, bool]:
+    """Of each parameter whether its interval holds the truth."""
+    return {
+        name: bool(abs(fit.value(name) - truth[NAMES.index(name)]) <= fit.half(name))
+        for name in SOUGHT
+    }
+
+
+def main(trials: int = 100) -> None:
+    """Print how many of the intervals hold the truth, and their median half-width."""
+    counts = dict.fromkeys(SOUGHT, 0)
+    widths: dict[str, list[float]] = {name: [] for name in SOUGHT}
+    for seed in range(trials):
+        rng = np.random.default_rng(seed)
+        truth = draw_servo(rng)
+        fit = fit_servo(make_logs(truth, rng))
+        for name, held in holds(fit, truth).items():
+            counts[name] += held
+            widths[name].append(fit.half(name) / max(abs(truth[NAMES.index(name)]), 1e-3))
+        if seed % 10 == 9:
+            print(seed + 1, counts, flush=True)
+    for name in SOUGHT:
+        print(f"{name}: {counts[name]} of {trials}, ± {100 * np.median(widths[name]):.2g} %")
+
+
+if __name__ == "__main__":
+    main()
