@@ -5,11 +5,13 @@ The fit replays every log from its first row, and takes the parameters with the 
 deviation of the angles (output error method, [Ljung1999]). Intervals are cluster-robust: residuals
 of a replay hang together for tenths of a second, so that a block of the log counts as one cluster.
 
+[Bock1983] H. G. Bock, "Recent Advances in Parameter Identification Techniques for O.D.E.".
 [Ljung1999] L. Ljung, "System Identification: Theory for the User", 2nd ed., section 7.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
@@ -23,13 +25,19 @@ from elastic_env.core.signals import Array, BoolArray
 VISCOUS_SHARE = 0.2
 """Viscous friction over all damping where the torque is never off, as published models of small
 servos have it: 22 % for the XL330 [Rhoban2025]."""
+USUAL_LOSS = (0.25, 0.15)
+"""Mean and standard deviation of c before a log is seen: gear trains pass 60 to 90 %."""
+_NO_LOAD_SPEED = 8.0
+_NO_LOAD_SPREAD = 0.5
+"""No-load speed and the deviation of its logarithm: data sheets of small servos have 4 to 16 rad/s."""
 SLOW = (0.02, 0.5)
 """Speeds of slow motion; below it the joint stands [rad/s]."""
 _MOVING = 0.05
 _BLOCK_S = 0.5
 _MOST_ROWS = 600
 _STEP = 1e-3
-_STARTS = 6
+_STARTS = 3
+_PARTS_S = (0.3, 1.0)
 _BETTER = 10.0  # fall of the criterion at which two more parameters are taken
 _AT = {name: i for i, name in enumerate(NAMES)}
 _DELAY_S = 0.06
@@ -79,6 +87,7 @@ class _Problem:
     upper: Array
     duty: float | None
     split_damping: bool
+    weight: float = 0.0
 
     def expand(self, z: Array) -> Array:
         """Parameters of the replay."""
@@ -98,7 +107,19 @@ class _Problem:
         for one in self.replays:
             every = max(1, len(one.log) // _MOST_ROWS) if thinned else 1
             parts.append((one.play(p) - one.log.position)[::every])
+        if self.weight > 0.0:
+            parts.append(self.weight * self.prior(p))
         return np.nan_to_num(np.concatenate(parts), nan=10.0, posinf=10.0, neginf=-10.0)
+
+    def prior(self, p: Array) -> Array:
+        """Deviations from what servos usually have, in standard deviations, (2,)."""
+        volts = max(one.log.supply for one in self.replays)
+        limit, damping = p[_AT["torque_limit"]], p[_AT["motor_damping"]]
+        speed = _NO_LOAD_SPEED
+        if 0.0 < limit < 1e3 * self.scale[_AT["torque_limit"]] and damping > 0.0:
+            speed = np.clip(limit * volts / damping, 0.1, 1e3)
+        loss = (p[_AT["load_friction"]] - USUAL_LOSS[0]) / USUAL_LOSS[1]
+        return np.array([loss, np.log(speed / _NO_LOAD_SPEED) / _NO_LOAD_SPREAD])
 
     def solve(self, z: Array, free: Array, evaluations: int) -> tuple[Array, float]:
         """Least squares over some of the parameters, from a start."""
@@ -136,7 +157,28 @@ class _Problem:
 def prepare(log: ServoLog) -> Replay:
     """A log ready for replays; its first speed from its first rows."""
     speed, _ = log.derivatives()
-    return Replay.of(log, float(speed[0]) if abs(speed[0]) > _MOVING else 0.0)
+    first = 5
+    if np.abs(speed[:first]).max() > _MOVING:
+        return Replay.of(log, float(speed[0]))
+    return Replay.of(log, 0.0, float(np.mean(log.position[:first])))
+
+
+def _cut(logs: Sequence[ServoLog], seconds: float) -> list[Replay]:
+    """Replays of short parts, each from the measured angle and speed at its first row.
+
+    A short replay goes wrong little with wrong parameters, so that its least squares have hardly
+    any local minima [Bock1983]; a long one then starts close to its own.
+    """
+    cut = []
+    for log in logs:
+        speed, _ = log.derivatives()
+        count = max(1, round((log.time[-1] - log.time[0]) / seconds))
+        edges = np.searchsorted(log.time, np.linspace(log.time[0], log.time[-1], count + 1))
+        for first, last in itertools.pairwise(edges):
+            if last - first >= _FEWEST_IN_PART:
+                own = log.part(slice(first, last + 1))
+                cut.append(Replay.of(own, float(speed[first])))
+    return cut
 
 
 def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
@@ -164,6 +206,8 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
     return highest / slope if slope > 0.0 and correlated else None
 
 
+_PRIORS = 2
+_FEWEST_IN_PART = 5
 _FEWEST_AT_LIMIT = 20
 _PROPORTIONAL = 0.98
 
@@ -185,16 +229,17 @@ def fit_servo(
     z = _start(problem, logs)
     base = _base(problem)
     rng = np.random.default_rng(seed)
-    starts = [z]
-    for _ in range(_STARTS - 1):
-        starts.append(np.clip(z * np.exp(0.5 * rng.normal(size=len(z))), 1e-3, problem.upper))
     found = []
-    for count, start in enumerate(starts):
-        found.append(problem.solve(start, base, 15))
+    for count in range(_STARTS):
+        start = z if count == 0 else z * np.exp(0.7 * rng.normal(size=len(z)))
+        for seconds in _PARTS_S:
+            parts = replace(problem, replays=tuple(_cut(logs, seconds)))
+            start, _ = parts.solve(start, base, 12)
+        found.append(problem.solve(start, base, 40))
         progress(count + 1)
-    found.sort(key=lambda pair: pair[1])
-    best = min((problem.solve(z, base, 60) for z, _ in found[:2]), key=lambda pair: pair[1])
-    progress(_STARTS + 1)
+    best = min(found, key=lambda pair: pair[1])
+    problem = replace(problem, weight=_deviation(problem, best[0]))
+    best = min((problem.solve(z, base, 40) for z, _ in found), key=lambda pair: pair[1])
     free = base
     for further, first in _further(problem):
         start = best[0].copy()
@@ -209,7 +254,7 @@ def fit_servo(
     return _described(problem, tuple(logs), best[0], np.sort(free))
 
 
-STAGES = _STARTS + 2
+STAGES = _STARTS + 1
 """Stages of a fit, for its progress."""
 
 
@@ -352,12 +397,24 @@ def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     return np.maximum(z, least)
 
 
+def _independent(r: Array) -> float:
+    """Number of independent rows, by the correlation of neighbours."""
+    r = r - r.mean()
+    alike = np.clip(float(r[1:] @ r[:-1]) / max(float(r @ r), 1e-30), 0.0, 0.999)
+    return len(r) * (1.0 - alike) / (1.0 + alike)
+
+
+def _deviation(problem: _Problem, z: Array) -> float:
+    """Standard deviation of a residual that stands for all that hang together with it [rad]."""
+    r = replace(problem, weight=0.0).residual(z)
+    blocks = _blocks([one.log for one in problem.replays])
+    independent = max(_independent(r), float(blocks.max()) + 1.0)
+    return float(np.sqrt(np.mean(r**2) * len(r) / independent))
+
+
 def _gain(problem: _Problem, before: tuple[Array, float], after: tuple[Array, float]) -> float:
     """n ln(S₀/S₁), with the number of independent rows in place of all."""
-    r = problem.residual(before[0])
-    r = r - r.mean()
-    alike = float(r[1:] @ r[:-1]) / max(float(r @ r), 1e-30)
-    independent = len(r) * (1.0 - alike) / (1.0 + alike)
+    independent = _independent(replace(problem, weight=0.0).residual(before[0]))
     return independent * float(np.log(max(before[1], 1e-30) / max(after[1], 1e-30)))
 
 
@@ -365,6 +422,11 @@ def _described(
     problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Array
 ) -> ServoFit:
     r = problem.residual(z, thinned=False)
+    rows = slice(0, len(r) - _PRIORS)
+    rms = float(np.sqrt(np.mean(r[rows] ** 2)))
+    blocks = _blocks(logs)
+    clusters = int(blocks.max()) + 1
+    blocks = np.append(blocks, clusters + np.arange(_PRIORS))
     at_bound = (z[free] - problem.lower[free] < 1e-3) | (problem.upper[free] - z[free] < 1e-3)
     gradient = []
     for i in free:
@@ -375,14 +437,14 @@ def _described(
         rest = r if behind is z else problem.residual(behind, thinned=False)
         gradient.append((ahead - rest) / (_STEP if behind is z else 2.0 * _STEP))
     J = np.stack(gradient, axis=-1)
+    r[len(r) - _PRIORS :] = problem.weight  # what a prior is expected to be off
     deviation = np.full(len(free), np.inf)
     inner = ~at_bound
-    spread = _spread(J[:, inner], r, _blocks(logs))
+    spread = _spread(J[:, inner], r, blocks)
     deviation[inner] = np.sqrt(np.diag(spread))
     for j in np.flatnonzero(at_bound):  # beside those within their bounds
         own = np.append(np.flatnonzero(inner), j)
-        deviation[j] = np.sqrt(_spread(J[:, own], r, _blocks(logs))[-1, -1])
-    clusters = len(np.unique(_blocks(logs)))
+        deviation[j] = np.sqrt(_spread(J[:, own], r, blocks)[-1, -1])
     quantile = float(student.ppf(0.975, max(clusters - len(free), 2)))
     half = np.full(len(NAMES), np.nan)
     half[free] = quantile * deviation * problem.scale[free]
@@ -404,7 +466,7 @@ def _described(
         half_width=half,
         sought=sought,
         tied=tied,
-        rms=float(np.sqrt(np.mean(r**2))),
+        rms=rms,
     )
 
 

@@ -45,7 +45,7 @@ of the servo's register.
 """
 NAMES = tuple(PARAMETERS)
 
-_LONGEST_STEP_S = 1.5e-3
+_LONGEST_STEP_S = 0.7e-3
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,16 @@ class Replay:
     known: Array
 
     @staticmethod
-    def of(log: ServoLog, speed: float = 0.0) -> "Replay":
-        """Prepare a log that begins with a speed [rad/s]."""
+    def of(log: ServoLog, speed: float = 0.0, angle: float | None = None) -> "Replay":
+        """Prepare a log that begins with a speed [rad/s], and at its first or another angle."""
         step = np.diff(log.time)
         count = max(1, int(np.ceil(np.median(step) / _LONGEST_STEP_S)))
         middle = log.time[:-1, None] + step[:, None] * (np.arange(count) + 0.5) / count
         known = np.zeros_like(middle)
         if log.known is not None:
             known = np.interp(middle, log.time, log.known)
-        return Replay(log, (float(log.position[0]), speed), middle, known)
+        angle = float(log.position[0]) if angle is None else angle
+        return Replay(log, (angle, speed), middle, known)
 
     def play(self, parameters: Array) -> Array:
         """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (12,)."""
