@@ -18,7 +18,7 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import t as student
 
 from baselines.identification.servo_log import ServoLog
-from baselines.identification.servo_replay import NAMES, Replay
+from baselines.identification.servo_replay import NAMES, STEP_S, Replay
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 
@@ -154,13 +154,13 @@ class _Problem:
         return full(found.x), 2.0 * float(found.cost)
 
 
-def prepare(log: ServoLog) -> Replay:
+def prepare(log: ServoLog, longest_s: float = STEP_S) -> Replay:
     """A log ready for replays; its first speed from its first rows."""
     speed, _ = log.derivatives()
     first = 5
     if np.abs(speed[:first]).max() > _MOVING:
-        return Replay.of(log, float(speed[0]))
-    return Replay.of(log, 0.0, float(np.mean(log.position[:first])))
+        return Replay.of(log, float(speed[0]), longest_s=longest_s)
+    return Replay.of(log, 0.0, float(np.mean(log.position[:first])), longest_s)
 
 
 def _cut(logs: Sequence[ServoLog], seconds: float) -> list[Replay]:
@@ -437,17 +437,22 @@ def _described(
         rest = r if behind is z else problem.residual(behind, thinned=False)
         gradient.append((ahead - rest) / (_STEP if behind is z else 2.0 * _STEP))
     J = np.stack(gradient, axis=-1)
+    finer = replace(problem, replays=tuple(prepare(log, 0.5 * STEP_S) for log in logs))
+    change = finer.residual(z, thinned=False) - r
     r[len(r) - _PRIORS :] = problem.weight  # what a prior is expected to be off
     deviation = np.full(len(free), np.inf)
+    # the error of the steps falls with their length, so that it is twice the change by halved ones
+    shift = np.zeros(len(free))
     inner = ~at_bound
     spread = _spread(J[:, inner], r, blocks)
     deviation[inner] = np.sqrt(np.diag(spread))
+    shift[inner] = 2.0 * np.abs(np.linalg.lstsq(J[:, inner], change, rcond=1e-8)[0])
     for j in np.flatnonzero(at_bound):  # beside those within their bounds
         own = np.append(np.flatnonzero(inner), j)
         deviation[j] = np.sqrt(_spread(J[:, own], r, blocks)[-1, -1])
     quantile = float(student.ppf(0.975, max(clusters - len(free), 2)))
     half = np.full(len(NAMES), np.nan)
-    half[free] = quantile * deviation * problem.scale[free]
+    half[free] = (quantile * deviation + shift) * problem.scale[free]
     sought = np.zeros(len(NAMES), dtype=np.bool_)
     sought[free] = True
     values = problem.expand(z.copy())

@@ -45,7 +45,8 @@ of the servo's register.
 """
 NAMES = tuple(PARAMETERS)
 
-_LONGEST_STEP_S = 0.7e-3
+STEP_S = 0.7e-3
+"""Longest step of a replay [s]."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,15 @@ class Replay:
     known: Array
 
     @staticmethod
-    def of(log: ServoLog, speed: float = 0.0, angle: float | None = None) -> "Replay":
-        """Prepare a log that begins with a speed [rad/s], and at its first or another angle."""
+    def of(
+        log: ServoLog, speed: float = 0.0, angle: float | None = None, longest_s: float = STEP_S
+    ) -> "Replay":
+        """Prepare a log that begins with a speed [rad/s], and at its first or another angle [rad].
+
+        Steps are at most `longest_s` long.
+        """
         step = np.diff(log.time)
-        count = max(1, int(np.ceil(np.median(step) / _LONGEST_STEP_S)))
+        count = max(1, int(np.ceil(np.median(step) / longest_s)))
         middle = log.time[:-1, None] + step[:, None] * (np.arange(count) + 0.5) / count
         known = np.zeros_like(middle)
         if log.known is not None:
