@@ -32,7 +32,7 @@ NOISE_RAD = 1e-3
 
 def draw_servo(rng: np.random.Generator) -> Array:
     """Parameters of a small servo, as in `NAMES`, (12,)."""
-    values = dict.fromkeys(NAMES, 0.0)
+    values: dict[str, float] = dict.fromkeys(NAMES, 0.0)
     values |= {
         "position_gain": rng.uniform(1.5e-3, 4e-3),
         "torque_limit": np.inf,
@@ -50,10 +50,7 @@ def draw_servo(rng: np.random.Generator) -> Array:
 
 def make_logs(truth: Array, rng: np.random.Generator, step_s: float = 5e-3) -> list[ServoLog]:
     """Logs of three motions of a servo."""
-    return [
-        _record(log, truth, rng)
-        for log in _motions(step_s)
-    ]
+    return [_record(log, truth, rng) for log in _motions(step_s)]
 
 
 def _motions(step_s: float) -> Iterator[ServoLog]:
@@ -99,7 +96,7 @@ def holds(fit: ServoFit, truth: Array) -> dict[str, bool]:
 
 def main(trials: int = 100) -> None:
     """Print how many of the intervals hold the truth, and their median half-width."""
-    counts = dict.fromkeys(SOUGHT, 0)
+    counts: dict[str, int] = dict.fromkeys(SOUGHT, 0)
     widths: dict[str, list[float]] = {name: [] for name in SOUGHT}
     for seed in range(trials):
         rng = np.random.default_rng(seed)

@@ -108,9 +108,7 @@ def test_replay_without_friction_agrees_with_mujoco() -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    st.floats(0.1, 5.0), st.floats(0.0, 0.8), st.floats(0.0, 0.3), st.floats(0.0, 0.5)
-)
+@given(st.floats(0.1, 5.0), st.floats(0.0, 0.8), st.floats(0.0, 0.3), st.floats(0.0, 0.5))
 def test_no_torque_no_goal_gains_energy(start: float, c: float, F: float, Fs: float) -> None:
     """Without torque the pendulum never rises above its start, and friction holds it for ever."""
     angle = min(start, 3.0)
@@ -185,9 +183,11 @@ def _unit(c: dict[str, Array]) -> None:
     c["position [deg/s]"] = c.pop("position")
 
 
-BAD: dict[str, tuple[Callable[[dict[str, Array]], None], str]] = {
-    "degrees": (lambda c: [c.update({k: np.rad2deg(c[k])}) for k in ("goal", "position")] and None,
-                "degrees"),
+BAD: dict[str, tuple[Callable[[dict[str, Array]], object], str]] = {
+    "degrees": (
+        lambda c: [c.update({k: np.rad2deg(c[k])}) for k in ("goal", "position")] and None,
+        "degrees",
+    ),
     "one column in degrees": (_set("goal", lambda x: np.rad2deg(0.2 * x)), "radians"),
     "milliseconds": (_set("time", lambda t: 1e3 * t), "milliseconds"),
     "another unit": (_unit, "unit"),
@@ -229,16 +229,14 @@ def test_a_log_without_a_load_is_refused(tmp_path: Path) -> None:
 def test_parquet_without_its_package_says_what_to_install(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     try:
-        import pyarrow  # noqa: F401
+        import pyarrow  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
         (tmp_path / "log.parquet").write_bytes(b"PAR1")
         with pytest.raises(Exception, match="pyarrow"):
             read_servo_log(tmp_path / "log.parquet", LOAD)
 
 
-def test_an_episode_of_lerobot_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_of_lerobot_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its table, without the package that reads it from the file."""
     import pandas as pd
 

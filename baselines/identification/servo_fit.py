@@ -29,7 +29,7 @@ USUAL_LOSS = (0.25, 0.15)
 """Mean and standard deviation of c before a log is seen: gear trains pass 60 to 90 %."""
 _NO_LOAD_SPEED = 8.0
 _NO_LOAD_SPREAD = 0.5
-"""No-load speed and the deviation of its logarithm: data sheets of small servos have 4 to 16 rad/s."""
+"""No-load speed [rad/s] and the deviation of its logarithm: data sheets have 4 to 16 rad/s."""
 SLOW = (0.02, 0.5)
 """Speeds of slow motion; below it the joint stands [rad/s]."""
 _MOVING = 0.05
@@ -38,6 +38,7 @@ _MOST_ROWS = 600
 _STEP = 1e-3
 _STARTS = 3
 _PARTS_S = (0.3, 1.0)
+_COARSE_S = 2.5e-3
 _BETTER = 10.0  # fall of the criterion at which two more parameters are taken
 _AT = {name: i for i, name in enumerate(NAMES)}
 _DELAY_S = 0.06
@@ -177,7 +178,7 @@ def _cut(logs: Sequence[ServoLog], seconds: float) -> list[Replay]:
         for first, last in itertools.pairwise(edges):
             if last - first >= _FEWEST_IN_PART:
                 own = log.part(slice(first, last + 1))
-                cut.append(Replay.of(own, float(speed[first])))
+                cut.append(Replay.of(own, float(speed[first]), longest_s=_COARSE_S))
     return cut
 
 
@@ -213,7 +214,7 @@ _PROPORTIONAL = 0.98
 
 
 def fit_servo(
-    logs: Sequence[ServoLog], progress: Callable[[int], None] = lambda done: None, seed: int = 0
+    logs: Sequence[ServoLog], progress: Callable[[int], None] | None = None, seed: int = 0
 ) -> ServoFit:
     """Estimate the parameters of a servo.
 
@@ -225,21 +226,25 @@ def fit_servo(
     Raises:
         ElasticError: No parameters replay the logs better than a joint that stands still.
     """
+    say = progress or (lambda done: None)  # noqa: ARG005
     problem = _problem(logs)
     z = _start(problem, logs)
     base = _base(problem)
     rng = np.random.default_rng(seed)
     found = []
+    coarse = replace(problem, replays=tuple(prepare(log, _COARSE_S) for log in logs))
     for count in range(_STARTS):
         start = z if count == 0 else z * np.exp(0.7 * rng.normal(size=len(z)))
         for seconds in _PARTS_S:
             parts = replace(problem, replays=tuple(_cut(logs, seconds)))
             start, _ = parts.solve(start, base, 12)
-        found.append(problem.solve(start, base, 40))
-        progress(count + 1)
+        found.append(coarse.solve(start, base, 25))
+        say(count + 1)
     best = min(found, key=lambda pair: pair[1])
-    problem = replace(problem, weight=_deviation(problem, best[0]))
-    best = min((problem.solve(z, base, 40) for z, _ in found), key=lambda pair: pair[1])
+    problem = replace(problem, weight=_deviation(coarse, best[0]))
+    coarse = replace(coarse, weight=problem.weight)
+    found = [coarse.solve(z, base, 20) for z, _ in found]
+    best = min(found, key=lambda pair: pair[1])
     free = base
     for further, first in _further(problem):
         start = best[0].copy()
@@ -247,11 +252,12 @@ def fit_servo(
         start[more] = first
         if "torque_limit" in further:
             start[more] = _SATURATED * largest_pull(problem, best[0])
-        trial = problem.solve(start, np.append(free, more), 40)
-        if _gain(problem, best, trial) > _BETTER:
+        trial = coarse.solve(start, np.append(free, more), 25)
+        if _gain(coarse, best, trial) > _BETTER:
             best, free = trial, np.append(free, more)
-    progress(STAGES)
-    return _described(problem, tuple(logs), best[0], np.sort(free))
+    z, _ = problem.solve(best[0], free, 40)
+    say(STAGES)
+    return _described(problem, tuple(logs), z, np.sort(free))
 
 
 STAGES = _STARTS + 1
@@ -328,7 +334,10 @@ def largest_pull(problem: _Problem, z: Array) -> float:
     """Largest torque that the servo would give without a limit, in the unit of the limit."""
     p = problem.expand(z)
     pulls = [
-        p[0] * one.log.gain * one.log.supply * np.abs(one.log.goal - one.log.position)[one.log.enabled]
+        p[0]
+        * one.log.gain
+        * one.log.supply
+        * np.abs(one.log.goal - one.log.position)[one.log.enabled]
         for one in problem.replays
     ]
     return float(np.concatenate(pulls).max()) / problem.scale[_AT["torque_limit"]]
@@ -337,8 +346,8 @@ def largest_pull(problem: _Problem, z: Array) -> float:
 def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     """Parameters that solve the equation of motion where the joint moves, in their scales.
 
-    k g e − k c g e s σ − b w − B a − F s − d w − m g l o cos q = I a − τ(q), linear in k, k c, b, B,
-    F, d and o, for the error e, the side s of motion and the side σ of the motor's torque.
+    k g e − k c g e s σ − b w − B a − F s − d w − m g l o cos q = I a − τ(q), linear in k, k c, b,
+    B, F, d and o, for the error e, the side s of motion and the side σ of the motor's torque.
     """
     rows, right = [], []
     for log in logs:
@@ -367,8 +376,8 @@ def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     matrix, target = np.concatenate(rows), np.concatenate(right)
     if len(target) < 2 * matrix.shape[1]:
         raise ElasticError(
-            f"the joint moves in {len(target)} rows only, {2 * matrix.shape[1]} are needed: it sticks"
-            " or the goal hardly moves; command a motion of some tenths of a radian"
+            f"the joint moves in {len(target)} rows only, {2 * matrix.shape[1]} are needed: it"
+            " sticks or the goal hardly moves; command a motion of some tenths of a radian"
         )
     size = np.maximum(np.abs(matrix).max(axis=0), 1e-12)
     low = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf])
@@ -413,14 +422,12 @@ def _deviation(problem: _Problem, z: Array) -> float:
 
 
 def _gain(problem: _Problem, before: tuple[Array, float], after: tuple[Array, float]) -> float:
-    """n ln(S₀/S₁), with the number of independent rows in place of all."""
+    """N ln(S₀/S₁), with the number of independent rows in place of all."""
     independent = _independent(replace(problem, weight=0.0).residual(before[0]))
     return independent * float(np.log(max(before[1], 1e-30) / max(after[1], 1e-30)))
 
 
-def _described(
-    problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Array
-) -> ServoFit:
+def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Array) -> ServoFit:
     r = problem.residual(z, thinned=False)
     rows = slice(0, len(r) - _PRIORS)
     rms = float(np.sqrt(np.mean(r[rows] ** 2)))
@@ -506,4 +513,3 @@ def slow_rows(log: ServoLog) -> BoolArray:
     weight = max(float(np.abs(log.external_torque(log.position)).max()), 1e-12)
     steady = np.abs(inertia * a) < 0.05 * weight
     return log.enabled & (np.abs(w) > SLOW[0]) & (np.abs(w) < SLOW[1]) & steady
-

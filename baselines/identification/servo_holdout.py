@@ -92,9 +92,7 @@ def predictions(fit: ServoFit, log: ServoLog) -> Array:
         position = np.concatenate([one.position[one.enabled] for one in fitted])
         offset = float(np.mean(position - goal))
         line = fit_line(goal, position)
-    return np.stack(
-        [log.goal, log.goal + offset, line[0] + line[1] * log.goal, fit.replay(log)]
-    )
+    return np.stack([log.goal, log.goal + offset, line[0] + line[1] * log.goal, fit.replay(log)])
 
 
 def fit_line(goal: Array, position: Array) -> Array:
@@ -114,7 +112,7 @@ def split_logs(
         seed: Seed of the draw.
     """
     if len(logs) == 1:
-        at = int(round((1.0 - share) * len(logs[0])))
+        at = round((1.0 - share) * len(logs[0]))
         return [logs[0].part(slice(0, at))], [logs[0].part(slice(at, None))]
     count = min(max(1, round(share * len(logs))), len(logs) - 1)
     order = np.random.default_rng(seed).permutation(len(logs))

@@ -64,3 +64,7 @@ class Load:
         inertia = float(full[at, at] - model.dof_armature[at])
         rest = float(np.arctan2(pulls[0], -pulls[1]))
         return Load(float(np.hypot(*pulls)), rest, inertia)
+
+
+NO_LOAD = Load()
+"""Nothing hangs on the joint, or the log says its torque."""

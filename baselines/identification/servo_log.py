@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.signal import savgol_filter
 
-from baselines.identification.servo_load import Load
+from baselines.identification.servo_load import NO_LOAD, Load
 from elastic_env.core.csv_table import LARGEST_BYTES, read_table
 from elastic_env.core.errors import ConfigurationError, missing_extra, quote
 from elastic_env.core.files import read_bounded
@@ -78,7 +78,7 @@ class ServoLog:
     position: Array
     enabled: BoolArray
     gain: float = 1.0
-    load: Load = Load()
+    load: Load = NO_LOAD
     pwm: Array | None = None
     known: Array | None = None
     supply: float = 1.0
@@ -172,14 +172,16 @@ def read_servo_log(
         position=scale * columns["position"],
         enabled=enabled,
         gain=gain,
-        load=load or Load(),
+        load=load or NO_LOAD,
         pwm=None if pwm is None or not pwm.any() else _signed(pwm),
         known=columns.get("known"),
-        supply=float(np.median(columns["voltage"])) if "voltage" in columns else facts.get("vin", 1.0),
+        supply=float(np.median(columns["voltage"]))
+        if "voltage" in columns
+        else facts.get("vin", 1.0),
     )
     if load is None and log.known is None:
         raise ConfigurationError(
-            f"{path} does not say what hangs on the joint; give --mass-kg and --length-m of a"
+            f"{path} does not say what hangs on the joint; give --mass-kg and --lever-m of a"
             " pendulum, --robot with --joints, or a column tau_known [N·m]"
         )
     require_usable(path, log)
@@ -309,9 +311,7 @@ def _read_json(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[st
     """A log of Rhoban's recorder: facts of the run, and a list of entries."""
     del joint
     try:
-        content = parse_json(
-            read_bounded(path, LARGEST_BYTES).decode("utf-8"), most=_LONGEST_JSON
-        )
+        content = parse_json(read_bounded(path, LARGEST_BYTES).decode("utf-8"), most=_LONGEST_JSON)
     except OSError as error:
         raise ConfigurationError(f"no log at {path}: {error.strerror}") from None
     except ConfigurationError:

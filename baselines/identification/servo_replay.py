@@ -11,9 +11,9 @@ F = F₀ + c |τ_J| + F_s exp(−(ω/ω_s)²). A DC motor under a voltage that t
 .. math:: \tau_m = \operatorname{clip}(k\,g\,(q_\mathrm{goal} - q), \pm T) - b\,\dot q
 
 where V is the supply's voltage, k the position gain for one volt and one unit of the register g, T
-the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque enabled τ_m is zero, the
-rotor's inertia stays. At rest friction balances whatever is not above F. So a joint at rest tells a
-band of torques, and motion tells the torque.
+the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque
+enabled τ_m is zero, and the rotor's inertia stays. At rest friction balances whatever is not above
+F. So a joint at rest tells a band of torques, and motion tells the torque.
 """
 
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ class Replay:
 
 
 @compiled
-def _play(  # noqa: D417
+def _play(
     steps: Array, goal: Array, known: Array, enabled: Array, setting: Array, p: Array, out: Array
 ) -> None:
     """Angles of the link at the rows, into `out`; second order in the step while it moves."""

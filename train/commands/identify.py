@@ -16,6 +16,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.identify import Identification, identify
+from baselines.identification.servo_result import ServoIdentification
 from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
@@ -42,6 +43,9 @@ class Identify(Model):
     An arm from a log of static poses, with joints.yaml for compensator and environment, see
     docs/identification.md: elastic identify --robot arm.urdf --log poses.csv --end-effector tool0
     --plan 20
+
+    A servo from logs of its motion under a known load, see the same page: elastic identify --log
+    run.csv --mass-kg 0.5 --lever-m 0.1
     """
 
     scenario: Title | None = None
@@ -74,7 +78,13 @@ class Identify(Model):
 
     def run(
         self, console: Console
-    ) -> list[Identification] | ArmIdentification | GeometryIdentification | None:
+    ) -> (
+        list[Identification]
+        | ArmIdentification
+        | GeometryIdentification
+        | ServoIdentification
+        | None
+    ):
         """Identify the testbed, simulated or real, or an arm; write result and figure.
 
         Returns:

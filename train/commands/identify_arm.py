@@ -40,6 +40,7 @@ from baselines.identification.pose_plan import (
     plan_further,
     plan_poses,
 )
+from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
@@ -47,6 +48,8 @@ from elastic_env.joint.joint_settings import SOFTEST
 from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
 from train.commands.identify_geometry import GeometryOptions, identify_geometry
+from train.commands.identify_servo import ServoOptions, are_servo_logs, identify_servo
+from train.commands.options import option_name
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
 from train.runs.console import make_table
@@ -66,9 +69,9 @@ class ArmOptions(Model):
     """Rigid model of an arm, MJCF or URDF, in place of the testbed; the options from here on are
     of an arm.
     """
-    log: Locator | None = None
+    log: tuple[Locator, ...] = ()
     """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an
-    IMU or joint torques.
+    IMU or joint torques. Or logs in time of one servo with its goal: CSV, JSON or parquet.
     """
     joints: tuple[Title, ...] = ()
     """Names or patterns of the joints whose stiffness is sought; default all in the log.
@@ -100,6 +103,7 @@ class ArmOptions(Model):
     best.
     """
     markers: Annotated[GeometryOptions, tyro.conf.arg(name="")] = GeometryOptions()
+    servo: Annotated[ServoOptions, tyro.conf.arg(name="")] = ServoOptions()
 
 
 @dataclass(frozen=True)
@@ -126,8 +130,8 @@ class _Setting:
 
 def run_arm_identification(
     options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
-) -> ArmIdentification | GeometryIdentification | None:
-    """Identify an arm, write result, `joints.yaml` and figure, and print the result; or plan poses.
+) -> ArmIdentification | GeometryIdentification | ServoIdentification | None:
+    """Identify an arm or a servo, write files and print the result; or plan poses.
 
     Args:
         options: What to do.
@@ -142,10 +146,17 @@ def run_arm_identification(
         ConfigurationError: Model, log or a name cannot be used.
         ResultsExistError: The output folder holds results.
     """
+    if are_servo_logs(options.log):
+        return _identify_servo(options, console, seed, output)
+    if options.servo != ServoOptions():
+        raise ConfigurationError(
+            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
+            " with columns time, goal and position by --log"
+        )
     if options.robot is None:
         problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
         raise ConfigurationError(problem)
-    if options.log is None and (not options.plan or options.measured_by is None):
+    if not options.log and (not options.plan or options.measured_by is None):
         raise ConfigurationError(
             "give the CSV file of static poses by --log, or plan the first poses by --plan 40"
             " --measured-by end_effector (or link_encoders, imu, torques)"
@@ -167,7 +178,7 @@ def run_arm_identification(
         )
     recorded = {**options.model_dump(mode="json"), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
-        if options.log is None:
+        if not options.log:
             _plan_first(setting, folder, console)
             return None
         work = {"fitting, steps": USUAL_EVALUATIONS}
@@ -189,6 +200,42 @@ def run_arm_identification(
     for line in (summed_up(fit), *remarks(result), *written):
         console.print(line)
     return result
+
+
+def _identify_servo(
+    options: ArmOptions, console: Console, seed: int, output: Path | None
+) -> ServoIdentification:
+    """Identify a servo from logs in time.
+
+    Raises:
+        ConfigurationError: An option is for poses only, or several joints are named.
+    """
+    taken = {"log", "robot", "joints", "servo", "markers"}
+    unused = [
+        option_name((name,))
+        for name in ArmOptions.model_fields
+        if name not in taken and getattr(options, name) != getattr(ArmOptions(), name)
+    ]
+    if options.markers.replace(holdout=GeometryOptions().holdout) != GeometryOptions():
+        unused.append("those of --geometry")
+    if unused:
+        raise ConfigurationError(
+            f"{', '.join(unused)}: not for logs in time; leave it out beside {options.log[0]}"
+        )
+    if len(options.joints) > 1:
+        raise ConfigurationError(
+            f"logs in time are of one joint, got --joints {' '.join(options.joints)}; name one"
+        )
+    return identify_servo(
+        options.servo,
+        options.log,
+        console,
+        robot=options.robot,
+        joint=options.joints[0] if options.joints else None,
+        holdout=options.markers.holdout,
+        seed=seed,
+        output=output,
+    )
 
 
 def result_table(result: ArmIdentification) -> Table:
@@ -321,9 +368,13 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
+    if len(options.log) > 1:
+        raise ConfigurationError(
+            f"static poses must be in one file, got {len(options.log)}; write one table"
+        )
     log = None
-    if options.log is not None:
-        log = read_log(Path(options.log), ranges, options.measured_by)
+    if options.log:
+        log = read_log(Path(options.log[0]), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
     arm = StaticArm(model, joints, options.end_effector, options.payload)
     arm.require_gravity()
@@ -336,7 +387,7 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
         )
     elastic = _elastic_joints(options.joints, log.joints)
     setting = _Setting(options, arm, log, elastic, seed)
-    if options.log is not None and not setting.seeks_geometry:
+    if options.log and not setting.seeks_geometry:
         require_poses(setting.model(log))
     return setting
 

@@ -1,0 +1,181 @@
+"""`elastic identify --log run.csv`: a servo from logs in time."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+
+from baselines.identification.servo_fit import STAGES, fit_servo
+from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
+from baselines.identification.servo_load import Load
+from baselines.identification.servo_log import AngleUnit, ServoLog, is_servo_log, read_servo_log
+from baselines.identification.servo_result import ServoIdentification, describe_servo
+from elastic_env.core.config import Locator, Model, quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.model_file import compiled_model
+from train.figures import plots
+from train.figures.servo_plots import draw_servo
+from train.runs.console import make_table
+from train.runs.folders import run_folder
+from train.runs.progress import show_progress
+
+
+class ServoOptions(Model):
+    """Options of `elastic identify` for logs in time of one servo."""
+
+    mass_kg: float | None = quantity("kg", None, gt=0)
+    """Mass of a pendulum on the servo, whose logs have time, goal and position [kg]."""
+    lever_m: float | None = quantity("m", None, gt=0)
+    """Distance of its mass from the axis [m]."""
+    gain: float | None = quantity("1", None, gt=0)
+    """Value of the servo's gain register, where the logs do not say it [1]."""
+    angles: AngleUnit = "rad"
+    """Unit of angles in the logs in time."""
+    unfitted: tuple[Locator, ...] = ()
+    """Logs in time to replay without a fit; default a share of all, by --holdout."""
+
+
+def are_servo_logs(paths: Sequence[str]) -> bool:
+    """True if the first of some files is a log in time."""
+    return bool(paths) and is_servo_log(Path(paths[0]))
+
+
+def identify_servo(
+    options: ServoOptions,
+    paths: Sequence[str],
+    console: Console,
+    *,
+    robot: str | None = None,
+    joint: str | None = None,
+    holdout: float = 0.3,
+    seed: int = 0,
+    output: Path | None = None,
+) -> ServoIdentification:
+    """Identify a servo, write files and picture, print tables.
+
+    Args:
+        options: Load, gain and units.
+        paths: Logs of one servo.
+        console: Where progress and tables go.
+        robot: Model whose links load the joint; None for a pendulum or a known torque.
+        joint: Name of the joint in model and files.
+        holdout: Share of the logs that is replayed without a fit; 0 for none.
+        seed: Seed of the draw of these logs.
+        output: Folder for the results; default runs/identify, numbered if taken.
+
+    Raises:
+        ConfigurationError: A log or an option cannot be used.
+        ElasticError: The joint hardly moves.
+    """
+    plots.require_matplotlib()
+    load = known_load(options, robot, joint)
+    logs = [_read(options, path, load, joint) for path in paths]
+    further = [_read(options, path, load, joint) for path in options.unfitted]
+    _require_one_supply([*logs, *further])
+    inner, outer = (logs, further) if further or not holdout else split_logs(logs, holdout, seed)
+    recorded = {**options.model_dump(mode="json"), "log": list(paths), "seed": seed}
+    with run_folder("identify", recorded, seed, output) as folder:
+        fits = 1 if inner is logs else 2
+        with show_progress(console, {"fits, stages": fits * STAGES}, transient=True) as show:
+            fit = fit_servo(inner, lambda done: show(0, done), seed)
+            held_out = judge_servo(fit, outer) if outer else None
+            shown = outer or logs
+            played = [fit.replay(log) for log in shown]
+            if inner is not logs:
+                fit = fit_servo(logs, lambda done: show(0, STAGES + done), seed)
+        result = describe_servo(fit, joint or "*", held_out)
+        files = result.save(folder)
+        picture = folder / "identification.png"
+        files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
+    show_result(result, console)
+    for path in files:
+        console.print(f"wrote {path}", soft_wrap=True)
+    return result
+
+
+def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> Load | None:
+    """What hangs on the joint; None if the logs say it.
+
+    Raises:
+        ConfigurationError: Half a pendulum, a pendulum beside a robot, or a robot without a joint.
+    """
+    given = [options.mass_kg is not None, options.lever_m is not None]
+    if any(given) and not all(given):
+        raise ConfigurationError("a pendulum needs both --mass-kg and --lever-m")
+    if robot is None:
+        if options.mass_kg is None or options.lever_m is None:
+            return None
+        return Load.pendulum(options.mass_kg, options.lever_m)
+    if any(given):
+        raise ConfigurationError(
+            "give a pendulum by --mass-kg and --lever-m, or --robot, not both"
+        )
+    if joint is None:
+        raise ConfigurationError("say by --joints which joint of the robot the log is of")
+    return Load.of_joint(compiled_model(robot), joint)
+
+
+def show_result(result: ServoIdentification, console: Console) -> None:
+    """Print held-out errors, parameters, and what the logs do not tell."""
+    if result.held_out is not None:
+        console.print(verdict(result.held_out), highlight=False)
+        rows = [
+            [error.name, f"{error.rms_mrad:.1f}", _number(error.slow_mrad, ".1f")]
+            for error in result.held_out.errors
+        ]
+        title = (
+            f"error of the angle at {len(result.held_out.logs)} logs that were not fitted [mrad]"
+        )
+        head = ["prediction", "torque on", "slow motion"]
+        console.print(make_table(title, head, rows, box=box.SIMPLE))
+    rows = [
+        [
+            f"k_p at gain {one.register_value:g}",
+            f"{one.position_gain_nm_per_rad:.4g}",
+            f"± {one.half_width:.2g}",
+            "N·m/rad",
+            "",
+        ]
+        for one in result.gains
+    ]
+    for one in result.parameters:
+        if one.name != "position_gain" and one.value is not None:
+            width = "–" if one.half_width is None else f"± {one.half_width:.2g}"
+            rows.append([one.name, f"{one.value:.4g}", width, one.unit, one.remark])
+    title = f"servo from {len(result.logs)} logs, replayed within {result.rms_mrad:.1f} mrad rms"
+    head = ["parameter", "value", "95 %", "unit", "follows from"]
+    console.print(make_table(title, head, rows, box=box.SIMPLE))
+    console.print("the logs do not tell:")
+    for line in result.untold:
+        console.print(f"  {line}", highlight=False)
+
+
+def verdict(held_out: ServoHoldout) -> str:
+    """Held-out errors in a sentence; a rival that is ahead comes first."""
+    own, rival = held_out.errors[-1], held_out.best_rival
+    if own.rms_mrad < rival.rms_mrad:
+        return (
+            f"not fitted: the replay is {own.rms_mrad:.1f} mrad off, {rival.name}"
+            f" {rival.rms_mrad:.1f}, the goal itself {held_out.errors[0].rms_mrad:.1f}"
+        )
+    return (
+        f"{rival.name} is ahead: {rival.rms_mrad:.1f} mrad at logs that were not fitted, where the"
+        f" replay has {own.rms_mrad:.1f}: use that, or log more motions"
+    )
+
+
+def _read(options: ServoOptions, path: str, load: Load | None, joint: str | None) -> ServoLog:
+    return read_servo_log(Path(path), load, options.gain, options.angles, joint)
+
+
+def _require_one_supply(logs: Sequence[ServoLog]) -> None:
+    known = {log.supply != 1.0 for log in logs}
+    if len(known) > 1:
+        raise ConfigurationError(
+            "some logs say their supply voltage and some do not; give it in all or in none"
+        )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
