@@ -27,7 +27,7 @@ from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
 from baselines.identification.arm_result import JointStiffness, bounded_compliance, describe_fit
 from baselines.identification.log_signs import turn_joint
-from baselines.identification.pose_log import Kind, PoseLog, read_log
+from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
 from baselines.identification.static_arm import StaticArm
@@ -189,6 +189,22 @@ def test_derivatives_are_those_of_finite_differences(kind: Kind, frame: str) -> 
     np.testing.assert_allclose(
         gradient, np.stack(numeric, axis=-1), atol=2e-6 * np.abs(gradient).max()
     )
+
+
+def test_a_known_torque_tells_a_joint_that_gravity_does_not_load(tmp_path: Path) -> None:
+    """Weights on a rope pull the vertical axis of the base; forward is positive."""
+    generator = np.random.default_rng(11)
+    theta = poses(20, generator)
+    pull = np.zeros_like(theta)
+    pull[:, 0] = generator.uniform(-40.0, 40.0, 20)
+    columns = {f"theta.{joint}": theta[:, i] for i, joint in enumerate(JOINTS)}
+    q = equilibria(theta, -pull)  # what the springs hold
+    columns |= {f"q.{joint}": q[:, i] for i, joint in enumerate(JOINTS)}
+    path = write_poses(tmp_path / "poses.csv", columns | {"tau_known.base_yaw": pull[:, 0]})
+    log = read_log(path, RANGES)
+    assert log.known is not None
+    np.testing.assert_allclose(log.known, pull, rtol=1e-8)
+    assert np.abs(errors(fit_arm(model_of(log)))).max() < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["end_effector", "link_encoders", "imu", "torques"])

@@ -1,7 +1,7 @@
 """Servos from logs in time: replay against closed forms and MuJoCo, known truth, bad logs."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
+from baselines.identification.servo_holdout import judge_servo
 from baselines.identification.servo_load import GRAVITY, Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_replay import NAMES, Replay
-from elastic_env.core.errors import ConfigurationError
+from baselines.identification.servo_result import ServoIdentification, describe_servo
+from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.joint.joint_settings import read_joints
+from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
+from train.commands.cli import main
+from train.recorded.servos import servo_figures
 
 MASS_KG, LENGTH_M = 0.5, 0.1
 WEIGHT = MASS_KG * GRAVITY * LENGTH_M
@@ -265,3 +272,174 @@ def test_known_torque_replaces_the_weight(tmp_path: Path) -> None:
     log = read_servo_log(csv_of(tmp_path / "log.csv", **columns, **{"tau_known.j": pull}))
     np.testing.assert_allclose(log.external_torque(log.position), pull)
     assert replace(log, load=LOAD).load.inertia is not None
+
+
+# estimates
+
+
+def short_logs(seed: int, **changed: float) -> tuple[Array, list[ServoLog]]:
+    """A servo and short logs of it."""
+    rng = np.random.default_rng(seed)
+    truth = draw_servo(rng)
+    for name, value in changed.items():
+        truth[NAMES.index(name)] = value
+    return truth, make_logs(truth, rng, step_s=0.02)
+
+
+def test_short_logs_tell_the_truth() -> None:
+    """One start and rows at 50 Hz: every parameter within its interval, or within a twentieth."""
+    truth, logs = short_logs(3)
+    fit = fit_servo(logs, starts=1)
+    for name in SOUGHT:
+        value = truth[NAMES.index(name)]
+        assert abs(fit.value(name) - value) < max(fit.half(name), 0.05 * abs(value), 1e-3), name
+    held_out = judge_servo(fit, [logs[0].part(slice(150, None))])
+    assert held_out.errors[-1].rms_mrad < 5.0 < held_out.best_rival.rms_mrad
+    result = describe_servo(fit, "elbow", held_out)
+    assert {one.name for one in result.parameters if one.is_told} >= set(SOUGHT) - {"zero_offset"}
+    assert any("backlash" in text for text in result.untold)
+    gains = {one.register_value: one.position_gain_nm_per_rad for one in result.gains}
+    assert gains[800.0] == pytest.approx(4.0 * gains[200.0])
+
+
+def test_without_a_swing_the_damping_is_split_by_assumption() -> None:
+    _, logs = short_logs(4)
+    fit = fit_servo(logs[:2], starts=1)
+    assert "viscous_friction" in fit.tied
+    assert any("back-EMF" in text for text in describe_servo(fit).untold)
+    share = fit.value("viscous_friction") / (
+        fit.value("viscous_friction") + fit.value("motor_damping")
+    )
+    assert share == pytest.approx(0.2)
+
+
+def test_pwm_at_its_limit_tells_the_torque_limit() -> None:
+    """The duty k g e / T stays at one: T follows from k, whatever unit the register has."""
+    truth, logs = short_logs(5)
+    gain = truth[NAMES.index("position_gain")]
+    limit = 0.9
+    duties = [
+        885.0 * np.clip(gain * log.gain * (log.goal - log.position) / limit, -1.0, 1.0)
+        for log in logs
+    ]
+    logged = [replace(log, pwm=duty) for log, duty in zip(logs, duties, strict=True)]
+    assert duty_per_torque_gain(logged) == pytest.approx(limit / gain, rel=1e-6)
+    assert duty_per_torque_gain(logs) is None
+
+
+def test_a_joint_that_sticks_all_the_time_is_refused() -> None:
+    _, logs = short_logs(6)
+    stuck = replace(logs[0], position=1e-3 * np.sin(logs[0].time))
+    with pytest.raises(ElasticError, match="sticks"):
+        fit_servo([stuck])
+
+
+def test_command_reads_a_log_and_writes_what_others_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("train.commands.identify_servo.fit_servo", quick_fit)
+    monkeypatch.chdir(tmp_path)
+    truth, logs = short_logs(7)
+    for i in (0, 1):
+        log = logs[i]
+        csv_of(
+            tmp_path / f"{i}.csv",
+            time=log.time,
+            goal=log.goal,
+            position=log.position,
+            gain=np.full(len(log), log.gain),
+        )
+    pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
+    main(["identify", "--log", "0.csv", "1.csv", *pendulum, "--output", "out"])
+    said = capsys.readouterr().out
+    assert "a line in the goal" in said
+    assert "the logs do not tell" in said
+    result = ServoIdentification.model_validate_json(Path("out/identification.json").read_text())
+    assert result.value("load_friction") == pytest.approx(
+        truth[NAMES.index("load_friction")], abs=0.1
+    )
+    joint = read_joints(Path("out/joints.yaml"), ["elbow"])["elbow"]
+    assert joint is not None
+    assert joint.is_rigid
+    gains = result.gains[0].position_gain_nm_per_rad
+    assert joint.servo.position_gain == pytest.approx(gains, rel=1e-3)
+    assert joint.load_friction == pytest.approx(result.value("load_friction"), rel=1e-3)
+    assert Path("out/identification.png").stat().st_size > 1000
+
+
+def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
+    """A fit with a single start."""
+    del rest
+    return fit_servo(logs, starts=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--mass-kg", "0.5"], "both"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
+        (["--robot", "arm.xml"], "--joints"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = csv_of(tmp_path / "log.csv", **good())
+    with pytest.raises(SystemExit) as ended:
+        main(["identify", "--log", str(path), *options])
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth() -> None:
+    """Few of many; `python -m tests.servo_trials` makes 100."""
+    held = []
+    for seed in range(100, 106):
+        rng = np.random.default_rng(seed)
+        truth = draw_servo(rng)
+        held += holds(fit_servo(make_logs(truth, rng)), truth).values()
+    assert np.mean(held) > 0.85
+
+
+@pytest.mark.slow
+def test_figures_of_recorded_servos_are_made(tmp_path: Path) -> None:
+    """From made-up logs of the form of the recordings."""
+    for motor, gains in (("xl330", (100, 400)), ("sts3250", (32,))):
+        for gain in gains:
+            for name in ("sin_sin", "up_and_down", "sin_time_square", "lift_and_drop"):
+                _recording(tmp_path / f"{motor}_{gain}_{name}.json", motor, gain, name)
+    figures = servo_figures(tmp_path, tmp_path)
+    assert len(figures["xl330"]["held_out"]) == 3
+    assert [row["gain"] for row in figures["xl330"]["sag"]] == [100.0, 400.0]
+    assert all(row["identified"] < row["the goal itself"] for row in figures["xl330"]["sag"])
+    assert (tmp_path / "sts3250.png").exists()
+
+
+def _recording(path: Path, motor: str, gain: float, name: str) -> None:
+    """A made-up recording of a motion."""
+    time = 0.01 * np.arange(400)
+    swing = {
+        "sin_sin": np.sin(2.0 * time) + 0.4 * np.sin(5.0 * time),
+        "up_and_down": np.sin(np.minimum(0.5 * time, 1.4)),
+        "sin_time_square": np.sin(time**2),
+        "lift_and_drop": -np.sin(np.minimum(time, 1.5)),
+    }[name]
+    on = time < (2.0 if name == "lift_and_drop" else 9.0)
+    log = ServoLog("log", time, swing, np.zeros(400), on, gain=gain, load=LOAD)
+    own = parameters(
+        position_gain=0.8 / gain * np.sqrt(gain / 32.0),
+        motor_damping=0.03,
+        rotor_inertia=1e-3,
+        viscous_friction=0.006,
+        load_friction=0.3,
+        coulomb_friction=0.01,
+    )
+    q = Replay.of(log).play(own)
+    entries = [
+        {"timestamp": t, "position": a, "goal_position": g, "torque_enable": bool(e)}
+        for t, a, g, e in zip(time.tolist(), q.tolist(), swing.tolist(), on.tolist(), strict=True)
+    ]
+    facts = {"mass": MASS_KG, "length": LENGTH_M, "kp": gain, "vin": 7.4, "motor": motor}
+    path.write_text(json.dumps({**facts, "trajectory": name, "entries": entries}))

@@ -113,6 +113,7 @@ def turn_joint(log: PoseLog, joint: str) -> PoseLog:
         theta=_negative(log.theta, at),
         measured=measured,
         direction=None if log.direction is None else _negative(log.direction, at),
+        known=None if log.known is None else _negative(log.known, at),
     )
 
 

@@ -29,7 +29,12 @@ KINDS: dict[str, tuple[Kind, str]] = {
 """Quantity of a column: what it is of, and its unit."""
 AXES: dict[Kind, tuple[str, ...]] = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}
 """Columns of what has no joints."""
-UNITS = {"theta": "rad", "direction": "1", **{name: unit for name, (_, unit) in KINDS.items()}}
+UNITS = {
+    "theta": "rad",
+    "direction": "1",
+    "tau_known": "N·m",
+    **{name: unit for name, (_, unit) in KINDS.items()},
+}
 MOST_POSES = 10_000
 """Rows of a log."""
 
@@ -51,6 +56,8 @@ class PoseLog:
         measured: The measurement, (N, m), in the unit of its kind.
         direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the
             log has none.
+        known: Known further torque on the joints, (N, n) [N·m], positive where it turns the joint
+            forward; None where the log has none.
     """
 
     joints: tuple[str, ...]
@@ -59,6 +66,7 @@ class PoseLog:
     columns: tuple[str, ...]
     measured: Array
     direction: Array | None = None
+    known: Array | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -82,7 +90,7 @@ def read_log(
         quantity: [key.split(".", 1)[1] for key in columns if key.startswith(f"{quantity}.")]
         for quantity in UNITS
     }
-    for quantity in ("theta", "q", "torque", "direction"):
+    for quantity in ("theta", "q", "torque", "direction", "tau_known"):
         for joint in names[quantity]:
             if joint not in ranges:
                 raise ConfigurationError(
@@ -110,6 +118,7 @@ def read_log(
         order,
         _table(columns, quantity, order),
         _directions(path, columns, joints) if names["direction"] else None,
+        _optional(columns, "tau_known", joints) if names["tau_known"] else None,
     )
     _require_radians(path, "theta", joints, log.theta, ranges)
     if chosen == "link_encoders":
@@ -135,6 +144,7 @@ def average_poses(log: PoseLog) -> PoseLog:
     starts = [0]
     for row in range(1, len(log)):
         moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _ALIKE_RAD
+        moved |= log.known is not None and (log.known[row] != log.known[starts[-1]]).any()
         if moved or (sides[row] != sides[starts[-1]]).any():
             starts.append(row)
     count = np.diff([*starts, len(log)])[:, None]
@@ -143,6 +153,7 @@ def average_poses(log: PoseLog) -> PoseLog:
         theta=np.add.reduceat(log.theta, starts) / count,
         measured=np.add.reduceat(log.measured, starts) / count,
         direction=None if log.direction is None else sides[starts],
+        known=None if log.known is None else np.add.reduceat(log.known, starts) / count,
     )
 
 
@@ -192,8 +203,8 @@ def _name(path: Path, text: str) -> str:
     if quantity not in UNITS or not of or "\n" in of:
         raise ConfigurationError(
             f"{path} has the column {quote(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT,"
-            " direction.JOINT, end_effector.x, .y, .z, marker.NAME.x, .y, .z, imu.roll and"
-            " imu.pitch"
+            " direction.JOINT, tau_known.JOINT, end_effector.x, .y, .z, marker.NAME.x, .y, .z,"
+            " imu.roll and imu.pitch"
         )
     if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
@@ -255,10 +266,15 @@ def _markers(path: Path, columns: Sequence[str]) -> list[str]:
     return names
 
 
+def _optional(columns: Mapping[str, Array], quantity: str, joints: Sequence[str]) -> Array:
+    """A quantity of all joints, zero for those without a column, (N, n)."""
+    zero = np.zeros(len(columns[f"theta.{joints[0]}"]))
+    return np.stack([columns.get(f"{quantity}.{joint}", zero) for joint in joints], axis=-1)
+
+
 def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str]) -> Array:
     """Sides of approach, zero for joints without a column."""
-    zero = np.zeros(len(columns[f"theta.{joints[0]}"]))
-    table = np.stack([columns.get(f"direction.{joint}", zero) for joint in joints], axis=-1)
+    table = _optional(columns, "direction", joints)
     if not np.isin(table, (-1.0, 0.0, 1.0)).all():
         raise ConfigurationError(
             f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown),"

@@ -122,13 +122,13 @@ class PoseModel:
     @cached_property
     def load(self) -> Array:
         """Largest torque of each elastic joint in these poses, (k,) [N·m]."""
-        return np.abs(self.arm.torque(self.log.theta)).max(axis=0)[self.unknowns.elastic]
+        return np.abs(self._weight(self.log.theta)).max(axis=0)[self.unknowns.elastic]
 
     @cached_property
     def scale(self) -> Array:
         """Plausible size of each unknown, (p,)."""
         own = self.unknowns.slices
-        largest = max(float(np.abs(self.arm.torque(self.log.theta)).max()), 1e-9)
+        largest = max(float(np.abs(self._weight(self.log.theta)).max()), 1e-9)
         load = np.maximum(self.load, SMALLEST_LOAD * largest)
         scale = np.empty(self.unknowns.size)
         scale[own["compliance"]] = LARGEST_DEFLECTION_RAD / load
@@ -180,12 +180,17 @@ class PoseModel:
 
     def torque(self, unknowns: Array, q: Array) -> Array:
         """Torques that the transmissions carry at link angles, (N, n) [N·m]."""
-        torque = self.arm.torque(q)
+        torque = self._weight(q)
         if self.unknowns.payload:
             torque = torque + self.payload_kg(unknowns) * self.arm.payload_torque(q)
         if self.log.direction is not None:
             torque = torque + self.expand(unknowns, "friction") * self.log.direction
         return torque
+
+    def _weight(self, q: Array) -> Array:
+        """Torques that hold the arm against its weight and known torques, (N, n) [N·m]."""
+        torque = self.arm.torque(q)
+        return torque if self.log.known is None else torque - self.log.known
 
     def link_angles(self, unknowns: Array) -> tuple[Array, Array]:
         """Link angles at rest, (N, n) [rad], and (1 + C ∂τ/∂q)⁻¹ there, (N, n, n).

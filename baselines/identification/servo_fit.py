@@ -36,7 +36,8 @@ _MOVING = 0.05
 _BLOCK_S = 0.5
 _MOST_ROWS = 600
 _STEP = 1e-3
-_STARTS = 3
+STARTS = 3
+"""Starts of a fit."""
 _PARTS_S = (0.3, 1.0)
 _COARSE_S = 2.5e-3
 _BETTER = 10.0  # fall of the criterion at which two more parameters are taken
@@ -214,7 +215,10 @@ _PROPORTIONAL = 0.98
 
 
 def fit_servo(
-    logs: Sequence[ServoLog], progress: Callable[[int], None] | None = None, seed: int = 0
+    logs: Sequence[ServoLog],
+    progress: Callable[[int], None] | None = None,
+    seed: int = 0,
+    starts: int = STARTS,
 ) -> ServoFit:
     """Estimate the parameters of a servo.
 
@@ -222,6 +226,7 @@ def fit_servo(
         logs: Logs of one servo under known loads.
         progress: Called with the number of finished stages, of `STAGES`.
         seed: Seed of the further starts.
+        starts: Number of starts, against local minima.
 
     Raises:
         ElasticError: No parameters replay the logs better than a joint that stands still.
@@ -233,7 +238,7 @@ def fit_servo(
     rng = np.random.default_rng(seed)
     found = []
     coarse = replace(problem, replays=tuple(prepare(log, _COARSE_S) for log in logs))
-    for count in range(_STARTS):
+    for count in range(starts):
         start = z if count == 0 else z * np.exp(0.7 * rng.normal(size=len(z)))
         for seconds in _PARTS_S:
             parts = replace(problem, replays=tuple(_cut(logs, seconds)))
@@ -260,7 +265,7 @@ def fit_servo(
     return _described(problem, tuple(logs), z, np.sort(free))
 
 
-STAGES = _STARTS + 1
+STAGES = STARTS + 1
 """Stages of a fit, for its progress."""
 
 

@@ -62,9 +62,14 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
         fit: A fit to other logs.
         held_out: Logs that it did not see.
     """
-    errors = [predictions(fit, log) - log.position for log in held_out]
-    logs = [_of_log(log, own) for log, own in zip(held_out, errors, strict=True)]
-    slow = [own[:, slow_rows(log)] for log, own in zip(held_out, errors, strict=True)]
+    logs = []
+    slow = []
+    for log in held_out:
+        played = fit.replay(log)
+        errors = np.vstack([rivals(fit.logs, log), played]) - log.position
+        slowly = np.vstack([rivals(fit.logs, log, slow=True), played]) - log.position
+        slow.append(slowly[:, slow_rows(log)])
+        logs.append(_of_log(log, errors, slow[-1]))
     slowly = np.concatenate(slow, axis=1)
     total = np.array([log.rms_mrad for log in logs])
     return ServoHoldout(
@@ -82,17 +87,28 @@ def judge_servo(fit: ServoFit, held_out: Sequence[ServoLog]) -> ServoHoldout:
     )
 
 
-def predictions(fit: ServoFit, log: ServoLog) -> Array:
-    """Angles of a log by all predictions, (4, N) [rad]."""
-    fitted = [one for one in fit.logs if one.gain == log.gain and one.enabled.any()]
-    fitted = fitted or [one for one in fit.logs if one.enabled.any()]
+def rivals(fitted: Sequence[ServoLog], log: ServoLog, *, slow: bool = False) -> Array:
+    """Angles of a log by predictions without physics, (3, N) [rad].
+
+    Offset and line are those of the fitted logs with the same gain, or of all if there are none.
+
+    Args:
+        fitted: Logs to learn from.
+        log: Log to predict.
+        slow: Learn from rows of slow motion only, where there are any.
+    """
+    own = [one for one in fitted if one.gain == log.gain and one.enabled.any()]
+    own = own or [one for one in fitted if one.enabled.any()]
     offset, line = 0.0, np.array([0.0, 1.0])
-    if fitted:
-        goal = np.concatenate([one.goal[one.enabled] for one in fitted])
-        position = np.concatenate([one.position[one.enabled] for one in fitted])
+    if own:
+        rows = [slow_rows(one) if slow else one.enabled for one in own]
+        if not any(part.any() for part in rows):
+            rows = [one.enabled for one in own]
+        goal = np.concatenate([one.goal[part] for one, part in zip(own, rows, strict=True)])
+        position = np.concatenate([one.position[part] for one, part in zip(own, rows, strict=True)])
         offset = float(np.mean(position - goal))
         line = fit_line(goal, position)
-    return np.stack([log.goal, log.goal + offset, line[0] + line[1] * log.goal, fit.replay(log)])
+    return np.stack([log.goal, log.goal + offset, line[0] + line[1] * log.goal])
 
 
 def fit_line(goal: Array, position: Array) -> Array:
@@ -123,15 +139,14 @@ def split_logs(
     )
 
 
-def _of_log(log: ServoLog, errors: Array) -> LogErrors:
-    slow = slow_rows(log)
+def _of_log(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
     on = log.enabled if log.enabled.any() else np.ones(len(log), dtype=np.bool_)
     return LogErrors(
         log=log.name,
         gain=log.gain,
         rms_mrad=tuple(_mrad(error[on]) for error in errors),
-        slow_mrad=tuple(_mrad(error[slow]) for error in errors) if slow.any() else None,
-        slow_rows=int(slow.sum()),
+        slow_mrad=tuple(map(_mrad, slow)) if slow.size else None,
+        slow_rows=slow.shape[1],
         replay_mrad=_mrad(errors[-1]),
     )
 
