@@ -33,7 +33,9 @@ _NO_LOAD_SPREAD = 0.5
 SLOW = (0.02, 0.5)
 """Speeds of slow motion; below it the joint stands [rad/s]."""
 _MOVING = 0.05
-_BLOCK_S = 0.5
+_BLOCKS_S = (0.25, 0.5, 1.0)
+_FIRST = 5
+_LEAST_FREEDOM = 4
 _MOST_ROWS = 600
 _STEP = 1e-3
 STARTS = 3
@@ -159,10 +161,9 @@ class _Problem:
 def prepare(log: ServoLog, longest_s: float = STEP_S) -> Replay:
     """A log ready for replays; its first speed from its first rows."""
     speed, _ = log.derivatives()
-    first = 5
-    if np.abs(speed[:first]).max() > _MOVING:
+    if np.abs(speed[:_FIRST]).max() > _MOVING:
         return Replay.of(log, float(speed[0]), longest_s=longest_s)
-    return Replay.of(log, 0.0, float(np.mean(log.position[:first])), longest_s)
+    return Replay.of(log, 0.0, float(np.mean(log.position[:_FIRST])), longest_s)
 
 
 def _cut(logs: Sequence[ServoLog], seconds: float) -> list[Replay]:
@@ -209,6 +210,7 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
 
 
 _PRIORS = 2
+_LEAST_WEIGHT = 1e-9
 _FEWEST_IN_PART = 5
 _FEWEST_AT_LIMIT = 20
 _PROPORTIONAL = 0.98
@@ -421,9 +423,9 @@ def _independent(r: Array) -> float:
 def _deviation(problem: _Problem, z: Array) -> float:
     """Standard deviation of a residual that stands for all that hang together with it [rad]."""
     r = replace(problem, weight=0.0).residual(z)
-    blocks = _blocks([one.log for one in problem.replays])
-    independent = max(_independent(r), float(blocks.max()) + 1.0)
-    return float(np.sqrt(np.mean(r**2) * len(r) / independent))
+    blocks = _blocks([one.log for one in problem.replays], _BLOCKS_S[1])
+    independent = max(_independent(r), float(blocks.max()) + 1.0 - _PRIORS)
+    return max(float(np.sqrt(np.mean(r**2) * len(r) / independent)), _LEAST_WEIGHT)
 
 
 def _gain(problem: _Problem, before: tuple[Array, float], after: tuple[Array, float]) -> float:
@@ -433,38 +435,9 @@ def _gain(problem: _Problem, before: tuple[Array, float], after: tuple[Array, fl
 
 
 def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Array) -> ServoFit:
-    r = problem.residual(z, thinned=False)
-    rows = slice(0, len(r) - _PRIORS)
-    rms = float(np.sqrt(np.mean(r[rows] ** 2)))
-    blocks = _blocks(logs)
-    clusters = int(blocks.max()) + 1
-    blocks = np.append(blocks, clusters + np.arange(_PRIORS))
-    at_bound = (z[free] - problem.lower[free] < 1e-3) | (problem.upper[free] - z[free] < 1e-3)
-    gradient = []
-    for i in free:
-        step = np.zeros_like(z)
-        step[i] = _STEP
-        ahead = problem.residual(z + step, thinned=False)
-        behind = z - step if z[i] - _STEP > problem.lower[i] else z
-        rest = r if behind is z else problem.residual(behind, thinned=False)
-        gradient.append((ahead - rest) / (_STEP if behind is z else 2.0 * _STEP))
-    J = np.stack(gradient, axis=-1)
-    finer = replace(problem, replays=tuple(prepare(log, 0.5 * STEP_S) for log in logs))
-    change = finer.residual(z, thinned=False) - r
-    r[len(r) - _PRIORS :] = problem.weight  # what a prior is expected to be off
-    deviation = np.full(len(free), np.inf)
-    # the error of the steps falls with their length, so that it is twice the change by halved ones
-    shift = np.zeros(len(free))
-    inner = ~at_bound
-    spread = _spread(J[:, inner], r, blocks)
-    deviation[inner] = np.sqrt(np.diag(spread))
-    shift[inner] = 2.0 * np.abs(np.linalg.lstsq(J[:, inner], change, rcond=1e-8)[0])
-    for j in np.flatnonzero(at_bound):  # beside those within their bounds
-        own = np.append(np.flatnonzero(inner), j)
-        deviation[j] = np.sqrt(_spread(J[:, own], r, blocks)[-1, -1])
-    quantile = float(student.ppf(0.975, max(clusters - len(free), 2)))
+    """Estimates with their intervals."""
     half = np.full(len(NAMES), np.nan)
-    half[free] = (quantile * deviation + shift) * problem.scale[free]
+    half[free] = _half_widths(problem, z, free) * problem.scale[free]
     sought = np.zeros(len(NAMES), dtype=np.bool_)
     sought[free] = True
     values = problem.expand(z.copy())
@@ -477,28 +450,79 @@ def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Ar
     if not problem.split_damping:
         tied["viscous_friction"] = f"{100 * VISCOUS_SHARE:g} % of the damping, assumed"
         half[_AT["motor_damping"]] *= 1.0 - VISCOUS_SHARE
+    r = replace(problem, weight=0.0).residual(z, thinned=False)
     return ServoFit(
         logs=logs,
         values=values,
         half_width=half,
         sought=sought,
         tied=tied,
-        rms=rms,
+        rms=float(np.sqrt(np.mean(r**2))),
     )
 
 
-def _blocks(logs: Sequence[ServoLog]) -> Array:
-    """Number of the block of each row, over all logs, (N,)."""
+def _half_widths(problem: _Problem, z: Array, free: Array) -> Array:
+    """Half-widths of 95 % intervals in the scales of the parameters, (k,).
+
+    They hold the noise, the angle at the first row, which noise shifts too, and the error of the
+    steps. That falls with their length, so that it is twice the change by halved steps.
+    """
+    r = problem.residual(z, thinned=False)
+    logs = [one.log for one in problem.replays]
+    J = _gradient(problem, z, free, r)
+    finer = replace(problem, replays=tuple(prepare(log, 0.5 * STEP_S) for log in logs))
+    by_steps = finer.residual(z, thinned=False) - r
+    by_starts = []
+    for i, one in enumerate(problem.replays):
+        noise = float(np.std(np.diff(one.log.position, 2))) / np.sqrt(6.0)
+        moved = replace(one, start=(one.start[0] + noise / np.sqrt(_FIRST), one.start[1]))
+        others = (*problem.replays[:i], moved, *problem.replays[i + 1 :])
+        by_starts.append(replace(problem, replays=others).residual(z, thinned=False) - r)
+    at_bound = (z[free] - problem.lower[free] < 1e-3) | (problem.upper[free] - z[free] < 1e-3)
+    inner = np.flatnonzero(~at_bound)
+    r[len(r) - _PRIORS :] = problem.weight  # what a prior is expected to be off
+    half = np.zeros(len(free))
+    for own in [inner, *(np.append(inner, j) for j in np.flatnonzero(at_bound))]:
+        columns = J[:, own]
+        blocks = [_blocks(logs, seconds) for seconds in _BLOCKS_S]
+        variance = np.max([_variance(columns, r, block) for block in blocks], axis=0)
+        moved = np.linalg.lstsq(columns, np.stack([by_steps, *by_starts], axis=-1), rcond=1e-8)[0]
+        variance += np.sum(moved[:, 1:] ** 2, axis=1)
+        clusters = len(np.unique(_blocks(logs, _BLOCKS_S[-1])))
+        quantile = float(student.ppf(0.975, max(clusters - len(free), _LEAST_FREEDOM)))
+        width = quantile * np.sqrt(variance) + 2.0 * np.abs(moved[:, 0])
+        new = own if own is inner else own[-1:]
+        half[new] = width if own is inner else width[-1:]
+    return half
+
+
+def _gradient(problem: _Problem, z: Array, free: Array, r: Array) -> Array:
+    """Derivatives of all residuals, central where the bounds allow it, (N, k)."""
+    columns = []
+    for i in free:
+        step = np.zeros_like(z)
+        step[i] = _STEP
+        ahead = problem.residual(z + step, thinned=False)
+        if z[i] - _STEP > problem.lower[i]:
+            behind = problem.residual(z - step, thinned=False)
+            columns.append((ahead - behind) / (2.0 * _STEP))
+        else:
+            columns.append((ahead - r) / _STEP)
+    return np.stack(columns, axis=-1)
+
+
+def _blocks(logs: Sequence[ServoLog], seconds: float) -> Array:
+    """Number of the block of each row over all logs, and one for each prior, (N,)."""
     numbers, first = [], 0
     for log in logs:
-        own = ((log.time - log.time[0]) / _BLOCK_S).astype(int)
+        own = ((log.time - log.time[0]) / seconds).astype(int)
         numbers.append(first + own)
         first += int(own[-1]) + 1
-    return np.concatenate(numbers)
+    return np.concatenate([*numbers, first + np.arange(_PRIORS)])
 
 
-def _spread(J: Array, r: Array, block: Array) -> Array:
-    """Covariance of estimates by clusters, not below that of independent rows, (p, p)."""
+def _variance(J: Array, r: Array, block: Array) -> Array:
+    """Variances of estimates by clusters, not below those for independent rows, (p,)."""
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
     inverse = np.linalg.pinv((J / size).T @ (J / size), rcond=1e-10)
     count = int(block.max()) + 1
@@ -507,8 +531,7 @@ def _spread(J: Array, r: Array, block: Array) -> Array:
     p = J.shape[1]
     robust = inverse @ (score.T @ score) @ inverse * (count / max(count - p, 1))
     plain = inverse * float(r @ r) / max(len(r) - p, 1)
-    variance = np.maximum(np.diag(robust), np.diag(plain))
-    return np.diag(variance / size**2)
+    return np.maximum(np.diag(robust), np.diag(plain)) / size**2
 
 
 def slow_rows(log: ServoLog) -> BoolArray:

@@ -105,47 +105,85 @@ class Replay:
 def _play(
     steps: Array, goal: Array, known: Array, enabled: Array, setting: Array, p: Array, out: Array
 ) -> None:
-    """Angles of the link at the rows, into `out`; second order in the step while it moves."""
+    """Angles of the link at the rows, into `out`; second order in the step.
+
+    A link whose speed passes zero within a step stops there. For the rest of the step it stands, or
+    is driven the other way.
+    """
     q = setting[0]
     w = setting[1]
     gain = setting[2] * setting[3] * p[0]
     limit = setting[3] * p[1]
-    B = p[3]
-    M = B + setting[6]
+    M = p[3] + setting[6]
+    at_rest = p[5] + p[8]
     out[0] = q
     substeps = goal.shape[1]
     for k in range(len(steps)):
         h = steps[k] / substeps
+        b = p[2] if enabled[k] else 0.0
         for j in range(substeps):
-            q += 0.5 * h * w
+            left = h
+            if w != 0.0:
+                middle = q + 0.5 * h * w
+                pull = 0.0
+                if enabled[k]:
+                    pull = min(max(gain * (goal[k, j] - middle), -limit), limit)
+                other = known[k, j] - setting[4] * np.sin(middle - setting[5] - p[10])
+                F = p[5]
+                if p[8] > 0.0:
+                    F += p[8] * np.exp(-((w / p[9]) ** 2))
+                side = 1.0 if w > 0.0 else -1.0
+                slope = _acceleration(side, pull, b, w, h, other, F, p[6], p[7], M, p[3])
+                faster = w + h * slope
+                if faster * w > 0.0:
+                    q = middle + 0.5 * h * faster
+                    w = faster
+                    continue
+                stop = -w / slope
+                q += 0.5 * w * stop
+                w = 0.0
+                left = h - stop
             pull = 0.0
-            b = 0.0
             if enabled[k]:
                 pull = min(max(gain * (goal[k, j] - q), -limit), limit)
-                b = p[2]
             other = known[k, j] - setting[4] * np.sin(q - setting[5] - p[10])
-            F = p[5]
-            if p[8] > 0.0:
-                F += p[8] * np.exp(-((w / p[9]) ** 2))
-            c = p[6]
-            # torque on the gear and friction that would bring the link to rest within the step
-            load = pull - 0.5 * b * w + B * w / h
-            needed = load + other - 0.5 * p[7] * w + (M - B) * w / h
-            if abs(needed) <= F + c * abs(load):
-                w = 0.0
-                continue
-            side = 1.0 if needed > 0.0 else -1.0
-            turn = 1.0 if pull - b * w > 0.0 else -1.0
-            slope = 0.0
-            for _ in range(2):
-                s = side * c * turn
-                damping = p[7] + b * (1.0 - s)
-                slope = (pull * (1.0 - s) + other - side * F - damping * w) / (
-                    M - s * B + 0.5 * h * damping
-                )
-                if (pull - b * (w + 0.5 * h * slope) - B * slope) * turn >= 0.0:
-                    break
-                turn = -turn
-            w += h * slope
-            q += 0.5 * h * w
+            needed = pull + other
+            if abs(needed) > at_rest + p[6] * abs(pull):
+                side = 1.0 if needed > 0.0 else -1.0
+                slope = _acceleration(side, pull, b, 0.0, left, other, at_rest, p[6], p[7], M, p[3])
+                w = left * slope
+                q += 0.5 * left * w
         out[k + 1] = q
+
+
+@compiled
+def _acceleration(
+    side: float,
+    pull: float,
+    b: float,
+    w: float,
+    h: float,
+    other: float,
+    F: float,
+    c: float,
+    d: float,
+    M: float,
+    B: float,
+) -> float:
+    """Mean acceleration over a step of a link that moves to a side [rad/s²].
+
+    M a = pull − b w̄ + other − d w̄ − s (F + c |pull − b w̄ − B a|), with w̄ = w + a h / 2, solved for
+    the sign of the load that it then has.
+    """
+    turn = 1.0 if pull - b * w > 0.0 else -1.0
+    slope = 0.0
+    for _ in range(2):
+        s = side * c * turn
+        damping = d + b * (1.0 - s)
+        slope = (pull * (1.0 - s) + other - side * F - damping * w) / (
+            M - s * B + 0.5 * h * damping
+        )
+        if (pull - b * (w + 0.5 * h * slope) - B * slope) * turn >= 0.0:
+            break
+        turn = -turn
+    return slope
