@@ -20,7 +20,7 @@ from scipy.stats import t as student
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import NAMES, STEP_S, Replay
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 
 VISCOUS_SHARE = 0.2
 """Viscous friction over all damping where the torque is never off, as published models of small
@@ -41,7 +41,7 @@ _STEP = 1e-3
 STARTS = 3
 """Starts of a fit."""
 _PARTS_S = (0.3, 1.0)
-_COARSE_S = 2.5e-3
+_COARSE_S = 3.4e-3
 _BETTER = 10.0  # fall of the criterion at which two more parameters are taken
 _AT = {name: i for i, name in enumerate(NAMES)}
 _DELAY_S = 0.06
@@ -125,7 +125,7 @@ class _Problem:
         loss = (p[_AT["load_friction"]] - USUAL_LOSS[0]) / USUAL_LOSS[1]
         return np.array([loss, np.log(speed / _NO_LOAD_SPEED) / _NO_LOAD_SPREAD])
 
-    def solve(self, z: Array, free: Array, evaluations: int) -> tuple[Array, float]:
+    def solve(self, z: Array, free: IntArray, evaluations: int) -> tuple[Array, float]:
         """Least squares over some of the parameters, from a start."""
         low, high = self.lower[free], self.upper[free]
 
@@ -312,7 +312,7 @@ def _problem(logs: Sequence[ServoLog]) -> _Problem:
     )
 
 
-def _base(problem: _Problem) -> Array:
+def _base(problem: _Problem) -> IntArray:
     """Parameters that are always sought."""
     logs = [one.log for one in problem.replays]
     names = ["rotor_inertia", "coulomb_friction", "load_friction"]
@@ -434,7 +434,7 @@ def _gain(problem: _Problem, before: tuple[Array, float], after: tuple[Array, fl
     return independent * float(np.log(max(before[1], 1e-30) / max(after[1], 1e-30)))
 
 
-def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Array) -> ServoFit:
+def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: IntArray) -> ServoFit:
     """Estimates with their intervals."""
     half = np.full(len(NAMES), np.nan)
     half[free] = _half_widths(problem, z, free) * problem.scale[free]
@@ -461,7 +461,7 @@ def _described(problem: _Problem, logs: tuple[ServoLog, ...], z: Array, free: Ar
     )
 
 
-def _half_widths(problem: _Problem, z: Array, free: Array) -> Array:
+def _half_widths(problem: _Problem, z: Array, free: IntArray) -> Array:
     """Half-widths of 95 % intervals in the scales of the parameters, (k,).
 
     They hold the noise, the angle at the first row, which noise shifts too, and the error of the
@@ -496,7 +496,7 @@ def _half_widths(problem: _Problem, z: Array, free: Array) -> Array:
     return half
 
 
-def _gradient(problem: _Problem, z: Array, free: Array, r: Array) -> Array:
+def _gradient(problem: _Problem, z: Array, free: IntArray, r: Array) -> Array:
     """Derivatives of all residuals, central where the bounds allow it, (N, k)."""
     columns = []
     for i in free:
@@ -511,17 +511,17 @@ def _gradient(problem: _Problem, z: Array, free: Array, r: Array) -> Array:
     return np.stack(columns, axis=-1)
 
 
-def _blocks(logs: Sequence[ServoLog], seconds: float) -> Array:
+def _blocks(logs: Sequence[ServoLog], seconds: float) -> IntArray:
     """Number of the block of each row over all logs, and one for each prior, (N,)."""
     numbers, first = [], 0
     for log in logs:
-        own = ((log.time - log.time[0]) / seconds).astype(int)
+        own = ((log.time - log.time[0]) / seconds).astype(np.int64)
         numbers.append(first + own)
         first += int(own[-1]) + 1
     return np.concatenate([*numbers, first + np.arange(_PRIORS)])
 
 
-def _variance(J: Array, r: Array, block: Array) -> Array:
+def _variance(J: Array, r: Array, block: IntArray) -> Array:
     """Variances of estimates by clusters, not below those for independent rows, (p,)."""
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
     inverse = np.linalg.pinv((J / size).T @ (J / size), rcond=1e-10)

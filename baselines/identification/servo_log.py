@@ -110,9 +110,8 @@ class ServoLog:
         grid = np.arange(self.time[0], self.time[-1] + step, step)
         q = np.interp(grid, self.time, self.position)
         window = min(window, 2 * ((len(grid) - 1) // 2) + 1)
-        slopes = (savgol_filter(q, window, 2, deriv=n, delta=step) for n in (1, 2))
-        speed, acceleration = (np.interp(self.time, grid, slope) for slope in slopes)
-        return speed, acceleration
+        slopes = [np.asarray(savgol_filter(q, window, 2, deriv=n, delta=step)) for n in (1, 2)]
+        return np.interp(self.time, grid, slopes[0]), np.interp(self.time, grid, slopes[1])
 
 
 def is_servo_log(path: Path) -> bool:

@@ -22,7 +22,7 @@ import numpy as np
 
 from baselines.identification.servo_log import ServoLog
 from elastic_env.core.compiled import compiled
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, BoolArray
 
 PARAMETERS = {
     "position_gain": "N·m/rad",
@@ -45,7 +45,7 @@ of the servo's register.
 """
 NAMES = tuple(PARAMETERS)
 
-STEP_S = 0.7e-3
+STEP_S = 1.7e-3
 """Longest step of a replay [s]."""
 
 
@@ -103,7 +103,13 @@ class Replay:
 
 @compiled
 def _play(
-    steps: Array, goal: Array, known: Array, enabled: Array, setting: Array, p: Array, out: Array
+    steps: Array,
+    goal: Array,
+    known: Array,
+    enabled: BoolArray,
+    setting: Array,
+    p: Array,
+    out: Array,
 ) -> None:
     """Angles of the link at the rows, into `out`; second order in the step.
 
