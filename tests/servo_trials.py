@@ -24,6 +24,7 @@ SOUGHT = (
     "load_friction",
     "viscous_friction",
     "zero_offset",
+    "delay",
 )
 """Parameters that every trial has and that the logs tell."""
 COUNT_RAD = 2.0 * np.pi / 4096
@@ -43,7 +44,7 @@ def draw_servo(rng: np.random.Generator) -> Array:
         "viscous_friction": rng.uniform(0.003, 0.012),
         "stribeck_speed": 0.3,
         "zero_offset": rng.uniform(-0.02, 0.02),
-        "delay": 0.004,
+        "delay": rng.uniform(0.002, 0.02),
     }
     return np.array([values[name] for name in NAMES])
 

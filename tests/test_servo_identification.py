@@ -17,7 +17,7 @@ from baselines.identification.servo_load import GRAVITY, Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
-from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
@@ -239,7 +239,7 @@ def test_parquet_without_its_package_says_what_to_install(tmp_path: Path) -> Non
         import pyarrow  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
         (tmp_path / "log.parquet").write_bytes(b"PAR1")
-        with pytest.raises(Exception, match="pyarrow"):
+        with pytest.raises(MissingExtraError, match="pip install pyarrow"):
             read_servo_log(tmp_path / "log.parquet", LOAD)
 
 

@@ -14,7 +14,7 @@ from scipy.signal import savgol_filter
 
 from baselines.identification.servo_load import NO_LOAD, Load
 from elastic_env.core.csv_table import LARGEST_BYTES, read_table
-from elastic_env.core.errors import ConfigurationError, missing_extra, quote
+from elastic_env.core.errors import ConfigurationError, MissingExtraError, quote
 from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array, BoolArray
@@ -343,7 +343,9 @@ def _read_parquet(path: Path, joint: str | None) -> tuple[dict[str, Array], dict
     try:
         table = pd.read_parquet(path)
     except ImportError:
-        raise missing_extra("pyarrow", "parquet", "reading parquet files") from None
+        raise MissingExtraError(
+            "reading parquet files needs the package pyarrow; install it with: pip install pyarrow"
+        ) from None
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"{path} is no parquet file that can be read: {error}") from None
     names = {"timestamp": "time", "action": "goal", "observation.state": "position"}

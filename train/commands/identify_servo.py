@@ -108,9 +108,7 @@ def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> L
             return None
         return Load.pendulum(options.mass_kg, options.lever_m)
     if any(given):
-        raise ConfigurationError(
-            "give a pendulum by --mass-kg and --lever-m, or --robot, not both"
-        )
+        raise ConfigurationError("give a pendulum by --mass-kg and --lever-m, or --robot, not both")
     if joint is None:
         raise ConfigurationError("say by --joints which joint of the robot the log is of")
     return Load.of_joint(compiled_model(robot), joint)
