@@ -410,7 +410,7 @@ def test_figures_of_recorded_servos_are_made(tmp_path: Path) -> None:
         for gain in gains:
             for name in ("sin_sin", "up_and_down", "sin_time_square", "lift_and_drop"):
                 _recording(tmp_path / f"{motor}_{gain}_{name}.json", motor, gain, name)
-    figures = servo_figures(tmp_path, tmp_path)
+    figures = servo_figures(sorted(tmp_path.glob("*.json")), tmp_path)
     assert len(figures["xl330"]["held_out"]) == 3
     assert [row["gain"] for row in figures["xl330"]["sag"]] == [100.0, 400.0]
     assert all(row["identified"] < row["the goal itself"] for row in figures["xl330"]["sag"])

@@ -79,3 +79,25 @@ def _most(rows: Rows) -> int:
 
 def _is(row: Mapping[str, str], name: str) -> bool:
     return row["prediction"] == name
+
+
+def replays(rows: Rows) -> str:
+    """Errors of replays of motions that were not fitted, over all rows of the logs."""
+    own = [row for row in rows if row["measure"] == "replay"]
+    return _servo_table("motion, not fitted", own)
+
+
+def slow_motion(rows: Rows) -> str:
+    """Errors in slow motion by the value of the gain register, over all motions."""
+    own = [row for row in rows if row["measure"] == "slow"]
+    return _servo_table("gain, slow motion, not fitted", own)
+
+
+def _servo_table(what: str, rows: Rows) -> str:
+    head = ["servo", what, "goal itself", "constant offset", "line in the goal", "identified"]
+    names = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
+    lines = []
+    for row in rows:
+        shown = [f"{float(row[name]):.1f}" for name in names]
+        lines.append([row["servo"].upper(), row["of"].replace("_", " "), *shown])
+    return page_table(head, lines, words=2)

@@ -81,7 +81,7 @@ TABLES = {
     },
     "cluster": "python -m tests.cluster_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
-    "recorded_justin": "python -m train.recorded writes it",
+    **dict.fromkeys(("recorded_justin", "recorded_servos"), "python -m train.recorded writes it"),
     "step": "python -m docs.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
@@ -215,6 +215,8 @@ PARTS: Mapping[str, Part] = {
     "recorded hands": _of(recorded.hands, "recorded_justin"),
     "recorded hands by poses": _of(recorded.by_poses, "recorded_justin"),
     "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
+    "replays of recorded servos": _of(recorded.replays, "recorded_servos"),
+    "recorded servos in slow motion": _of(recorded.slow_motion, "recorded_servos"),
     "recorded in short": _of(recorded.in_short, "recorded_justin"),
     "link encoders": _of(arms.link_encoders, "link_encoder"),
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),

@@ -1,18 +1,22 @@
 """`python -m train.recorded FOLDER`: every figure of the page "Recorded robots"."""
 
+import json
+from itertools import count
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich import box
 from rich.console import Console
 
+from elastic_env.core.files import write_whole
 from train.commands.cli import CONSOLE, run_program
 from train.commands.entry import start as start_program
 from train.recorded.justin import HandError, hand_errors, num_trials, read_poses
 from train.recorded.pictures import draw_hand_errors
-from train.recorded.sources import JUSTIN, SOURCES
-from train.runs.console import make_table
+from train.recorded.servos import num_fits, servo_figures, servo_rows
+from train.recorded.sources import JUSTIN, SOURCES, STS3250, XL330
+from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
@@ -42,19 +46,35 @@ def main(
             source.fetch(folder, lambda address: CONSOLE.print(f"fetching {address}"))
     (path,) = (JUSTIN.file(folder, path) for path in JUSTIN.files)
     poses = read_poses(path)
-    total = num_trials(len(poses.theta))
+    logs = [source.file(folder, path) for source in (XL330, STS3250) for path in source.files]
+    totals = {"servos": num_fits(), "humanoid": num_trials(len(poses.theta))}
     with (
         run_folder("recorded", {"folder": str(folder)}, None, output) as results,
-        show_progress(CONSOLE, {"humanoid": total}, unit="fits") as show,
+        show_progress(CONSOLE, totals, unit="fits") as show,
     ):
-        rows = hand_errors(poses, lambda done: show(0, done))
-        files = [
-            write_records([row.model_dump() for row in rows], results / "recorded_justin.csv"),
-            draw_hand_errors(rows, results / "recorded_justin.png"),
-        ]
-    _print_hands(rows, CONSOLE)
-    for file in files:
-        CONSOLE.print(f"wrote {file}", soft_wrap=True)
+        done = count(1)
+        figures = servo_figures(logs, results, lambda what: show(0, next(done), what))
+        servos = servo_rows(figures)
+        hands = hand_errors(poses, lambda done: show(1, done))
+        write_records(servos, results / "recorded_servos.csv")
+        write_records([row.model_dump() for row in hands], results / "recorded_justin.csv")
+        draw_hand_errors(hands, results / "recorded_justin.png")
+        write_whole(results / "servos.json", json.dumps(figures, indent=1))
+    _print_servos(servos, CONSOLE)
+    _print_hands(hands, CONSOLE)
+    print_files(results, sorted(results.iterdir()), CONSOLE)
+
+
+def _print_servos(rows: list[dict[str, Any]], console: Console) -> None:
+    """Errors of the servos' logs that were not fitted."""
+    keys = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
+    lines = [
+        [row["servo"], row["measure"], row["of"], *(f"{row[key]:.1f}" for key in keys)]
+        for row in rows
+    ]
+    head = ["servo", "measure", "motion or gain", "goal", "offset", "line", "identified"]
+    title = "error of the angle in logs that were not fitted, rms [mrad]"
+    console.print(make_table(title, head, lines, box=box.SIMPLE))
 
 
 def _print_hands(rows: list[HandError], console: Console) -> None:

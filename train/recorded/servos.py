@@ -37,12 +37,14 @@ class RecordedLog:
 
 
 def servo_figures(
-    folder: Path, pictures: Path | None = None, say: Callable[[str], None] | None = None
+    files: Sequence[Path],
+    pictures: Path | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """All figures of the two servos.
 
     Args:
-        folder: Folder with the unpacked JSON files.
+        files: Logs of both servos in JSON.
         pictures: Folder for a picture of each servo's replay; None for none.
         say: Called with what is being done.
 
@@ -52,15 +54,15 @@ def servo_figures(
         [mrad]; and `identified`, the parameters from all logs.
 
     Raises:
-        ConfigurationError: The folder has none of the logs.
+        ConfigurationError: A servo has no log.
     """
     tell = say or (lambda text: None)  # noqa: ARG005
-    recorded = read_recordings(folder)
+    recorded = read_recordings(files)
     figures = {}
     for motor, groups in (("xl330", XL330_LEFT_OUT), ("sts3250", STS3250_LEFT_OUT)):
         own = [one for one in recorded if one.motor == motor]
         if not own:
-            raise ConfigurationError(f"{folder} has no log of the {motor}; unpack them all there")
+            raise ConfigurationError(f"there is no log of the {motor} among {len(files)} files")
         held_out = []
         for number, group in enumerate(groups):
             tell(f"{motor}: fit without {', '.join(group)}")
@@ -76,20 +78,39 @@ def servo_figures(
     return figures
 
 
-def read_recordings(folder: Path) -> list[RecordedLog]:
-    """All logs of a folder, by gain and name.
+def read_recordings(files: Sequence[Path]) -> list[RecordedLog]:
+    """Logs by gain and name.
 
     Raises:
-        ConfigurationError: There is none, or one cannot be read.
+        ConfigurationError: One cannot be read.
     """
     found = []
-    for path in sorted(folder.glob("*.json")):
+    for path in files:
         log = read_servo_log(path)
         facts: Mapping[str, Any] = parse_json(path.read_text(encoding="utf-8"), most=_LARGEST_JSON)
         found.append(RecordedLog(str(facts["motor"]), str(facts["trajectory"]), log))
-    if not found:
-        raise ConfigurationError(f"{folder} has no logs; unpack the JSON files of the servos there")
     return sorted(found, key=lambda one: (one.log.gain, one.log.name))
+
+
+def num_fits() -> int:
+    """How often `servo_figures` says what is being done."""
+    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2
+
+
+def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The errors as a table, `recorded_servos.csv`: replays of motions, and slow motion by gain."""
+    rows = []
+    columns = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
+    for motor, figure in figures.items():
+        for part in figure["held_out"]:
+            errors = [error["rms_mrad"] for error in part["errors"][:-1]]
+            own = dict(zip(columns, [*errors, part["replay_mrad"]], strict=True))
+            of = ", ".join(part["motions"])
+            rows.append({"servo": motor, "measure": "replay", "of": of, **own})
+        for gain in figure["sag"]:
+            own = dict(zip(columns, (gain[name] for name in PREDICTIONS), strict=True))
+            rows.append({"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}", **own})
+    return rows
 
 
 def sag_by_gain(held_out: Sequence[ServoHoldout]) -> list[dict[str, float]]:
