@@ -350,11 +350,15 @@ def test_command_reads_a_log_and_writes_what_others_read(
             gain=np.full(len(log), log.gain),
         )
     pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
-    main(["identify", "--log", "0.csv", "1.csv", *pendulum, "--output", "out"])
+    logged = ["--log", "0.csv", "1.csv", "--unfitted", "./1.csv"]
+    main(["identify", *logged, *pendulum, "--output", "out"])
     said = capsys.readouterr().out
     assert "a line in the goal" in said
     assert "the logs do not tell" in said
     result = ServoIdentification.model_validate_json(Path("out/identification.json").read_text())
+    assert result.logs == ("0",)  # what is replayed without a fit was not fitted
+    assert result.held_out is not None
+    assert [log.log for log in result.held_out.logs] == ["1"]
     assert result.value("load_friction") == pytest.approx(
         truth[NAMES.index("load_friction")], abs=0.1
     )
@@ -380,11 +384,17 @@ def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
         (["--robot", "arm.xml"], "--joints"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "log.csv"], "at least one"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
-    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     path = csv_of(tmp_path / "log.csv", **good())
     with pytest.raises(SystemExit) as ended:
         main(["identify", "--log", str(path), *options])

@@ -33,7 +33,7 @@ class ServoOptions(Model):
     angles: AngleUnit = "rad"
     """Unit of angles in the logs in time."""
     unfitted: tuple[Locator, ...] = ()
-    """Logs in time to replay without a fit; default a share of all, by --holdout."""
+    """Logs in time to replay without a fit, left out of --log too; default a share by --holdout."""
 
 
 def are_servo_logs(paths: Sequence[str]) -> bool:
@@ -70,7 +70,11 @@ def identify_servo(
     """
     plots.require_matplotlib()
     load = known_load(options, robot, joint)
-    logs = [_read(options, path, load, joint) for path in paths]
+    apart = {Path(path).resolve() for path in options.unfitted}
+    fitted = [path for path in paths if Path(path).resolve() not in apart]
+    if not fitted:
+        raise ConfigurationError("all logs are --unfitted; leave at least one to fit")
+    logs = [_read(options, path, load, joint) for path in fitted]
     further = [_read(options, path, load, joint) for path in options.unfitted]
     _require_one_supply([*logs, *further])
     inner, outer = (logs, further) if further or not holdout else split_logs(logs, holdout, seed)
