@@ -22,7 +22,7 @@ from train.figures.servo_plots import draw_servo
 
 XL330_LEFT_OUT = (("sin_time_square", "lift_and_drop"), ("up_and_down",), ("sin_sin",))
 """Motions of the XL330 that are left out together; the first are those of the source's figures."""
-STS3250_LEFT_OUT = (("up_and_down",), ("sin_sin",), ("sin_time_square",))
+STS3250_LEFT_OUT = (("up_and_down",), ("sin_sin",), ("lift_and_drop",), ("sin_time_square",))
 """Motions of the STS3250 that are left out in turn; the last is faster than those that are left."""
 _LARGEST_JSON = 20_000_000
 
