@@ -26,7 +26,7 @@ def hands(rows: Rows) -> str:
             _SOURCE_MM.get(row["prediction"], "–"),
         ]
         for row in own
-        if int(row["poses"]) == _most(rows)
+        if float(row["poses"]) == _most(rows)
     ]
     head = ["prediction", "mean [mm]", "over the halves", "rms", "source, in-sample mean"]
     return page_table(head, lines)
@@ -34,19 +34,20 @@ def hands(rows: Rows) -> str:
 
 def by_poses(rows: Rows) -> str:
     """Held-out errors of what was identified, by the number of poses that were fitted."""
-    counts = sorted({int(row["poses"]) for row in rows})
+    counts = sorted({float(row["poses"]) for row in rows})
     lines = []
     for name in [name for name in _SOURCE_MM if name.startswith("K")]:
-        found = {int(row["poses"]): row for row in _of_masses(rows, GUESSED) if _is(row, name)}
+        found = {float(row["poses"]): row for row in _of_masses(rows, GUESSED) if _is(row, name)}
         lines.append([name, *(f"{float(found[count]['mean_mm']):.2f}" for count in counts)])
-    return page_table(["mean error [mm] by poses that were fitted", *map(str, counts)], lines)
+    head = [f"{count:g}" for count in counts]
+    return page_table(["mean error [mm] by poses that were fitted", *head], lines)
 
 
 def by_masses(rows: Rows) -> str:
     """Held-out errors with the guessed masses, and with others."""
     lines = []
     for name in [name for name in _SOURCE_MM if name.startswith("K")]:
-        found = [row for row in rows if _is(row, name) and int(row["poses"]) == _most(rows)]
+        found = [row for row in rows if _is(row, name) and float(row["poses"]) == _most(rows)]
         by_masses = {row["masses"]: float(row["mean_mm"]) for row in found}
         lines.append([name, *(f"{by_masses[masses]:.2f}" for masses in (GUESSED, DRAWN))])
     return page_table(["mean error [mm] by masses", GUESSED, DRAWN], lines)
@@ -57,15 +58,15 @@ def in_short(rows: Rows) -> str:
     full = {
         row["prediction"]: float(row["mean_mm"])
         for row in _of_masses(rows, GUESSED)
-        if int(row["poses"]) == _most(rows)
+        if float(row["poses"]) == _most(rows)
     }
     best = min(value for name, value in full.items() if name.startswith("K"))
     rivals = [value for name, value in full.items() if not name.startswith(("K", "rigid"))]
     held_out = rows[0]["held_out"]
     return (
-        f"At {held_out} held-out poses of a recorded humanoid, identification lowers the error of"
-        f" a hand from {full['rigid, as given']:.1f} to {best:.1f} mm; the best rival without"
-        f" physics reaches {min(rivals):.1f} mm.\n"
+        f"Identification lowers the error of a recorded humanoid's hand from"
+        f" {full['rigid, as given']:.1f} to {best:.1f} mm at {held_out} held-out poses. The best"
+        f" rival without physics reaches {min(rivals):.1f} mm.\n"
     )
 
 
@@ -73,8 +74,8 @@ def _of_masses(rows: Rows, masses: str) -> list[Mapping[str, str]]:
     return [row for row in rows if row["masses"] == masses]
 
 
-def _most(rows: Rows) -> int:
-    return max(int(row["poses"]) for row in rows)
+def _most(rows: Rows) -> float:
+    return max(float(row["poses"]) for row in rows)
 
 
 def _is(row: Mapping[str, str], name: str) -> bool:
