@@ -39,6 +39,7 @@ KERNELS = (
     "baselines.walking.zmp_shift",
     "baselines.estimation.bending",
     "baselines.residual.network",
+    "baselines.identification.servo_replay",
 )
 
 

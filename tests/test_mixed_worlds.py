@@ -15,6 +15,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.cells import play
 from train.cells.play import in_batches
+from train.evaluate import rollout
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate, evaluate_together
 
@@ -229,7 +230,7 @@ def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(
 ) -> None:
     """Catches a failure in one scenario that takes the results of the others with it, or has
     another's name."""
-    monkeypatch.setattr(play, "can_share_worlds", lambda condition: True)
+    monkeypatch.setattr(rollout, "can_share_worlds", lambda condition: True)
     cells = [cell(f"{__name__}:failing", scenario) for scenario in ("payload", "nominal")]
     failed, passed = play._evaluate(cells, lambda _: None)
     assert failed.error is not None

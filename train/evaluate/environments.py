@@ -186,13 +186,15 @@ class Environment:
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """True if all episodes of a condition are one and the same."""
-        is_random = make_scenario(scenario).is_random
-        return not (self.is_real or is_random or self.draws(reference))
+        if self.is_real:
+            return False
+        return not (make_scenario(scenario).is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
         """True if the episodes of a condition are of one robot and one motion."""
-        draws_robots = make_scenario(scenario).draws_robots
-        return not (self.is_real or draws_robots or self.draws(reference))
+        if self.is_real:
+            return False
+        return not (make_scenario(scenario).draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
