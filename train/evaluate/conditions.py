@@ -79,8 +79,7 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     Raises:
         ConfigurationError: There are ranges, and no scenario draws robots from one set of them.
     """
-    sets = [len(make_scenario(scenario).ranges) for scenario in scenarios]
-    if ranges and 1 not in sets:
+    if ranges and not any(len(make_scenario(name).ranges) == 1 for name in scenarios):
         raise ConfigurationError(
             "ranges need a scenario whose robots are drawn from them, such as 'drawn', got"
             f" {quote(list(scenarios))}"
