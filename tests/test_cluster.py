@@ -89,6 +89,32 @@ def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> 
     assert isinstance(outcomes[1].error, WorkerKilledError)  # type: ignore[union-attr]
 
 
+class Unreadable:
+    """What a worker can send and nobody can read."""
+
+    def __reduce__(self) -> Any:
+        return fails_to_load, ()
+
+
+def fails_to_load() -> None:
+    raise OSError("not here")
+
+
+def unreadable(report: Callable[[int], None]) -> Unreadable:
+    return Unreadable()
+
+
+def test_an_outcome_that_cannot_be_read_fails_alone_and_ends_its_process(tmp_path: Path) -> None:
+    """Catches a call that waits for ever for the end of a process that lives."""
+    before = processes_of(os.getpid())
+    with Executors(jobs=2).open(4, tmp_path) as pool:
+        outcomes = run_calls(unreadable, [()] * 4, pool, Watch())
+        assert len(processes_of(os.getpid()) - before) <= 2
+    said = [str(outcome.error) for outcome in outcomes if outcome is not None]
+    assert len(said) == 4
+    assert all("cannot be read: not here" in text for text in said)
+
+
 def processes_of(parent: int) -> set[int]:
     """Processes of Python that a process has started, without the tracker that Python starts for
     itself."""

@@ -19,6 +19,7 @@ import train.commands.compare
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
@@ -515,6 +516,17 @@ def test_configurations_that_come_with_it_are_valid(
     config = load_yaml(path, CompareConfig)
     assert config.name == path.stem
     try_out(config.conditions())
+
+
+def test_a_cell_is_the_same_with_its_default_motion_named() -> None:
+    """Catches a default of another type, whose cell is played and kept a second time."""
+    named = Condition(env="walker", policy=PolicySpec(name="input"), reference=3)
+    default = Condition(env="walker", policy=PolicySpec(name="input"))
+    assert repr(default.reference) == repr(named.reference)
+    with pytest.raises(ConfigurationError, match=r"Condition.env must be text, got 5"):
+        Condition(env=5, policy=PolicySpec(name="input"))  # type: ignore[arg-type]
+    twice = Condition(policy=PolicySpec(name="input"), env_options={"sensors": ["a", "a"]})
+    assert twice.arguments["sensors"] == ["a", "a"]
 
 
 def test_cells_of_a_scenario_have_their_own_number_of_episodes() -> None:

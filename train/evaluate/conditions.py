@@ -161,7 +161,8 @@ class Condition(Model):
     @model_validator(mode="before")
     @classmethod
     def _environment_has_a_default(cls, values: dict[str, Any]) -> dict[str, Any]:
-        if values.get("reference") is None:
+        is_named = isinstance(values, dict) and isinstance(values.get("env", ""), str)
+        if is_named and values.get("reference") is None:
             known = environment(values.get("env", "testbed"))
             values = {**values, "reference": known.default_reference}
         return values
@@ -199,7 +200,7 @@ class Condition(Model):
         needed = sensors_needed(self.policy.name)
         # else the environment says what they are
         if needed and isinstance(given, list | tuple):
-            found["sensors"] = list(dict.fromkeys([*given, *needed]))
+            found["sensors"] = [*given, *(name for name in needed if name not in given)]
         return found
 
     @property

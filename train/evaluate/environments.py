@@ -17,7 +17,7 @@ from elastic_env.world.scenario import make_scenario
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
 
-Reference: TypeAlias = str | float | list[float] | dict[str, Any]
+Reference: TypeAlias = str | int | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says
 which of them it takes.
 """

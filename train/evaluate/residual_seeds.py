@@ -153,8 +153,9 @@ def _members(pattern: str) -> list[_Folder]:
     """Folders of a pattern in natural order; shipped ones where none lie there."""
     if not _WILD.search(pattern):
         return [_Folder(Path(pattern), read_description(Path(pattern)))]
-    shipped = map(Path, fnmatch.filter(shipped_names(), pattern))
-    folders = sorted(_matching(pattern) or shipped, key=_natural)
+    local = _matching(pattern)
+    folders = local or map(Path, fnmatch.filter(shipped_names(), pattern))
+    folders = sorted(folders, key=_natural)
     members = [_Folder(own, read_description(own)) for own in folders]
     if not members:
         near = _nearest(Path(pattern))

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain, groupby, pairwise, repeat
+from itertools import groupby, pairwise
 from typing import Any
 
 import gymnasium
@@ -161,7 +161,7 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    worlds = list(chain(*map(repeat, conditions, sizes)))
+    worlds = [own for own, size in zip(conditions, sizes, strict=True) for _ in range(size)]
     shares = [list(share) for _, share in groupby(worlds, shared_settings)]
     threads = threads_of_each(_cores(num_threads), len(shares))
     mode = AutoresetMode.DISABLED

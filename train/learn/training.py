@@ -70,8 +70,8 @@ class Training(Trainer):
         set_random_seed(seed)
         self._normaliser.seed(first_episode(seed))
         algorithm = algorithm_class(config.algorithm)
-        options = {**_with_activation(options), "device": "cpu", "seed": None}
         with name_options(config.algorithm, config.algorithm_options):
+            options = {**_with_activation(options), "device": "cpu", "seed": None}
             with warnings.catch_warnings():
                 # a rollout whose last minibatch is smaller is no mistake
                 smaller = "You have specified a mini-batch size"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from baselines.catalogue import Track
@@ -240,6 +240,9 @@ def read_leaderboard(path: Path) -> list[Standing]:
     with path.open(newline="", encoding="utf-8") as file:
         try:
             found = [_standing(row) for row in csv.DictReader(file)]
+        except ValidationError as error:
+            said = error.errors()[0]["msg"]
+            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {said}") from None
         except (KeyError, TypeError, ValueError) as error:
             problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
             raise ConfigurationError(problem) from None

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import pickle
 import queue
 import signal
 import sys
@@ -87,11 +88,19 @@ class _Processes:
         try:
             outcome = worker.run(call, self.events)
         except (EOFError, OSError):
-            with self._lock:
-                self._workers.discard(worker)
+            self._discard(worker)
             raise worker.why() from None
+        except BaseException:  # a call or an outcome that cannot be pickled
+            self._discard(worker)
+            worker.process.terminate()
+            worker.process.join()
+            raise
         self._idle.append(worker)
         return outcome
+
+    def _discard(self, worker: "_Worker") -> None:
+        with self._lock:
+            self._workers.discard(worker)
 
 
 class _Worker:
@@ -116,9 +125,10 @@ class _Worker:
         Raises:
             EOFError: The process has ended.
             OSError: Likewise.
+            UnpicklingError: A report or the outcome cannot be read here.
         """
         self.pipe.send(call)
-        while not isinstance(message := self.pipe.recv(), calls.Outcome):
+        while not isinstance(message := _read(self.pipe.recv_bytes()), calls.Outcome):
             self._has_begun = True
             events.put(message)
         return message
@@ -131,6 +141,14 @@ class _Worker:
         if self._has_begun or code < 0:
             return calls.WorkerLostError("a worker process was killed")
         return calls.UnguardedScriptError()
+
+
+def _read(content: bytes) -> Any:
+    """What a process sent; an error of its reading is none of the pipe."""
+    try:
+        return pickle.loads(content)
+    except Exception as error:
+        raise pickle.UnpicklingError(f"what a worker sent cannot be read: {error}") from error
 
 
 def _block_ctrl_c() -> None:
