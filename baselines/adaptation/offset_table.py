@@ -120,7 +120,8 @@ def _require_same(folder: Path, learned: Any, table: Array, env: Any) -> None:
     """Refuse a table of another robot or motion."""
     task = env.unwrapped.task
     period_s = task.assumed_model.control_period_s
-    motion = motion_of(env)
+    # another robot may have another kind of motion
+    motion = motion_of(env) if learned.robot == task.name else {}
     pairs = [
         ("the robot", learned.robot, task.name),
         ("the control period", learned.control_period_s, period_s),

@@ -39,12 +39,16 @@ class TrueMemory(NamedTuple):
 class TrueCompensator(DynamicCompensator):
     """The dynamic compensator with the true parameters and the true links of an environment.
 
+    What inputs of a policy correct, it knows already.
+
     Args:
         env: The environment itself.
         ramp_s: Time after which the integrator begins [s].
         friction: Whether the compensator knows the friction.
         gain: Gain on the true link error [1/s].
     """
+
+    modelled = 0.0
 
     def __init__(self, env: Any, ramp_s: float, friction: bool, gain: float) -> None:
         self._env = env.unwrapped
@@ -86,6 +90,10 @@ class TrueCompensator(DynamicCompensator):
         return offset + correction, memory
 
     @override
+    def deflection(self, offset: Array, memory: Any) -> Array:
+        return np.zeros_like(offset)
+
+    @override
     def link_angle(self, theta: Array, memory: Any) -> Array:
         return self._truth.q
 
@@ -119,5 +127,6 @@ class Oracle(Compensated):
         integral_gain: float = 1.0,
     ) -> None:
         compensator = TrueCompensator(env, ramp_s, friction, integral_gain)
-        super().__init__(policy, compensator, ramp_s)
+        super().__init__(policy, compensator, ramp_s, corrects_policy=True)
+        self._plan = None
         self.inputs = ()

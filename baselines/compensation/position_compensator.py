@@ -59,6 +59,7 @@ from elastic_env.joint.supported_models import (
 )
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.rigid.rigid_body import RigidBody
+from elastic_env.world.robot_model import joint_ranges
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 """A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000,
@@ -154,9 +155,7 @@ class PositionCompensator:
         self.joints = tuple(settings)
         self._links = RigidBody(model, self.joints, _held(model, self.joints))
         at = [int(model.joint(name).id) for name in self.joints]
-        limited = model.jnt_limited[at].astype(bool)
-        self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
-        self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
+        self._lowest, self._highest = joint_ranges(model, self.joints)
         self._compliance = 1.0 / np.array([one.stiffness for one in settings.values()])
         gains = _servo_gains(model, settings, position_gain)
         self._of_command = self._compliance + 1.0 / gains

@@ -10,6 +10,7 @@ import numpy as np
 from baselines.compensation.position_compensator import PositionCompensator
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
+from elastic_env.world.robot_model import joint_ranges
 
 _STEP_RAD = 1e-4  # of central differences: an error of 1e-9 relative
 
@@ -75,9 +76,7 @@ class StaticArm:
             self.end_effector = end_effector
             self._body, self._point = place_of(model, end_effector)
             self._turn = _turn(model, end_effector)
-        at = [int(model.joint(name).id) for name in joints]
-        limited = model.jnt_limited[at].astype(bool)[:, None]
-        self.ranges = np.where(limited, model.jnt_range[at], [-np.inf, np.inf])
+        self.ranges = np.column_stack(joint_ranges(model, joints))
 
     @property
     def up(self) -> Array:

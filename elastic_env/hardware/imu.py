@@ -234,6 +234,10 @@ def _start(port: str, baudrate: int) -> tuple["subprocess.Popen[str]", SharedSam
         pipes: Any = dict.fromkeys(("stdin", "stderr"), subprocess.PIPE)
         arguments = (str(file), port, str(baudrate))
         reader = start_child(_READER, *arguments, pass_fds=[file], **pipes)
-        return reader, SharedSample(file)
+        try:
+            return reader, SharedSample(file)
+        except BaseException:
+            end_child(reader, _END_S)
+            raise
     finally:
         os.close(file)

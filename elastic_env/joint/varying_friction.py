@@ -23,7 +23,6 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, joint_torque
 from elastic_env.joint.friction import dry_friction
 from elastic_env.joint.joint_names import (
-    FRICTION_SUFFIX,
     JointAddresses,
     friction_name,
     spring_name,
@@ -62,10 +61,9 @@ class VaryingFriction:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        names = [model.numeric(i).name for i in range(model.nnumeric)]
-        self.joints = [
-            name.removesuffix(FRICTION_SUFFIX) for name in names if name.endswith(FRICTION_SUFFIX)
-        ]
+        names = {model.numeric(i).name for i in range(model.nnumeric)}
+        hinges = [model.joint(j).name for j in range(model.njnt)]
+        self.joints = [name for name in hinges if friction_name(name) in names]
         at = JointAddresses.of(model, self.joints)
         self.links = at.q_dot
         first = [model.numeric_adr[model.numeric(friction_name(j)).id] for j in self.joints]

@@ -61,7 +61,7 @@ class Workspace:
             ConfigurationError: The servos are too weak for almost all poses.
         """
         extent = self.highest - self.lowest
-        width = np.where(np.isfinite(extent), _MARGIN * extent, 0.0)
+        width = np.where(np.isfinite(extent), _MARGIN * extent, _MARGIN)
         low = np.maximum(self.lowest + width, self.home - _HALF_TURN)
         high = np.minimum(self.highest - width, self.home + _HALF_TURN)
         n = len(self.home)

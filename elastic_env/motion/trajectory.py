@@ -110,8 +110,8 @@ class Motion:
     is_random: bool = False
 
 
-LARGEST_TABLE = 250_000_000
-"""Memory of the plans of all worlds [B]: 64 worlds of six joints for 100 s take a tenth."""
+LARGEST_TABLE = 500_000_000
+"""Memory of the plans of all worlds [B]: 64 worlds of six joints for 100 s take half of it."""
 
 
 class PlanTable:

@@ -218,9 +218,11 @@ class JointTask(Task):
         columns = self.observation_table.names
         self._imu_column = columns.index(LINK_IMU.name) if observe_imu else -1
         self._schedule = _schedule(self._reference, scenario.imu.rate_hz, period_s)
+        terms = records.LINK_SCORES.names or ()
+        weights = {name: getattr(config.reward, name) for name in terms}
         self._link_constants = one(
             records.LINK_CONSTANTS,
-            weights=one(records.LINK_SCORES, **dict(config.reward)),
+            weights=one(records.LINK_SCORES, **weights),
             imu_noise_rad=scenario.imu.noise_rad,
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,

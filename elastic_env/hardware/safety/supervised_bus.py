@@ -300,7 +300,8 @@ def emergency_stop(
                     # one that does not answer keeps no other on
                     with noting(ReplyError):
                         known[servo_id] = bus.ping(servo_id).model_number
-                bus.attach_known(known)
+                # a model of zero is none, and keeps no other servo on
+                bus.attach_known({i: model for i, model in known.items() if model})
         reached = [bus for bus in buses if bus.models]
         problem = BusGroup(reached).torque_off() if reached else None
     finally:

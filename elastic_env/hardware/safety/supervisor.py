@@ -38,6 +38,8 @@ _REST_RAD_S = 0.2
 
 One that gets its torque in motion is stopped with a jerk.
 """
+_ACTIONS = ("attach", "enable", "exchange", "read", "disable")
+"""What a program can ask for."""
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
@@ -105,7 +107,11 @@ class Supervisor:
             self._stop(f"no command for {hang_ms:.0f} ms: the program hangs")
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        action = getattr(self, f"_{request['do']}")  # by a program of ours
+        name = request["do"]
+        if name not in _ACTIONS:
+            choices = ", ".join(_ACTIONS)
+            raise HardwareError(f"the supervisor cannot {name!r}; choose from: {choices}")
+        action = getattr(self, f"_{name}")
         try:
             return action(**request["with"])
         except HardwareError as error:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import mujoco
 
 from elastic_env.core.config import read_mapping
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.joint import supported_models as supported
 from elastic_env.joint.held_joints import hold_other_joints
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
@@ -153,6 +153,9 @@ def joint_robot(
 def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
     hinges = supported.hinges_of(model)
+    if not isinstance(joints, Mapping | str | Path):
+        kinds = "a YAML file or a mapping of joints by name"
+        raise ConfigurationError(f"joints must be {kinds}, got {quote(joints)}")
     given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
     names = [model.joint(j).name for j in range(model.njnt)]
     others = [name for name in names if name not in hinges]

@@ -326,9 +326,12 @@ def drawn_poses(
 
 
 def home_of_joints(model: mujoco.MjModel, joints: list[str]) -> Array:
-    """The first keyframe or the model's reference, a tenth inside the joint ranges, (n,) [rad]."""
+    """The first keyframe or the model's reference, a tenth inside the joint ranges, (n,) [rad].
+
+    That is 0.1 rad where only one side has a limit.
+    """
     lowest, highest = joint_ranges(model, joints)
     home = home_of(model)[[model.jnt_qposadr[model.joint(name).id] for name in joints]]
     with np.errstate(invalid="ignore"):
-        margin = np.where(np.isfinite(highest - lowest), 0.1 * (highest - lowest), 0.0)
+        margin = np.where(np.isfinite(highest - lowest), 0.1 * (highest - lowest), 0.1)
     return np.clip(home, lowest + margin, highest - margin)

@@ -37,6 +37,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.small_servos import small_servo
@@ -90,6 +91,10 @@ def configure_testbed(
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
+    if not isinstance(observe_link, bool):
+        raise ConfigurationError(f"observe_link must be true or false, got {quote(observe_link)}")
+    if observe_link and isinstance(sensors, list | tuple):
+        sensors = (*sensors, LINK_IMU_SENSOR)
     given = small_servo(joint) if isinstance(joint, str) else joint
     chosen = as_model("joint", given, H54_200_S500_R)
     if stiffness is not None:
@@ -100,7 +105,7 @@ def configure_testbed(
         joint=chosen,
         pendulum=as_model("pendulum", pendulum, Pendulum()),
         form=form,
-        sensors=(*sensors, LINK_IMU_SENSOR) if observe_link else sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
+        sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         reward=as_model("reward", reward, RewardWeights()),
         action_bound_rad=action_bound_rad,
         **({} if timestep_s is None else {"timestep_s": timestep_s}),

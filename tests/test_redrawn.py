@@ -1,0 +1,83 @@
+"""Inputs whose checks a redrawing once moved or lost."""
+
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+import baselines
+import elastic_env  # noqa: F401  registers the environments
+from baselines.compensation.policy import NO_INPUTS
+from elastic_env.core.config import quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.robots.robot.environment import EXAMPLE
+from elastic_env.robots.robot.joints import home_of_joints
+from elastic_env.world.joint_config import RewardWeights
+
+TESTBED = "elastic_env/Testbed-v0"
+
+
+def test_the_oracle_takes_inputs_that_correct_what_it_knows() -> None:
+    """Catches an error in the midst of a walk, and a correction of the truth."""
+    for name, size in ((TESTBED, 1), ("elastic_env/WalkInPlace-v0", 12)):
+        env = gymnasium.make(name)
+        observation, _ = env.reset(seed=0)
+        policy = baselines.make("oracle", env)
+        plain, _ = policy.predict(observation)
+        inputs = NO_INPUTS._replace(deflection=np.full((1, size), 0.1))
+        corrected, _ = policy.predict(observation, inputs=inputs)
+        if size == 1:
+            np.testing.assert_array_equal(corrected, plain)
+        else:
+            shifted = NO_INPUTS._replace(zmp=np.full((1, 2), 0.01))
+            action, _ = policy.predict(observation, inputs=shifted)
+            assert np.isfinite(action).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"observe_link": "false"}, "observe_link must be true or false, got 'false'"),
+        ({"observe_link": True, "sensors": 5}, "sensors must be a list, got 5"),
+    ],
+)
+def test_observe_link_is_true_or_false(arguments: dict[str, Any], said: str) -> None:
+    """Catches text that counts as true."""
+    with pytest.raises(ConfigurationError, match=said):
+        gymnasium.make(TESTBED, **arguments)
+
+
+class MyWeights(RewardWeights):
+    energy: float = quantity("1", 1.0, ge=0)
+
+
+def test_weights_of_further_terms_are_taken() -> None:
+    """Catches a weight that the testbed's own terms do not have."""
+    gymnasium.make(TESTBED, reward=MyWeights())
+
+
+def test_numbers_of_a_model_that_end_like_ours_are_not_ours() -> None:
+    """Catches a joint that the model does not have."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><custom><numeric name="x_dry_friction" data="1 2 3 4"/></custom>
+        <worldbody><body><joint name="one"/><geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    assert VaryingFriction(model).joints == []
+
+
+def test_home_keeps_off_a_limit_on_one_side() -> None:
+    """Catches a home on the stop, from which no reference can leave."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><compiler angle="radian"/><worldbody><body><geom size=".1"/>
+        <joint name="one" range="0.5 1000"/></body></worldbody></mujoco>"""
+    )
+    assert home_of_joints(model, ["one"]).tolist() == [0.6]
+
+
+def test_joints_that_are_no_mapping_are_refused() -> None:
+    """Catches a traceback of a path."""
+    with pytest.raises(ConfigurationError, match="joints must be a YAML file or a mapping"):
+        gymnasium.make("elastic_env/Robot-v0", model=EXAMPLE, joints=5)
