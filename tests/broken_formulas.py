@@ -182,7 +182,7 @@ BROKEN = (
     BrokenFormula(_PLAN, "np.sqrt(self.gravity / self.com_height)", "np.sqrt(self.gravity)", PLAN),
     BrokenFormula(_PLAN, "samples[2:] - 2.0 * samples[1:-1]", "samples[2:] - samples[1:-1]", PLAN),
     BrokenFormula(_STATISTICS, "np.mean(mine, axis=-1)", "np.median(mine, axis=-1)", STATISTICS),
-    BrokenFormula(_STATISTICS, "0.5 * np.sum(mine == base)", "np.sum(mine == base)", STATISTICS),
+    BrokenFormula(_STATISTICS, "0.5 * (mine == base)", "(mine == base)", STATISTICS),
     BrokenFormula(_STATISTICS, "[::-1] / counted", "/ counted", STATISTICS),
 )
 
