@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from baselines.identification import servo_fit
 from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
 from baselines.identification.servo_holdout import judge_servo
 from baselines.identification.servo_load import GRAVITY, Load
@@ -325,6 +326,45 @@ def test_pwm_at_its_limit_tells_the_torque_limit() -> None:
     logged = [replace(log, pwm=duty) for log, duty in zip(logs, duties, strict=True)]
     assert duty_per_torque_gain(logged) == pytest.approx(limit / gain, rel=1e-6)
     assert duty_per_torque_gain(logs) is None
+
+
+def test_the_start_limits_the_torque_where_the_replay_does() -> None:
+    """Catches a limit in volts where it is in units of the register: 12 V scale both sides."""
+    _, logs = short_logs(5)
+    log = replace(logs[0], supply=12.0)
+    duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
+    torque = 1e-3 * servo_fit._drive(log, duty)
+    pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
+    limit = 1e-3 * duty * log.supply
+    np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)
+    assert (np.abs(torque) < 0.999 * limit).any()
+
+
+def test_a_parameter_without_influence_has_no_interval() -> None:
+    """Catches ± 0 where nothing depends on a parameter, and where two cannot be told apart."""
+    rng = np.random.default_rng(1)
+    one = rng.normal(size=(100, 3))
+    block = np.arange(100) // 10
+    r = rng.normal(size=100)
+    J = np.column_stack([one[:, 0], np.zeros(100), one[:, 1], one[:, 2], 2.0 * one[:, 2]])
+    told = np.isfinite(servo_fit._variance(J, r, block))
+    assert told.tolist() == [True, False, True, False, False]
+
+
+def test_what_nothing_depends_on_is_named_and_not_told() -> None:
+    """Catches an infinite width that JSON and checks refuse, or that stays unsaid."""
+    _, logs = short_logs(3)
+    half = np.full(len(NAMES), 1e-6)
+    half[[NAMES.index("delay"), NAMES.index("position_gain")]] = np.inf
+    values = np.full(len(NAMES), 0.1)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    result = describe_servo(ServoFit(tuple(logs), values, half, sought, {}, 1e-3))
+    again = ServoIdentification.model_validate_json(result.model_dump_json())
+    delay = next(one for one in again.parameters if one.name == "delay")
+    assert delay.half_width is None
+    assert not delay.is_told
+    assert again.gains[0].half_width is None
+    assert any("position_gain, delay: nothing" in text for text in again.untold)
 
 
 def test_a_joint_that_sticks_all_the_time_is_refused() -> None:

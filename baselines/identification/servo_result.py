@@ -40,7 +40,8 @@ class RegisterGain(Model):
 
     register_value: float
     position_gain_nm_per_rad: float
-    half_width: float
+    half_width: float | None
+    """Half of the 95 % interval; None where the logs do not tell the gain."""
 
 
 class ServoIdentification(Model):
@@ -116,7 +117,7 @@ def describe_servo(
             RegisterGain(
                 register_value=register,
                 position_gain_nm_per_rad=gain * register,
-                half_width=half * register,
+                half_width=half * register if np.isfinite(half) else None,
             )
             for register in registers
         ),
@@ -177,6 +178,11 @@ def _untold(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
             f"with less than half their value: {', '.join(wide)}; log faster motions, both sides of"
             " approach, and a swing with the torque off"
         )
+    without = [
+        one.name for one in parameters if one.value is not None and np.isinf(fit.half(one.name))
+    ]
+    if without:
+        said.append(f"{', '.join(without)}: nothing in these logs depends on it alone")
     if by_name["static_friction"].value is None:
         said.append("Stribeck friction: it does not lower the error")
     if fit.half("load_friction") > _TOLD * USUAL_LOSS[1]:

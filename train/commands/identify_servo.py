@@ -135,7 +135,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
         [
             f"k_p at gain {one.register_value:g}",
             f"{one.position_gain_nm_per_rad:.4g}",
-            f"± {one.half_width:.2g}",
+            _width(one.half_width),
             "N·m/rad",
             "",
         ]
@@ -143,7 +143,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
     ]
     for one in result.parameters:
         if one.name != "position_gain" and one.value is not None:
-            width = "–" if one.half_width is None else f"± {one.half_width:.2g}"
+            width = _width(one.half_width)
             rows.append([one.name, f"{one.value:.4g}", width, one.unit, one.remark])
     title = f"servo from {len(result.logs)} logs, replayed within {result.rms_mrad:.1f} mrad rms"
     head = ["parameter", "value", "95 %", "unit", "follows from"]
@@ -177,6 +177,10 @@ def _require_one_supply(logs: Sequence[ServoLog]) -> None:
         raise ConfigurationError(
             "some logs say their supply voltage and some do not; give it in all or in none"
         )
+
+
+def _width(half: float | None) -> str:
+    return "–" if half is None else f"± {half:.2g}"
 
 
 def _number(value: float | None, form: str) -> str:
