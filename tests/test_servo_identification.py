@@ -15,7 +15,7 @@ from baselines.identification import servo_fit
 from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
 from baselines.identification.servo_holdout import judge_servo
 from baselines.identification.servo_load import GRAVITY, Load
-from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_log import AngleUnit, ServoLog, read_servo_log
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
@@ -265,6 +265,171 @@ def test_an_episode_of_lerobot_is_read(tmp_path: Path, monkeypatch: pytest.Monke
     np.testing.assert_allclose(log.position, columns["position"])
     with pytest.raises(ConfigurationError, match="2 joints"):
         read_servo_log(path, LOAD, unit="deg")
+
+
+def with_units(goal: str, position: str) -> dict[str, Array]:
+    """Columns in degrees under headers with units."""
+    columns = good()
+    turned = {name: np.rad2deg(columns[name]) for name in ("goal", "position")}
+    return {
+        "time [s]": columns["time"],
+        f"goal{goal}": turned["goal"],
+        f"position{position}": turned["position"],
+    }
+
+
+def test_degrees_of_a_header_are_converted(tmp_path: Path) -> None:
+    """Catches degrees that are taken for radians although the header names them."""
+    path = csv_of(tmp_path / "log.csv", **with_units(" [deg]", " [deg]"))
+    for unit in (None, "deg"):
+        log = read_servo_log(path, LOAD, unit=unit)
+        np.testing.assert_allclose(log.position, good()["position"])
+        np.testing.assert_allclose(log.goal, good()["goal"])
+
+
+@pytest.mark.parametrize(
+    ("goal", "position", "unit", "said"),
+    [
+        (" [deg]", " [deg]", "rad", "leave --angles out"),
+        (" [rad]", " [rad]", "deg", "leave --angles out"),
+        (" [deg]", " [rad]", None, "one unit"),
+        (" [deg]", "", "deg", "one unit"),
+    ],
+)
+def test_units_that_contradict_each_other_are_refused(
+    goal: str, position: str, unit: AngleUnit | None, said: str, tmp_path: Path
+) -> None:
+    path = csv_of(tmp_path / "log.csv", **with_units(goal, position))
+    with pytest.raises(ConfigurationError, match=said):
+        read_servo_log(path, LOAD, unit=unit)
+
+
+def episode(monkeypatch: pytest.MonkeyPatch, **changed: list[object]) -> None:
+    """An episode of LeRobot with two joints, without a file."""
+    import pandas as pd
+
+    columns = good()
+    lists = {
+        name: [[0.0, float(value)] for value in columns[name]] for name in ("goal", "position")
+    }
+    content = {
+        "timestamp": list(columns["time"]),
+        "action": lists["goal"],
+        "observation.state": lists["position"],
+    }
+    table = pd.DataFrame(content | changed)
+    monkeypatch.setattr(pd, "read_parquet", lambda path: table)
+
+
+@pytest.mark.parametrize("joint", ["2", "-1", "elbow", "1.0", "²", "9" * 5000])
+def test_another_joint_than_the_episode_has_is_refused(
+    joint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches another joint that is read in its place."""
+    episode(monkeypatch)
+    with pytest.raises(ConfigurationError, match="--joints 0 to 1, got"):
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint=joint)
+
+
+BAD_CELLS: dict[str, tuple[list[object], str]] = {
+    "nan": ([*[[0.0, 0.1]] * 199, [0.0, np.nan]], "row 200: needs finite numbers"),
+    "ragged": ([*[[0.0, 0.1]] * 199, [0.0]], "as many numbers"),
+    "empty": ([[]] * 200, "as many numbers"),
+    "text": ([["0.1", "0.2"]] * 200, "row 1: needs finite numbers"),
+    "nothing": ([None] * 200, "row 1: needs finite numbers"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_CELLS)
+def test_bad_episodes_are_refused_in_one_sentence(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a traceback of NumPy, and a replay of what is no number."""
+    cells, said = BAD_CELLS[kind]
+    episode(monkeypatch, **{"observation.state": cells})
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_episode_without_rows_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episode(monkeypatch, **{"timestamp": [], "action": [], "observation.state": []})
+    with pytest.raises(ConfigurationError, match="it has 0"):
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+
+
+def recorded_json(path: Path, **facts: object) -> Path:
+    """A usable log of Rhoban's recorder with some facts changed."""
+    keys = ("timestamp", "goal_position", "position")
+    rows = zip(*good().values(), strict=True)
+    entries = [dict(zip(keys, map(float, row), strict=True)) for row in rows]
+    usual = {"mass": MASS_KG, "length": LENGTH_M, "kp": 400, "vin": 7.4}
+    path.write_text(json.dumps({**usual, "entries": entries, **facts}))
+    return path
+
+
+@pytest.mark.parametrize("key", ["mass", "length", "kp", "vin"])
+@pytest.mark.parametrize("value", [0, -1.0, True, "0.5"])
+def test_facts_that_no_run_has_are_refused(key: str, value: object, tmp_path: Path) -> None:
+    """Catches a load of zero, and a truth value that counts as 1 V."""
+    path = recorded_json(tmp_path / "log.json", **{key: value})
+    with pytest.raises(ConfigurationError, match=f"{key} must be a number above 0"):
+        read_servo_log(path)
+
+
+def test_a_supply_of_zero_volts_is_refused(tmp_path: Path) -> None:
+    path = csv_of(tmp_path / "log.csv", **good(), voltage=np.zeros(200))
+    with pytest.raises(ConfigurationError, match="above 0 V"):
+        read_servo_log(path, LOAD)
+
+
+def test_the_arm_of_the_pendulum_is_a_rod(tmp_path: Path) -> None:
+    """Catches an arm that weighs nothing: its weight acts at l/2, its inertia is m l²/3."""
+    load = read_servo_log(recorded_json(tmp_path / "log.json", arm_mass=0.06)).load
+    assert load.torque == pytest.approx(WEIGHT + 0.06 * GRAVITY * LENGTH_M / 2.0)
+    assert load.inertia == pytest.approx((MASS_KG + 0.06 / 3.0) * LENGTH_M**2)
+    with pytest.raises(ConfigurationError, match="arm_mass must be a number of at least 0"):
+        read_servo_log(recorded_json(tmp_path / "log.json", arm_mass=-0.1))
+
+
+@pytest.mark.parametrize("key", ["torque_enable", "load", "goal_position"])
+def test_a_key_of_some_entries_only_is_refused(key: str, tmp_path: Path) -> None:
+    """Catches a column that is left out without a word, the torque then on."""
+    path = recorded_json(tmp_path / "log.json")
+    content = json.loads(path.read_text())
+    for entry in content["entries"]:
+        entry[key] = 0.5
+    del content["entries"][3][key]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=f"entry 4 has no {key}"):
+        read_servo_log(path)
+    content["entries"][3][key] = "on"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=f"entry 4: {key} must be a number"):
+        read_servo_log(path)
+
+
+def test_options_do_not_override_what_a_log_says(tmp_path: Path) -> None:
+    """Catches a load or a gain of an option in place of the recorded one."""
+    path = recorded_json(tmp_path / "log.json")
+    same = read_servo_log(path, LOAD, 400.0)
+    assert (same.load, same.gain) == (LOAD, 400.0)
+    with pytest.raises(ConfigurationError, match=r"0\.5 kg hang at 0\.1 m"):
+        read_servo_log(path, Load.pendulum(0.6, LENGTH_M))
+    with pytest.raises(ConfigurationError, match="gain is 400, and --gain 200"):
+        read_servo_log(path, gain=200.0)
+    columns = csv_of(tmp_path / "log.csv", **good(), gain=np.full(200, 32.0))
+    with pytest.raises(ConfigurationError, match="gain is 32, and --gain 200"):
+        read_servo_log(columns, LOAD, 200.0)
+
+
+def test_a_joint_that_nothing_loads_is_refused() -> None:
+    """Catches a division by the largest torque, which is zero."""
+    _, logs = short_logs(6)
+    with pytest.raises(ElasticError, match="nothing loads the joint"):
+        fit_servo([replace(logs[0], load=Load(0.0, 0.0, 1e-3))], starts=1)
 
 
 def test_known_torque_replaces_the_weight(tmp_path: Path) -> None:

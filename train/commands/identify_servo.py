@@ -30,8 +30,8 @@ class ServoOptions(Model):
     """Distance of its mass from the axis [m]."""
     gain: float | None = quantity("1", None, gt=0)
     """Value of the servo's gain register, where the logs do not say it [1]."""
-    angles: AngleUnit = "rad"
-    """Unit of angles in the logs in time."""
+    angles: AngleUnit | None = None
+    """Unit of angles in the logs in time; default what they say, or radians."""
     unfitted: tuple[Locator, ...] = ()
     """Logs in time to replay without a fit, left out of --log too; default a share by --holdout."""
 
