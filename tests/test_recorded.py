@@ -2,6 +2,8 @@
 
 import zipfile
 from dataclasses import dataclass
+from http.client import IncompleteRead
+from io import BytesIO
 from pathlib import Path
 
 import mujoco
@@ -117,6 +119,29 @@ def test_a_recording_is_fetched_once_and_checked(tmp_path: Path) -> None:
     copy.unlink()
     with pytest.raises(ConfigurationError, match="cannot fetch file:"):
         source.fetch(folder, shown.append)
+    (tmp_path / "there/a.json").write_text("[]")
+    with pytest.raises(ConfigurationError, match=r"sent is not the file .*; nothing was written"):
+        source.fetch(folder, shown.append)
+    assert not copy.exists()
+
+
+@pytest.mark.parametrize(
+    "error", [ConnectionResetError("reset"), IncompleteRead(b"{"), TimeoutError("slow")]
+)
+def test_a_download_that_breaks_off_is_refused_in_one_sentence(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a traceback where the line is cut while the file is read."""
+
+    class Broken(BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            del size
+            raise error
+
+    monkeypatch.setattr("urllib.request.urlopen", lambda address, timeout: Broken())
+    source = Source("made", "", "a/b", "c", "none", {"a.json": "0"})
+    with pytest.raises(ConfigurationError, match="cannot fetch https:"):
+        source.fetch(tmp_path, lambda address: None)
 
 
 def test_rivals_and_replay_are_shown_over_the_same_rows() -> None:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import mujoco
@@ -10,10 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 from baselines.identification import servo_fit
 from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
-from baselines.identification.servo_holdout import judge_servo
+from baselines.identification.servo_holdout import (
+    PREDICTIONS,
+    LogErrors,
+    ServoError,
+    ServoHoldout,
+    judge_servo,
+)
 from baselines.identification.servo_load import GRAVITY, Load
 from baselines.identification.servo_log import AngleUnit, ServoLog, read_servo_log
 from baselines.identification.servo_replay import NAMES, Replay
@@ -23,6 +31,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
+from train.commands.identify_servo import show_result, verdict
 from train.recorded.servos import servo_figures
 
 MASS_KG, LENGTH_M = 0.5, 0.1
@@ -555,7 +564,7 @@ def test_command_reads_a_log_and_writes_what_others_read(
             gain=np.full(len(log), log.gain),
         )
     pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
-    logged = ["--log", "0.csv", "1.csv", "--unfitted", "./1.csv"]
+    logged = ["--log", "0.csv", "--unfitted", "./1.csv"]
     main(["identify", *logged, *pendulum, "--output", "out"])
     said = capsys.readouterr().out
     assert "a line in the goal" in said
@@ -589,7 +598,11 @@ def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
         (["--robot", "arm.xml"], "--joints"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "log.csv"], "at least one"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "the same log"),
+        (["copy.csv", "--mass-kg", "0.5", "--lever-m", "0.1"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.002"], "holds out 0"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.9"], "fits 20 rows"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
@@ -601,10 +614,100 @@ def test_options_that_do_not_go_together_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = csv_of(tmp_path / "log.csv", **good())
+    csv_of(tmp_path / "copy.csv", **good())
     with pytest.raises(SystemExit) as ended:
         main(["identify", "--log", str(path), *options])
     assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_log_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a message on options where the name of the file is wrong."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["identify", "--log", "nolog.csv", "--mass-kg", "0.5", "--lever-m", "0.1"])
+    assert "no log at nolog.csv" in capsys.readouterr().err
+
+
+def held_out_of(on_mrad: float, all_mrad: float, off_rows: int) -> ServoHoldout:
+    """Errors of a replay beside rivals that are 20 mrad off."""
+    rms = (20.0, 20.0, 20.0, on_mrad)
+    return ServoHoldout(
+        fitted=("a",),
+        replay_mrad=all_mrad,
+        errors=tuple(
+            ServoError(name=name, rms_mrad=value, slow_mrad=None)
+            for name, value in zip(PREDICTIONS, rms, strict=True)
+        ),
+        logs=(
+            LogErrors(
+                log="b",
+                gain=1.0,
+                rms_mrad=rms,
+                slow_mrad=None,
+                slow_rows=0,
+                replay_mrad=all_mrad,
+                off_rows=off_rows,
+            ),
+        ),
+    )
+
+
+def test_the_first_line_names_a_swing_that_is_replayed_wrongly() -> None:
+    """Catches a verdict that leaves out the rows with the torque off without a word."""
+    said = "with the torque off included the replay has 216.0"
+    assert said in verdict(held_out_of(4.0, 216.0, 50))
+    assert said in verdict(held_out_of(25.0, 216.0, 50))
+    assert "torque off" not in verdict(held_out_of(4.0, 8.0, 50))
+    assert "torque off" not in verdict(held_out_of(4.0, 4.0, 0))
+
+
+def test_rows_with_the_torque_off_are_shown_apart() -> None:
+    _, logs = short_logs(3)
+    values = np.full(len(NAMES), 0.01)
+    half = np.full(len(NAMES), 1e-6)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    fit = ServoFit(tuple(logs), values, half, sought, {}, 1e-3)
+    for log in (logs[0], logs[2]):
+        held_out = judge_servo(fit, [log])
+        off = int((~log.enabled).sum())
+        assert held_out.logs[0].off_rows == off
+        console = Console(width=200, record=True, quiet=False, file=StringIO())
+        show_result(describe_servo(fit, "j", held_out), console)
+        shown = console.export_text()
+        assert ("all rows, torque off included" in shown) == bool(off)
+    assert off > 0
+
+
+def test_each_gain_is_that_of_its_own_supply() -> None:
+    """Catches the voltage of the first log for all, and a torque limit of another voltage."""
+    _, logs = short_logs(3)
+    volts = (7.4, 12.0, 12.2)
+    logs = [replace(log, supply=v) for log, v in zip(logs, volts, strict=True)]
+    logs = [replace(logs[0], gain=100.0), *(replace(log, gain=200.0) for log in logs[1:])]
+    logs.append(replace(logs[1], gain=100.0))
+    values = np.full(len(NAMES), 0.01)
+    half = np.full(len(NAMES), 1e-4)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    result = describe_servo(ServoFit(tuple(logs), values, half, sought, {}, 1e-3))
+    expected = [(100.0, 7.4), (200.0, 12.1), (100.0, 12.0)]
+    assert [(one.register_value, one.supply_v) for one in result.gains] == [
+        (register, pytest.approx(supply)) for register, supply in expected
+    ]
+    for one in result.gains:
+        assert one.supply_v is not None
+        stiffness = 0.01 * one.register_value * one.supply_v
+        assert one.position_gain_nm_per_rad == pytest.approx(stiffness)
+        assert one.half_width == pytest.approx(0.01 * stiffness)
+    assert result.value("torque_limit") == pytest.approx(0.01 * 7.4)
+    assert result.supply_v == 7.4
+    console = Console(width=200, record=True, file=StringIO())
+    show_result(result, console)
+    shown = console.export_text()
+    assert "k_p at gain 200, 12.1 V" in shown
+    assert "torque_limit at 7.4 V" in shown
 
 
 @pytest.mark.slow

@@ -23,6 +23,8 @@ AngleUnit = Literal["rad", "deg"]
 """Unit of the angles of a file."""
 MOST_ROWS = 200_000
 """Rows of a log."""
+FEWEST_ROWS = 50
+"""Rows that a fit needs."""
 
 _COLUMNS = {
     "time": "s",
@@ -45,7 +47,6 @@ _JSON_NAMES = {
     "torque_enable": "torque_enable",
 }
 """Names of Rhoban's recorder, and of others who follow it."""
-_FEWEST_ROWS = 50
 _LONGEST_ROW_S = 0.2
 _LONGEST_GAP_S = 0.3
 _LARGEST_ANGLE = 4.0 * math.pi
@@ -254,9 +255,9 @@ def require_usable(path: Path, log: ServoLog) -> None:
         ConfigurationError: Too few rows, a clock that stops, goes back or jumps, angles in another
             unit or wrapped, a goal that never moves, or goal and position exchanged.
     """
-    if len(log) < _FEWEST_ROWS:
+    if len(log) < FEWEST_ROWS:
         raise ConfigurationError(
-            f"{path} has {len(log)} rows, and at least {_FEWEST_ROWS} are needed; log the whole"
+            f"{path} has {len(log)} rows, and at least {FEWEST_ROWS} are needed; log the whole"
             " motion, some ten rows or more a second"
         )
     step = np.diff(log.time)
