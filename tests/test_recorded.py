@@ -2,6 +2,8 @@
 
 import zipfile
 from dataclasses import dataclass
+from http.client import IncompleteRead
+from io import BytesIO
 from pathlib import Path
 
 import mujoco
@@ -10,10 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from baselines.identification.geometry_fit import fit_geometry
+from docs.pages import recorded
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.recorded import justin
 from train.recorded.justin import RecordedPoses, find_rigid, justin_spec, read_poses
+from train.recorded.servos import servo_rows
 from train.recorded.sources import Source
 
 GENERATOR = np.random.default_rng(5)
@@ -115,6 +119,52 @@ def test_a_recording_is_fetched_once_and_checked(tmp_path: Path) -> None:
     copy.unlink()
     with pytest.raises(ConfigurationError, match="cannot fetch file:"):
         source.fetch(folder, shown.append)
+    (tmp_path / "there/a.json").write_text("[]")
+    with pytest.raises(ConfigurationError, match=r"sent is not the file .*; nothing was written"):
+        source.fetch(folder, shown.append)
+    assert not copy.exists()
+
+
+@pytest.mark.parametrize(
+    "error", [ConnectionResetError("reset"), IncompleteRead(b"{"), TimeoutError("slow")]
+)
+def test_a_download_that_breaks_off_is_refused_in_one_sentence(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a traceback where the line is cut while the file is read."""
+
+    class Broken(BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            del size
+            raise error
+
+    monkeypatch.setattr("urllib.request.urlopen", lambda address, timeout: Broken())
+    source = Source("made", "", "a/b", "c", "none", {"a.json": "0"})
+    with pytest.raises(ConfigurationError, match="cannot fetch https:"):
+        source.fetch(tmp_path, lambda address: None)
+
+
+def test_rivals_and_replay_are_shown_over_the_same_rows() -> None:
+    """Catches a replay over all rows beside rivals over those with the torque on."""
+    errors = [{"rms_mrad": value} for value in (40.0, 30.0, 20.0, 10.0)]
+    part = {"motions": ["sin_sin"], "errors": errors, "replay_mrad": 90.0}
+    slow = {
+        "gain": 32.0,
+        "the goal itself": 4.0,
+        "a constant offset": 3.0,
+        "a line in the goal": 2.0,
+        "identified": 1.0,
+    }
+    rows = servo_rows({"sts3250": {"held_out": [part], "sag": [slow]}})
+    assert rows[0]["replay_mrad"] == 10.0
+    assert rows[0]["replay_all_mrad"] == 90.0
+    assert "replay_all_mrad" not in rows[1]
+    texts = [{name: str(value) for name, value in row.items()} for row in rows]
+    shown = recorded.replays(texts).splitlines()
+    assert shown[0].count("|") == 8
+    assert "| identified | identified, torque off included |" in shown[0]
+    assert "| 10.0 | 90.0 |" in shown[2]
+    assert "torque off" not in recorded.slow_motion(texts)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import mujoco
@@ -10,11 +11,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
+from baselines.identification import servo_fit
 from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
-from baselines.identification.servo_holdout import judge_servo
+from baselines.identification.servo_holdout import (
+    PREDICTIONS,
+    LogErrors,
+    ServoError,
+    ServoHoldout,
+    judge_servo,
+)
 from baselines.identification.servo_load import GRAVITY, Load
-from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_log import AngleUnit, ServoLog, read_servo_log
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
@@ -22,6 +31,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
+from train.commands.identify_servo import show_result, verdict
 from train.recorded.servos import servo_figures
 
 MASS_KG, LENGTH_M = 0.5, 0.1
@@ -266,6 +276,170 @@ def test_an_episode_of_lerobot_is_read(tmp_path: Path, monkeypatch: pytest.Monke
         read_servo_log(path, LOAD, unit="deg")
 
 
+def with_units(goal: str, position: str) -> dict[str, Array]:
+    """Columns in degrees under headers with units."""
+    columns = good()
+    turned = {name: np.rad2deg(columns[name]) for name in ("goal", "position")}
+    return {
+        "time [s]": columns["time"],
+        f"goal{goal}": turned["goal"],
+        f"position{position}": turned["position"],
+    }
+
+
+def test_degrees_of_a_header_are_converted(tmp_path: Path) -> None:
+    """Catches degrees that are taken for radians although the header names them."""
+    path = csv_of(tmp_path / "log.csv", **with_units(" [deg]", " [deg]"))
+    for log in (read_servo_log(path, LOAD), read_servo_log(path, LOAD, unit="deg")):
+        np.testing.assert_allclose(log.position, good()["position"])
+        np.testing.assert_allclose(log.goal, good()["goal"])
+
+
+@pytest.mark.parametrize(
+    ("goal", "position", "unit", "said"),
+    [
+        (" [deg]", " [deg]", "rad", "leave --angles out"),
+        (" [rad]", " [rad]", "deg", "leave --angles out"),
+        (" [deg]", " [rad]", None, "one unit"),
+        (" [deg]", "", "deg", "one unit"),
+    ],
+)
+def test_units_that_contradict_each_other_are_refused(
+    goal: str, position: str, unit: AngleUnit | None, said: str, tmp_path: Path
+) -> None:
+    path = csv_of(tmp_path / "log.csv", **with_units(goal, position))
+    with pytest.raises(ConfigurationError, match=said):
+        read_servo_log(path, LOAD, unit=unit)
+
+
+def episode(monkeypatch: pytest.MonkeyPatch, **changed: list[object]) -> None:
+    """An episode of LeRobot with two joints, without a file."""
+    import pandas as pd
+
+    columns = good()
+    lists = {
+        name: [[0.0, float(value)] for value in columns[name]] for name in ("goal", "position")
+    }
+    content = {
+        "timestamp": list(columns["time"]),
+        "action": lists["goal"],
+        "observation.state": lists["position"],
+    }
+    table = pd.DataFrame(content | changed)
+    monkeypatch.setattr(pd, "read_parquet", lambda path: table)
+
+
+@pytest.mark.parametrize("joint", ["2", "-1", "elbow", "1.0", "²", "9" * 5000])
+def test_another_joint_than_the_episode_has_is_refused(
+    joint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches another joint that is read in its place."""
+    episode(monkeypatch)
+    with pytest.raises(ConfigurationError, match="--joints 0 to 1, got"):
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint=joint)
+
+
+BAD_CELLS: dict[str, tuple[list[object], str]] = {
+    "nan": ([*[[0.0, 0.1]] * 199, [0.0, np.nan]], "row 200: needs finite numbers"),
+    "ragged": ([*[[0.0, 0.1]] * 199, [0.0]], "as many numbers"),
+    "empty": ([[]] * 200, "as many numbers"),
+    "text": ([["0.1", "0.2"]] * 200, "row 1: needs finite numbers"),
+    "nothing": ([None] * 200, "row 1: needs finite numbers"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_CELLS)
+def test_bad_episodes_are_refused_in_one_sentence(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a traceback of NumPy, and a replay of what is no number."""
+    cells, said = BAD_CELLS[kind]
+    episode(monkeypatch, **{"observation.state": cells})
+    with pytest.raises(ConfigurationError, match=said) as caught:
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_episode_without_rows_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episode(monkeypatch, **{"timestamp": [], "action": [], "observation.state": []})
+    with pytest.raises(ConfigurationError, match="it has 0"):
+        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+
+
+def recorded_json(path: Path, **facts: object) -> Path:
+    """A usable log of Rhoban's recorder with some facts changed."""
+    keys = ("timestamp", "goal_position", "position")
+    rows = zip(*good().values(), strict=True)
+    entries = [dict(zip(keys, map(float, row), strict=True)) for row in rows]
+    usual = {"mass": MASS_KG, "length": LENGTH_M, "kp": 400, "vin": 7.4}
+    path.write_text(json.dumps({**usual, "entries": entries, **facts}))
+    return path
+
+
+@pytest.mark.parametrize("key", ["mass", "length", "kp", "vin"])
+@pytest.mark.parametrize("value", [0, -1.0, True, "0.5"])
+def test_facts_that_no_run_has_are_refused(key: str, value: object, tmp_path: Path) -> None:
+    """Catches a load of zero, and a truth value that counts as 1 V."""
+    path = recorded_json(tmp_path / "log.json", **{key: value})
+    with pytest.raises(ConfigurationError, match=f"{key} must be a number above 0"):
+        read_servo_log(path)
+
+
+def test_a_supply_of_zero_volts_is_refused(tmp_path: Path) -> None:
+    path = csv_of(tmp_path / "log.csv", **good(), voltage=np.zeros(200))
+    with pytest.raises(ConfigurationError, match="above 0 V"):
+        read_servo_log(path, LOAD)
+
+
+def test_the_arm_of_the_pendulum_is_a_rod(tmp_path: Path) -> None:
+    """Catches an arm that weighs nothing: its weight acts at l/2, its inertia is m l²/3."""
+    load = read_servo_log(recorded_json(tmp_path / "log.json", arm_mass=0.06)).load
+    assert load.torque == pytest.approx(WEIGHT + 0.06 * GRAVITY * LENGTH_M / 2.0)
+    assert load.inertia == pytest.approx((MASS_KG + 0.06 / 3.0) * LENGTH_M**2)
+    with pytest.raises(ConfigurationError, match="arm_mass must be a number of at least 0"):
+        read_servo_log(recorded_json(tmp_path / "log.json", arm_mass=-0.1))
+
+
+@pytest.mark.parametrize("key", ["torque_enable", "load", "goal_position"])
+def test_a_key_of_some_entries_only_is_refused(key: str, tmp_path: Path) -> None:
+    """Catches a column that is left out without a word, the torque then on."""
+    path = recorded_json(tmp_path / "log.json")
+    content = json.loads(path.read_text())
+    for entry in content["entries"]:
+        entry[key] = 0.5
+    del content["entries"][3][key]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=f"entry 4 has no {key}"):
+        read_servo_log(path)
+    content["entries"][3][key] = "on"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=f"entry 4: {key} must be a number"):
+        read_servo_log(path)
+
+
+def test_options_do_not_override_what_a_log_says(tmp_path: Path) -> None:
+    """Catches a load or a gain of an option in place of the recorded one."""
+    path = recorded_json(tmp_path / "log.json")
+    same = read_servo_log(path, LOAD, 400.0)
+    assert (same.load, same.gain) == (LOAD, 400.0)
+    with pytest.raises(ConfigurationError, match=r"0\.5 kg hang at 0\.1 m"):
+        read_servo_log(path, Load.pendulum(0.6, LENGTH_M))
+    with pytest.raises(ConfigurationError, match="gain is 400, and --gain 200"):
+        read_servo_log(path, gain=200.0)
+    columns = csv_of(tmp_path / "log.csv", **good(), gain=np.full(200, 32.0))
+    with pytest.raises(ConfigurationError, match="gain is 32, and --gain 200"):
+        read_servo_log(columns, LOAD, 200.0)
+
+
+def test_a_joint_that_nothing_loads_is_refused() -> None:
+    """Catches a division by the largest torque, which is zero."""
+    _, logs = short_logs(6)
+    with pytest.raises(ElasticError, match="nothing loads the joint"):
+        fit_servo([replace(logs[0], load=Load(0.0, 0.0, 1e-3))], starts=1)
+
+
 def test_known_torque_replaces_the_weight(tmp_path: Path) -> None:
     columns = good()
     pull = -WEIGHT * np.sin(columns["position"])
@@ -327,6 +501,45 @@ def test_pwm_at_its_limit_tells_the_torque_limit() -> None:
     assert duty_per_torque_gain(logs) is None
 
 
+def test_the_start_limits_the_torque_where_the_replay_does() -> None:
+    """Catches a limit in volts where it is in units of the register: 12 V scale both sides."""
+    _, logs = short_logs(5)
+    log = replace(logs[0], supply=12.0)
+    duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
+    torque = 1e-3 * servo_fit._drive(log, duty)
+    pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
+    limit = 1e-3 * duty * log.supply
+    np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)
+    assert (np.abs(torque) < 0.999 * limit).any()
+
+
+def test_a_parameter_without_influence_has_no_interval() -> None:
+    """Catches ± 0 where nothing depends on a parameter, and where two cannot be told apart."""
+    rng = np.random.default_rng(1)
+    one = rng.normal(size=(100, 3))
+    block = np.arange(100) // 10
+    r = rng.normal(size=100)
+    J = np.column_stack([one[:, 0], np.zeros(100), one[:, 1], one[:, 2], 2.0 * one[:, 2]])
+    told = np.isfinite(servo_fit._variance(J, r, block))
+    assert told.tolist() == [True, False, True, False, False]
+
+
+def test_what_nothing_depends_on_is_named_and_not_told() -> None:
+    """Catches an infinite width that JSON and checks refuse, or that stays unsaid."""
+    _, logs = short_logs(3)
+    half = np.full(len(NAMES), 1e-6)
+    half[[NAMES.index("delay"), NAMES.index("position_gain")]] = np.inf
+    values = np.full(len(NAMES), 0.1)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    result = describe_servo(ServoFit(tuple(logs), values, half, sought, {}, 1e-3))
+    again = ServoIdentification.model_validate_json(result.model_dump_json())
+    delay = next(one for one in again.parameters if one.name == "delay")
+    assert delay.half_width is None
+    assert not delay.is_told
+    assert again.gains[0].half_width is None
+    assert any("position_gain, delay: nothing" in text for text in again.untold)
+
+
 def test_a_joint_that_sticks_all_the_time_is_refused() -> None:
     _, logs = short_logs(6)
     stuck = replace(logs[0], position=1e-3 * np.sin(logs[0].time))
@@ -350,7 +563,7 @@ def test_command_reads_a_log_and_writes_what_others_read(
             gain=np.full(len(log), log.gain),
         )
     pendulum = ["--mass-kg", "0.5", "--lever-m", "0.1"]
-    logged = ["--log", "0.csv", "1.csv", "--unfitted", "./1.csv"]
+    logged = ["--log", "0.csv", "--unfitted", "./1.csv"]
     main(["identify", *logged, *pendulum, "--output", "out"])
     said = capsys.readouterr().out
     assert "a line in the goal" in said
@@ -384,7 +597,11 @@ def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
         (["--robot", "arm.xml"], "--joints"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "log.csv"], "at least one"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "the same log"),
+        (["copy.csv", "--mass-kg", "0.5", "--lever-m", "0.1"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.002"], "holds out 0"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.9"], "fits 20 rows"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
@@ -396,10 +613,100 @@ def test_options_that_do_not_go_together_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = csv_of(tmp_path / "log.csv", **good())
+    csv_of(tmp_path / "copy.csv", **good())
     with pytest.raises(SystemExit) as ended:
         main(["identify", "--log", str(path), *options])
     assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_log_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a message on options where the name of the file is wrong."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["identify", "--log", "nolog.csv", "--mass-kg", "0.5", "--lever-m", "0.1"])
+    assert "no log at nolog.csv" in capsys.readouterr().err
+
+
+def held_out_of(on_mrad: float, all_mrad: float, off_rows: int) -> ServoHoldout:
+    """Errors of a replay beside rivals that are 20 mrad off."""
+    rms = (20.0, 20.0, 20.0, on_mrad)
+    return ServoHoldout(
+        fitted=("a",),
+        replay_mrad=all_mrad,
+        errors=tuple(
+            ServoError(name=name, rms_mrad=value, slow_mrad=None)
+            for name, value in zip(PREDICTIONS, rms, strict=True)
+        ),
+        logs=(
+            LogErrors(
+                log="b",
+                gain=1.0,
+                rms_mrad=rms,
+                slow_mrad=None,
+                slow_rows=0,
+                replay_mrad=all_mrad,
+                off_rows=off_rows,
+            ),
+        ),
+    )
+
+
+def test_the_first_line_names_a_swing_that_is_replayed_wrongly() -> None:
+    """Catches a verdict that leaves out the rows with the torque off without a word."""
+    said = "with the torque off included the replay has 216.0"
+    assert said in verdict(held_out_of(4.0, 216.0, 50))
+    assert said in verdict(held_out_of(25.0, 216.0, 50))
+    assert "torque off" not in verdict(held_out_of(4.0, 8.0, 50))
+    assert "torque off" not in verdict(held_out_of(4.0, 4.0, 0))
+
+
+def test_rows_with_the_torque_off_are_shown_apart() -> None:
+    _, logs = short_logs(3)
+    values = np.full(len(NAMES), 0.01)
+    half = np.full(len(NAMES), 1e-6)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    fit = ServoFit(tuple(logs), values, half, sought, {}, 1e-3)
+    for log in (logs[0], logs[2]):
+        held_out = judge_servo(fit, [log])
+        off = int((~log.enabled).sum())
+        assert held_out.logs[0].off_rows == off
+        console = Console(width=200, record=True, quiet=False, file=StringIO())
+        show_result(describe_servo(fit, "j", held_out), console)
+        shown = console.export_text()
+        assert ("all rows, torque off included" in shown) == bool(off)
+    assert off > 0
+
+
+def test_each_gain_is_that_of_its_own_supply() -> None:
+    """Catches the voltage of the first log for all, and a torque limit of another voltage."""
+    _, logs = short_logs(3)
+    volts = (7.4, 12.0, 12.2)
+    logs = [replace(log, supply=v) for log, v in zip(logs, volts, strict=True)]
+    logs = [replace(logs[0], gain=100.0), *(replace(log, gain=200.0) for log in logs[1:])]
+    logs.append(replace(logs[1], gain=100.0))
+    values = np.full(len(NAMES), 0.01)
+    half = np.full(len(NAMES), 1e-4)
+    sought = np.ones(len(NAMES), dtype=np.bool_)
+    result = describe_servo(ServoFit(tuple(logs), values, half, sought, {}, 1e-3))
+    expected = [(100.0, 7.4), (200.0, 12.1), (100.0, 12.0)]
+    assert [(one.register_value, one.supply_v) for one in result.gains] == [
+        (register, pytest.approx(supply)) for register, supply in expected
+    ]
+    for one in result.gains:
+        assert one.supply_v is not None
+        stiffness = 0.01 * one.register_value * one.supply_v
+        assert one.position_gain_nm_per_rad == pytest.approx(stiffness)
+        assert one.half_width == pytest.approx(0.01 * stiffness)
+    assert result.value("torque_limit") == pytest.approx(0.01 * 7.4)
+    assert result.supply_v == 7.4
+    console = Console(width=200, record=True, file=StringIO())
+    show_result(result, console)
+    shown = console.export_text()
+    assert "k_p at gain 200, 12.1 V" in shown
+    assert "torque_limit at 7.4 V" in shown
 
 
 @pytest.mark.slow

@@ -271,8 +271,16 @@ STAGES = STARTS + 1
 """Stages of a fit, for its progress."""
 
 
+_LEAST_TORQUE = 1e-9
+
+
 def _problem(logs: Sequence[ServoLog]) -> _Problem:
     torque = max(float(np.abs(log.external_torque(log.position)).max()) for log in logs)
+    if torque < _LEAST_TORQUE:
+        raise ElasticError(
+            "nothing loads the joint, so that no torque is known; hang a known mass on it, turn"
+            " its axis out of the vertical, or log a column tau_known [N·m]"
+        )
     highest = max(log.gain for log in logs)
     inertia = max(log.load.inertia or torque / 100.0 for log in logs)
     spans = [np.ptp(log.goal) for log in logs if log.enabled.any()]
@@ -359,9 +367,7 @@ def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     rows, right = [], []
     for log in logs:
         w, a = log.derivatives()
-        error = log.gain * log.supply * (log.goal - log.position) * log.enabled
-        if problem.duty is not None:
-            error = np.clip(error, -problem.duty, problem.duty)
+        error = _drive(log, problem.duty)
         moving = np.abs(w) > _MOVING
         side = np.sign(w)
         lever = log.load.torque * np.cos(log.position - log.load.rest)
@@ -411,6 +417,17 @@ def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     least[base] = 0.05
     least[_AT["zero_offset"]] = -np.inf
     return np.maximum(z, least)
+
+
+def _drive(log: ServoLog, duty: float | None) -> Array:
+    """Torque of the motor at standstill over k, as `Replay` has it, (N,) [V·rad].
+
+    The register's error is limited before the supply's voltage scales it: the limit is T/k.
+    """
+    error = log.gain * (log.goal - log.position)
+    if duty is not None:
+        error = np.clip(error, -duty, duty)
+    return error * log.supply * log.enabled
 
 
 def _independent(r: Array) -> float:
@@ -522,16 +539,33 @@ def _blocks(logs: Sequence[ServoLog], seconds: float) -> IntArray:
 
 
 def _variance(J: Array, r: Array, block: IntArray) -> Array:
-    """Variances of estimates by clusters, not below those for independent rows, (p,)."""
-    size = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
-    inverse = np.linalg.pinv((J / size).T @ (J / size), rcond=1e-10)
+    """Variances of estimates by clusters, not below those for independent rows, (p,).
+
+    Infinite for a parameter without influence, alone or against the others.
+    """
+    norm = np.linalg.norm(J, axis=0)
+    size = np.maximum(norm, 1e-12)
+    information = (J / size).T @ (J / size)
+    inverse = np.linalg.pinv(information, rcond=_SINGULAR)
+    spectrum, directions = np.linalg.eigh(information)
+    free = directions[:, spectrum <= _SINGULAR * spectrum[-1]]
+    is_told = np.abs(free).max(axis=1, initial=0.0) < _UNTOLD_PART
+    is_told &= norm > _LEAST_INFLUENCE * norm.max()
     count = int(block.max()) + 1
     score = np.zeros((count, J.shape[1]))
     np.add.at(score, block, (J / size) * r[:, None])
     p = J.shape[1]
     robust = inverse @ (score.T @ score) @ inverse * (count / max(count - p, 1))
     plain = inverse * float(r @ r) / max(len(r) - p, 1)
-    return np.maximum(np.diag(robust), np.diag(plain)) / size**2
+    return np.where(is_told, np.maximum(np.diag(robust), np.diag(plain)) / size**2, np.inf)
+
+
+_SINGULAR = 1e-10
+"""Share of the largest eigenvalue below which a direction counts as free."""
+_UNTOLD_PART = 1e-3
+"""Part of a parameter in a free direction from which on it is not told."""
+_LEAST_INFLUENCE = 1e-9
+"""Influence over the largest one, below which a parameter has none."""
 
 
 def slow_rows(log: ServoLog) -> BoolArray:

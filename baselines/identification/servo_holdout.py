@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from baselines.identification.servo_fit import ServoFit, slow_rows
-from baselines.identification.servo_log import ServoLog
+from baselines.identification.servo_log import FEWEST_ROWS, ServoLog
 from elastic_env.core.config import Model
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
 GOAL = "the goal itself"
@@ -14,6 +15,7 @@ OFFSET = "a constant offset"
 LINE = "a line in the goal"
 REPLAYED = "identified"
 PREDICTIONS = (GOAL, OFFSET, LINE, REPLAYED)
+_FEWEST_HELD_OUT = 20
 
 
 class ServoError(Model):
@@ -37,6 +39,8 @@ class LogErrors(Model):
     slow_rows: int
     replay_mrad: float
     """Of the replay over all rows, those with the torque off included."""
+    off_rows: int = 0
+    """Rows with the torque off, which `rms_mrad` leaves out."""
 
 
 class ServoHoldout(Model):
@@ -48,6 +52,11 @@ class ServoHoldout(Model):
     errors: tuple[ServoError, ...]
     """Of the rivals, and the identification last."""
     logs: tuple[LogErrors, ...]
+
+    @property
+    def has_torque_off(self) -> bool:
+        """True if `errors` leave out rows with the torque off."""
+        return any(log.off_rows for log in self.logs)
 
     @property
     def best_rival(self) -> ServoError:
@@ -126,9 +135,18 @@ def split_logs(
         logs: All logs.
         share: Share that is held out; at least one log is fitted and one held out.
         seed: Seed of the draw.
+
+    Raises:
+        ConfigurationError: A part of a single log has too few rows.
     """
     if len(logs) == 1:
         at = round((1.0 - share) * len(logs[0]))
+        if at < FEWEST_ROWS or len(logs[0]) - at < _FEWEST_HELD_OUT:
+            raise ConfigurationError(
+                f"--holdout {share:g} fits {at} rows of {logs[0].name} and holds out"
+                f" {len(logs[0]) - at}, at least {FEWEST_ROWS} and {_FEWEST_HELD_OUT} are needed;"
+                " choose another share, 0 for none, or give more logs"
+            )
         return [logs[0].part(slice(0, at))], [logs[0].part(slice(at, None))]
     count = min(max(1, round(share * len(logs))), len(logs) - 1)
     order = np.random.default_rng(seed).permutation(len(logs))
@@ -148,6 +166,7 @@ def _of_log(log: ServoLog, errors: Array, slow: Array) -> LogErrors:
         slow_mrad=tuple(map(_mrad, slow)) if slow.size else None,
         slow_rows=slow.shape[1],
         replay_mrad=_mrad(errors[-1]),
+        off_rows=int((~on).sum()),
     )
 
 

@@ -30,9 +30,13 @@ class Load:
     inertia: float | None = None
 
     @staticmethod
-    def pendulum(mass_kg: float, length_m: float) -> "Load":
-        """A point mass on a light rod that hangs at zero."""
-        return Load(GRAVITY * mass_kg * length_m, 0.0, mass_kg * length_m**2)
+    def pendulum(mass_kg: float, length_m: float, rod_kg: float = 0.0) -> "Load":
+        """A point mass at the end of a uniform rod that hangs at zero."""
+        return Load(
+            GRAVITY * (mass_kg + rod_kg / 2.0) * length_m,
+            0.0,
+            (mass_kg + rod_kg / 3.0) * length_m**2,
+        )
 
     def pull(self, q: Array) -> Array:
         """Torque of the weight on the joint, (...,) [N·m]; positive turns it forward."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -23,6 +23,8 @@ AngleUnit = Literal["rad", "deg"]
 """Unit of the angles of a file."""
 MOST_ROWS = 200_000
 """Rows of a log."""
+FEWEST_ROWS = 50
+"""Rows that a fit needs."""
 
 _COLUMNS = {
     "time": "s",
@@ -45,7 +47,6 @@ _JSON_NAMES = {
     "torque_enable": "torque_enable",
 }
 """Names of Rhoban's recorder, and of others who follow it."""
-_FEWEST_ROWS = 50
 _LONGEST_ROW_S = 0.2
 _LONGEST_GAP_S = 0.3
 _LARGEST_ANGLE = 4.0 * math.pi
@@ -130,7 +131,7 @@ def read_servo_log(
     path: Path,
     load: Load | None = None,
     gain: float | None = None,
-    unit: AngleUnit = "rad",
+    unit: AngleUnit | None = None,
     joint: str | None = None,
 ) -> ServoLog:
     """Read and check a log.
@@ -139,29 +140,32 @@ def read_servo_log(
         path: CSV file, JSON file of a recorder of servos, or parquet file of LeRobot.
         load: What hangs on the joint; None for what the file says.
         gain: Value of the gain register; None for what the file says.
-        unit: Unit of the angles.
+        unit: Unit of the angles; None for what the file says, or radians.
         joint: Joint to read, where the file has several.
 
     Raises:
         ConfigurationError: The log cannot be used; the message says what to change.
     """
     readers = {".json": _read_json, ".parquet": _read_parquet}
-    columns, facts = readers.get(path.suffix.lower(), _read_csv)(path, joint)
+    columns, facts, stated = readers.get(path.suffix.lower(), _read_csv)(path, joint)
     for name in ("time", "goal", "position"):
         if name not in columns:
             raise ConfigurationError(
                 f"{path} has no column {name}; a log in time needs time [s], goal [rad] and"
                 f" position [rad], it has {', '.join(columns) or 'none of them'}"
             )
-    scale = 1.0 if unit == "rad" else math.pi / 180.0
-    if load is None and {"mass", "length"} <= set(facts):
-        load = Load.pendulum(facts["mass"], facts["length"])
-    if gain is None:
-        gain = facts.get("kp", 1.0)
-        if "gain" in columns:
-            gain = _constant_gain(path, columns["gain"])
-    if not gain > 0.0:
-        raise ConfigurationError(f"{path}: the gain must be positive, got {gain:g}")
+    if unit is not None and stated not in (None, unit):
+        raise ConfigurationError(
+            f"{path}: its header says [{stated}], and --angles {unit}; leave --angles out"
+        )
+    scale = math.pi / 180.0 if "deg" in (unit, stated) else 1.0
+    load = _load(path, load, facts)
+    gain = _gain(path, gain, columns, facts)
+    if "voltage" in columns and not columns["voltage"].min() > 0.0:
+        raise ConfigurationError(
+            f"{path}, column voltage: a supply must be above 0 V, got"
+            f" {columns['voltage'].min():g}; leave the column out if it is not known"
+        )
     enabled = columns.get("torque_enable", np.ones(len(columns["time"]))) > 0.5
     pwm = columns.get("pwm")
     log = ServoLog(
@@ -187,6 +191,63 @@ def read_servo_log(
     return log
 
 
+def _load(path: Path, load: Load | None, facts: Mapping[str, float]) -> Load | None:
+    """What hangs on the joint by options and file.
+
+    Raises:
+        ConfigurationError: They contradict each other.
+    """
+    if not {"mass", "length"} <= set(facts):
+        return load
+    rod = facts.get("arm_mass", 0.0)
+    own = Load.pendulum(facts["mass"], facts["length"], rod)
+    if load is not None and not _is_same_load(load, own):
+        arm = f" and an arm of {rod:g} kg" if rod else ""
+        raise ConfigurationError(
+            f"{path} says that {facts['mass']:g} kg hang at {facts['length']:g} m{arm}, and the"
+            " options say another load; leave --mass-kg, --lever-m and --robot out, or correct"
+            " the file"
+        )
+    return own
+
+
+def _is_same_load(one: Load, other: Load) -> bool:
+    if one.inertia is None or other.inertia is None:
+        return one == other
+    turn = abs(one.rest - other.rest)
+    return (
+        math.isclose(one.torque, other.torque, rel_tol=_SAME)
+        and math.isclose(one.inertia, other.inertia, rel_tol=_SAME)
+        and turn < _SAME
+    )
+
+
+def _gain(
+    path: Path, gain: float | None, columns: Mapping[str, Array], facts: Mapping[str, float]
+) -> float:
+    """Value of the gain register by option and file.
+
+    Raises:
+        ConfigurationError: They contradict each other, or it is not positive.
+    """
+    own = facts.get("kp")
+    if "gain" in columns:
+        own = _constant_gain(path, columns["gain"])
+    if own is not None and gain is not None and not math.isclose(own, gain, rel_tol=_SAME):
+        raise ConfigurationError(
+            f"{path} says that the gain is {own:g}, and --gain {gain:g}; leave --gain out, or"
+            " correct the file"
+        )
+    value = own if own is not None else 1.0 if gain is None else gain
+    if not value > 0.0:
+        raise ConfigurationError(f"{path}: the gain must be positive, got {value:g}")
+    return value
+
+
+_SAME = 1e-6
+"""Share within which option and file say the same."""
+
+
 def require_usable(path: Path, log: ServoLog) -> None:
     """Refuse what no servo can have logged, each by one sentence.
 
@@ -194,9 +255,9 @@ def require_usable(path: Path, log: ServoLog) -> None:
         ConfigurationError: Too few rows, a clock that stops, goes back or jumps, angles in another
             unit or wrapped, a goal that never moves, or goal and position exchanged.
     """
-    if len(log) < _FEWEST_ROWS:
+    if len(log) < FEWEST_ROWS:
         raise ConfigurationError(
-            f"{path} has {len(log)} rows, and at least {_FEWEST_ROWS} are needed; log the whole"
+            f"{path} has {len(log)} rows, and at least {FEWEST_ROWS} are needed; log the whole"
             " motion, some ten rows or more a second"
         )
     step = np.diff(log.time)
@@ -271,7 +332,15 @@ def _plain(cell: str) -> str:
     return cell.strip().strip('"').partition("[")[0].strip()
 
 
-def _read_csv(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[str, float]]:
+class _Content(NamedTuple):
+    """Content of a file: columns, facts of the run, and the unit of angles if it says one."""
+
+    columns: dict[str, Array]
+    facts: dict[str, float]
+    unit: AngleUnit | None = None
+
+
+def _read_csv(path: Path, joint: str | None) -> _Content:
     table = read_table(
         path,
         what="log",
@@ -280,6 +349,7 @@ def _read_csv(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[str
         example="time [s], goal [rad] and position [rad]",
     )
     columns: dict[str, Array] = {}
+    units: dict[str, str] = {}
     for text, values in zip(table.names, table.values.T, strict=True):
         name = _plain(text)
         known = name == "tau_known" or name.startswith("tau_known.")
@@ -293,20 +363,39 @@ def _read_csv(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[str
             )
         given = text.partition("[")[2].rstrip("] ").replace("Nm", "N·m")
         if given and given != unit and not (unit == "rad" and given == "deg"):
+            allowed = "[rad] or [deg]" if unit == "rad" else f"[{unit}]"
             raise ConfigurationError(
-                f"{path}, column {name}: the unit must be [{unit}], got [{quote(given)[1:-1]}];"
+                f"{path}, column {name}: the unit must be {allowed}, got [{quote(given)[1:-1]}];"
                 " convert the column"
             )
+        if unit == "rad":
+            units[name] = given
         name = "known" if known else name
         if name in columns:
             raise ConfigurationError(
                 f"{path} has several columns {name}; name the joint by --joints"
             )
         columns[name] = values
-    return columns, {}
+    return _Content(columns, {}, _angle_unit(path, units))
 
 
-def _read_json(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[str, float]]:
+def _angle_unit(path: Path, units: Mapping[str, str]) -> AngleUnit | None:
+    """Unit of the angles by the header; None if it says none.
+
+    Raises:
+        ConfigurationError: Only one of goal and position is in degrees.
+    """
+    if "deg" not in units.values():
+        return "rad" if "rad" in units.values() else None
+    if other := [name for name, unit in units.items() if unit != "deg"]:
+        raise ConfigurationError(
+            f"{path}: its header says [deg] for one angle, but not for {other[0]}; give goal and"
+            " position in one unit, and name it for both"
+        )
+    return "deg"
+
+
+def _read_json(path: Path, joint: str | None) -> _Content:
     """A log of Rhoban's recorder: facts of the run, and a list of entries."""
     del joint
     try:
@@ -327,16 +416,63 @@ def _read_json(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[st
         raise ConfigurationError(f"{path} has no entries; log a motion")
     columns: dict[str, Array] = {}
     for key, name in _JSON_NAMES.items():
-        if all(_is_number(entry.get(key)) for entry in entries):
-            columns[name] = np.array([float(entry[key]) for entry in entries])
-    return columns, {str(k): float(v) for k, v in content.items() if _is_number(v)}
+        has = [entry.get(key) is not None for entry in entries]
+        if not any(has):
+            continue
+        if not all(has):
+            raise ConfigurationError(
+                f"{path}: entry {has.index(False) + 1} has no {key}, and others have one; give it"
+                " in all entries or in none"
+            )
+        columns[name] = np.array(
+            [_entry(path, number, key, entry[key]) for number, entry in enumerate(entries, 1)]
+        )
+    return _Content(columns, _facts(path, content))
+
+
+_FACTS = {"mass": "kg", "length": "m", "kp": "1", "vin": "V", "arm_mass": "kg"}
+"""Facts of a run with their units; others are not used."""
+
+
+def _facts(path: Path, content: Mapping[str, Any]) -> dict[str, float]:
+    """Facts of a run that are used.
+
+    Raises:
+        ConfigurationError: One is no positive number.
+    """
+    facts = {}
+    for key, unit in _FACTS.items():
+        value = content.get(key)
+        if value is None:
+            continue
+        may_vanish = key == "arm_mass"
+        if not _is_number(value) or value < 0.0 or (value == 0.0 and not may_vanish):
+            raise ConfigurationError(
+                f"{path}: {key} must be a number {'of at least' if may_vanish else 'above'} 0"
+                f" [{unit}], got {quote(str(value))[1:-1]}"
+            )
+        facts[key] = float(value)
+    return facts
+
+
+def _entry(path: Path, number: int, key: str, value: Any) -> float:
+    """Value of an entry; only whether the torque is on may be a truth value."""
+    if not _is_number(value) and not (key == "torque_enable" and isinstance(value, bool)):
+        raise ConfigurationError(
+            f"{path}, entry {number}: {key} must be a number, got {quote(str(value))[1:-1]}"
+        )
+    return float(value)
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float)
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and abs(value) < _LARGEST
 
 
-def _read_parquet(path: Path, joint: str | None) -> tuple[dict[str, Array], dict[str, float]]:
+_LARGEST = 1e300
+
+
+def _read_parquet(path: Path, joint: str | None) -> _Content:
     """An episode of LeRobot: `timestamp`, and the lists `action` and `observation.state`."""
     import pandas as pd
 
@@ -354,16 +490,54 @@ def _read_parquet(path: Path, joint: str | None) -> tuple[dict[str, Array], dict
             f"{path} has no column {missing[0]}; an episode of LeRobot has timestamp, action and"
             " observation.state"
         )
-    at = int(joint) if joint is not None and joint.isdecimal() else 0
-    columns = {}
-    for key, name in names.items():
-        values = np.array([np.ravel(cell) for cell in table[key]], dtype=np.float64)
-        if joint is None and values.shape[1] > 1:
+    if not 0 < len(table) <= MOST_ROWS:
+        raise ConfigurationError(
+            f"{path} must have 1 to {MOST_ROWS} rows, it has {len(table)}; give an episode"
+        )
+    parts = {name: _parquet_column(path, key, list(table[key])) for key, name in names.items()}
+    count = min(parts["goal"].shape[1], parts["position"].shape[1])
+    at = _joint_number(path, joint, count)
+    return _Content(
+        {name: part[:, 0 if name == "time" else at] for name, part in parts.items()}, {}
+    )
+
+
+def _parquet_column(path: Path, key: str, cells: list[Any]) -> Array:
+    """Numbers of a column, (N, number of joints).
+
+    Raises:
+        ConfigurationError: They are not as many in each row, or no finite numbers.
+    """
+    rows = [np.ravel(cell) for cell in cells]
+    if len({len(row) for row in rows}) > 1 or not len(rows[0]):
+        raise ConfigurationError(
+            f"{path}, column {key}: each row must hold as many numbers as the others, one a joint"
+        )
+    for number, row in enumerate(rows, 1):
+        if row.dtype.kind not in "fiu" or not np.isfinite(row).all():
             raise ConfigurationError(
-                f"{path} has {values.shape[1]} joints; choose one by its number, --joints 0"
+                f"{path}, column {key}, row {number}: needs finite numbers, got"
+                f" {quote(str(row[0]))[1:-1] if row.dtype.kind not in 'fiu' else 'nan or inf'}"
             )
-        columns[name] = values[:, min(at, values.shape[1] - 1)]
-    return columns, {}
+    return np.array(rows, dtype=np.float64)
+
+
+def _joint_number(path: Path, joint: str | None, count: int) -> int:
+    """Place of a joint; a file of one joint needs no number.
+
+    Raises:
+        ConfigurationError: It is no number of a joint.
+    """
+    is_number = joint is not None and joint.isascii() and joint.isdecimal() and len(joint) < 10
+    if count == 1 and not is_number:
+        return 0
+    if joint is None or not is_number or int(joint) >= count:
+        got = "" if joint is None else f", got {quote(joint)[1:-1]}"
+        raise ConfigurationError(
+            f"{path} has {count} joint{'s' * (count > 1)}; choose one by its number, --joints 0"
+            f" to {count - 1}{got}"
+        )
+    return int(joint)
 
 
 def _constant_gain(path: Path, column: Array) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from baselines.identification.servo_fit import USUAL_LOSS, ServoFit
 from baselines.identification.servo_holdout import ServoHoldout
+from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import PARAMETERS
 from elastic_env.core.config import Model
 from elastic_env.core.yaml_text import yaml_line
@@ -17,6 +18,8 @@ _TOLD = 0.5
 _TOLD_WITHIN = {"zero_offset": 0.02, "delay": 0.005, "load_friction": 0.1}
 """Half-widths at which a parameter counts as told whatever its value is."""
 _FRICTION = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
+_SAME_SUPPLY = 0.1
+"""Share of a voltage within which logs have one supply."""
 _SMALL_SHARE = 0.02
 """Share of the largest load below which a dry friction is as good as told."""
 
@@ -40,7 +43,10 @@ class RegisterGain(Model):
 
     register_value: float
     position_gain_nm_per_rad: float
-    half_width: float
+    half_width: float | None
+    """Half of the 95 % interval; None where the logs do not tell the gain."""
+    supply_v: float | None = None
+    """Voltage at which the servo has this gain; None where the logs do not say it."""
 
 
 class ServoIdentification(Model):
@@ -56,6 +62,7 @@ class ServoIdentification(Model):
     untold: tuple[str, ...]
     """What the logs cannot tell, in words."""
     supply_v: float | None
+    """Voltage of the position gain and the torque limit among the parameters."""
     held_out: ServoHoldout | None = None
 
     def value(self, name: str) -> float | None:
@@ -86,7 +93,11 @@ class ServoIdentification(Model):
         files = [folder / name for name in ("identification.json", "joints.yaml")]
         files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# by elastic identify from logs in time; the logs do not tell the gear's stiffness"
-        said = "no servo" if not self.gains else f"gain register {self.gains[0].register_value:g}"
+        said = "no servo"
+        if self.gains:
+            volts = self.gains[0].supply_v
+            at = "" if volts is None else f" at {volts:g} V"
+            said = f"gain register {self.gains[0].register_value:g}{at}"
         text = f"{head}\n{yaml_line(self.joint, self.settings(), said)}\n"
         files[1].write_text(text, encoding="utf-8")
         return files
@@ -102,11 +113,10 @@ def describe_servo(
         joint: Name for `joints.yaml`, or a pattern.
         held_out: Errors of another fit at logs that it did not see.
     """
-    supply = fit.logs[0].supply
+    registers = _registers(fit.logs)
+    supply = registers[0][1] if registers else fit.logs[0].supply
     parameters = tuple(_parameter(fit, name, supply) for name in PARAMETERS)
-    gain = fit.value("position_gain") * supply
-    half = fit.half("position_gain") * supply
-    registers = list(dict.fromkeys(log.gain for log in fit.logs if log.enabled.any()))
+    gain, half = fit.value("position_gain"), fit.half("position_gain")
     return ServoIdentification(
         joint=joint,
         logs=tuple(log.name for log in fit.logs),
@@ -115,16 +125,38 @@ def describe_servo(
         gains=tuple(
             RegisterGain(
                 register_value=register,
-                position_gain_nm_per_rad=gain * register,
-                half_width=half * register,
+                position_gain_nm_per_rad=gain * register * volts,
+                half_width=half * register * volts if np.isfinite(half) else None,
+                supply_v=None if volts == 1.0 else volts,
             )
-            for register in registers
+            for register, volts in registers
         ),
         parameters=parameters,
         untold=tuple(_untold(fit, parameters)),
         supply_v=None if supply == 1.0 else supply,
         held_out=held_out,
     )
+
+
+def _registers(logs: Sequence[ServoLog]) -> list[tuple[float, float]]:
+    """Each value of the register at each supply, with the mean voltage of its logs [1], [V].
+
+    Voltages that were measured differ a little from log to log, and count as one supply.
+    """
+    found: list[tuple[float, list[float]]] = []
+    for log in logs:
+        if not log.enabled.any():
+            continue
+        alike = [
+            volts
+            for register, volts in found
+            if register == log.gain and abs(log.supply / volts[0] - 1.0) < _SAME_SUPPLY
+        ]
+        if alike:
+            alike[0].append(log.supply)
+        else:
+            found.append((log.gain, [log.supply]))
+    return [(register, float(np.mean(volts))) for register, volts in found]
 
 
 def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
@@ -177,6 +209,11 @@ def _untold(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
             f"with less than half their value: {', '.join(wide)}; log faster motions, both sides of"
             " approach, and a swing with the torque off"
         )
+    without = [
+        one.name for one in parameters if one.value is not None and np.isinf(fit.half(one.name))
+    ]
+    if without:
+        said.append(f"{', '.join(without)}: nothing in these logs depends on it alone")
     if by_name["static_friction"].value is None:
         said.append("Stribeck friction: it does not lower the error")
     if fit.half("load_friction") > _TOLD * USUAL_LOSS[1]:

@@ -83,22 +83,31 @@ def _is(row: Mapping[str, str], name: str) -> bool:
 
 
 def replays(rows: Rows) -> str:
-    """Errors of replays of motions that were not fitted, over all rows of the logs."""
+    """Errors at motions that were not fitted: torque on, and of the replay over all rows too."""
     own = [row for row in rows if row["measure"] == "replay"]
-    return _servo_table("motion, not fitted", own)
+    return _servo_table("motion, not fitted", own, {_ALL_ROWS: "replay_all_mrad"})
 
 
 def slow_motion(rows: Rows) -> str:
     """Errors in slow motion by the value of the gain register, over all motions."""
     own = [row for row in rows if row["measure"] == "slow"]
-    return _servo_table("gain, slow motion, not fitted", own)
+    return _servo_table("gain, slow motion, not fitted", own, {})
 
 
-def _servo_table(what: str, rows: Rows) -> str:
-    head = ["servo", what, "goal itself", "constant offset", "line in the goal", "identified"]
-    names = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
+_ALL_ROWS = "identified, torque off included"
+_PREDICTIONS = {
+    "goal itself": "goal_mrad",
+    "constant offset": "offset_mrad",
+    "line in the goal": "line_mrad",
+    "identified": "replay_mrad",
+}
+"""Columns of both tables, over the same rows."""
+
+
+def _servo_table(what: str, rows: Rows, further: Mapping[str, str]) -> str:
+    columns = {**_PREDICTIONS, **further}
     lines = []
     for row in rows:
-        shown = [f"{float(row[name]):.1f}" for name in names]
+        shown = [f"{float(row[name]):.1f}" for name in columns.values()]
         lines.append([row["servo"].upper(), row["of"].replace("_", " "), *shown])
-    return page_table(head, lines, words=2)
+    return page_table(["servo", what, *columns], lines, words=2)

@@ -43,7 +43,7 @@ from baselines.identification.pose_plan import (
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import Locator, Model, Title, quantity
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.joint.joint_settings import SOFTEST
 from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
@@ -149,6 +149,8 @@ def run_arm_identification(
     if are_servo_logs(options.log):
         return _identify_servo(options, console, seed, output)
     if options.servo != ServoOptions():
+        if options.log and not Path(options.log[0]).is_file():
+            raise ConfigurationError(f"no log at {quote(options.log[0])[1:-1]}; name a file")
         raise ConfigurationError(
             "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
             " with columns time, goal and position by --log"

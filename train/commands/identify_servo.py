@@ -1,6 +1,8 @@
 """`elastic identify --log run.csv`: a servo from logs in time."""
 
+import hashlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from rich import box
@@ -30,10 +32,10 @@ class ServoOptions(Model):
     """Distance of its mass from the axis [m]."""
     gain: float | None = quantity("1", None, gt=0)
     """Value of the servo's gain register, where the logs do not say it [1]."""
-    angles: AngleUnit = "rad"
-    """Unit of angles in the logs in time."""
+    angles: AngleUnit | None = None
+    """Unit of angles in the logs in time; default what they say, or radians."""
     unfitted: tuple[Locator, ...] = ()
-    """Logs in time to replay without a fit, left out of --log too; default a share by --holdout."""
+    """Logs in time to replay without a fit, not in --log; default a share by --holdout."""
 
 
 def are_servo_logs(paths: Sequence[str]) -> bool:
@@ -70,11 +72,8 @@ def identify_servo(
     """
     plots.require_matplotlib()
     load = known_load(options, robot, joint)
-    apart = {Path(path).resolve() for path in options.unfitted}
-    fitted = [path for path in paths if Path(path).resolve() not in apart]
-    if not fitted:
-        raise ConfigurationError("all logs are --unfitted; leave at least one to fit")
-    logs = [_read(options, path, load, joint) for path in fitted]
+    _require_each_once(paths, options.unfitted)
+    logs = [_read(options, path, load, joint) for path in paths]
     further = [_read(options, path, load, joint) for path in options.unfitted]
     _require_one_supply([*logs, *further])
     inner, outer = (logs, further) if further or not holdout else split_logs(logs, holdout, seed)
@@ -126,16 +125,20 @@ def show_result(result: ServoIdentification, console: Console) -> None:
             [error.name, f"{error.rms_mrad:.1f}", _number(error.slow_mrad, ".1f")]
             for error in result.held_out.errors
         ]
+        head = ["prediction", "torque on", "slow motion"]
+        if result.held_out.has_torque_off:
+            head.append("all rows, torque off included")
+            rows = [[*row, "–"] for row in rows]
+            rows[-1][-1] = f"{result.held_out.replay_mrad:.1f}"
         title = (
             f"error of the angle at {len(result.held_out.logs)} logs that were not fitted [mrad]"
         )
-        head = ["prediction", "torque on", "slow motion"]
         console.print(make_table(title, head, rows, box=box.SIMPLE))
     rows = [
         [
-            f"k_p at gain {one.register_value:g}",
+            f"k_p at gain {one.register_value:g}{_volts(one.supply_v)}",
             f"{one.position_gain_nm_per_rad:.4g}",
-            f"± {one.half_width:.2g}",
+            _width(one.half_width),
             "N·m/rad",
             "",
         ]
@@ -143,8 +146,11 @@ def show_result(result: ServoIdentification, console: Console) -> None:
     ]
     for one in result.parameters:
         if one.name != "position_gain" and one.value is not None:
-            width = "–" if one.half_width is None else f"± {one.half_width:.2g}"
-            rows.append([one.name, f"{one.value:.4g}", width, one.unit, one.remark])
+            width = _width(one.half_width)
+            name = one.name
+            if name == "torque_limit" and result.supply_v is not None:
+                name += f" at {result.supply_v:.4g} V"
+            rows.append([name, f"{one.value:.4g}", width, one.unit, one.remark])
     title = f"servo from {len(result.logs)} logs, replayed within {result.rms_mrad:.1f} mrad rms"
     head = ["parameter", "value", "95 %", "unit", "follows from"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
@@ -154,17 +160,49 @@ def show_result(result: ServoIdentification, console: Console) -> None:
 
 
 def verdict(held_out: ServoHoldout) -> str:
-    """Held-out errors in a sentence; a rival that is ahead comes first."""
+    """Held-out errors in a sentence; a rival that is ahead comes first.
+
+    A replay that goes wrong once the torque is off is named too.
+    """
     own, rival = held_out.errors[-1], held_out.best_rival
+    swing = ""
+    if held_out.has_torque_off and held_out.replay_mrad > _MUCH_WORSE * rival.rms_mrad:
+        swing = f"; with the torque off included the replay has {held_out.replay_mrad:.1f}"
     if own.rms_mrad < rival.rms_mrad:
         return (
             f"not fitted: the replay is {own.rms_mrad:.1f} mrad off, {rival.name}"
-            f" {rival.rms_mrad:.1f}, the goal itself {held_out.errors[0].rms_mrad:.1f}"
+            f" {rival.rms_mrad:.1f}, the goal itself {held_out.errors[0].rms_mrad:.1f}{swing}"
         )
     return (
         f"{rival.name} is ahead: {rival.rms_mrad:.1f} mrad at logs that were not fitted, where the"
-        f" replay has {own.rms_mrad:.1f}: use that, or log more motions"
+        f" replay has {own.rms_mrad:.1f}{swing}: use that, or log more motions"
     )
+
+
+_MUCH_WORSE = 1.5
+
+
+def _require_each_once(paths: Sequence[str], unfitted: Sequence[str]) -> None:
+    """Refuse a log that is named twice, by its path or by its content.
+
+    Raises:
+        ConfigurationError: One is.
+    """
+    seen: dict[Path | str, str] = {}
+    for path in (*paths, *unfitted):
+        file = Path(path)
+        keys: list[Path | str] = [file.resolve()]
+        with suppress(OSError):  # the reader says why it cannot be read
+            if file.is_file():
+                with file.open("rb") as content:
+                    keys.append(hashlib.file_digest(content, "sha256").hexdigest())
+        for key in keys:
+            if key in seen:
+                raise ConfigurationError(
+                    f"{seen[key]} and {path} are the same log; name each once in --log or"
+                    " --unfitted, since a log that was fitted tells nothing of other motions"
+                )
+        seen |= dict.fromkeys(keys, path)
 
 
 def _read(options: ServoOptions, path: str, load: Load | None, joint: str | None) -> ServoLog:
@@ -177,6 +215,14 @@ def _require_one_supply(logs: Sequence[ServoLog]) -> None:
         raise ConfigurationError(
             "some logs say their supply voltage and some do not; give it in all or in none"
         )
+
+
+def _volts(supply: float | None) -> str:
+    return "" if supply is None else f", {supply:.4g} V"
+
+
+def _width(half: float | None) -> str:
+    return "–" if half is None else f"± {half:.2g}"
 
 
 def _number(value: float | None, form: str) -> str:

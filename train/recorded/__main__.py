@@ -67,13 +67,14 @@ def main(
 
 def _print_servos(rows: list[dict[str, Any]], console: Console) -> None:
     """Errors of the servos' logs that were not fitted."""
-    keys = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
-    lines = [
-        [row["servo"], row["measure"], row["of"], *(f"{row[key]:.1f}" for key in keys)]
-        for row in rows
-    ]
+    keys = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad", "replay_all_mrad")
+    lines = []
+    for row in rows:
+        shown = [f"{row[key]:.1f}" if key in row else "–" for key in keys]
+        lines.append([row["servo"], row["measure"], row["of"], *shown])
     head = ["servo", "measure", "motion or gain", "goal", "offset", "line", "identified"]
-    title = "error of the angle in logs that were not fitted, rms [mrad]"
+    head.append("identified, torque off included")
+    title = "error of the angle in logs that were not fitted, torque on, rms [mrad]"
     console.print(make_table(title, head, lines, box=box.SIMPLE))
 
 

@@ -98,13 +98,18 @@ def num_fits() -> int:
 
 
 def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The errors as a table, `recorded_servos.csv`: replays of motions, and slow motion by gain."""
+    """The errors as a table, `recorded_servos.csv`: replays of motions, and slow motion by gain.
+
+    Rivals and `replay_mrad` are judged over the same rows, those with the torque on.
+    `replay_all_mrad` adds the rows with the torque off; slow motion has none.
+    """
     rows = []
     columns = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
     for motor, figure in figures.items():
         for part in figure["held_out"]:
-            errors = [error["rms_mrad"] for error in part["errors"][:-1]]
-            own = dict(zip(columns, [*errors, part["replay_mrad"]], strict=True))
+            errors = (error["rms_mrad"] for error in part["errors"])
+            own: dict[str, Any] = dict(zip(columns, errors, strict=True))
+            own["replay_all_mrad"] = part["replay_mrad"]
             of = ", ".join(part["motions"])
             rows.append({"servo": motor, "measure": "replay", "of": of, **own})
         for gain in figure["sag"]:

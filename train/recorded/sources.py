@@ -1,7 +1,7 @@
 """Where the recordings come from, and how a copy is fetched and checked."""
 
 import hashlib
-import urllib.error
+import http.client
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,7 +49,12 @@ class Source:
             raise ConfigurationError(
                 f"{copy} is not there; get it by --fetch, or by hand from {self.address(path)}"
             )
-        self._require(path, copy.read_bytes(), str(copy))
+        digest = hashlib.sha256(copy.read_bytes()).hexdigest()
+        if digest != self.files[path]:
+            raise ConfigurationError(
+                f"{copy} is not the file that was measured: SHA-256 {digest}, expected"
+                f" {self.files[path]}; delete it and fetch it anew"
+            )
         return copy
 
     def fetch(self, folder: Path, show: Callable[[str], None]) -> None:
@@ -71,19 +76,16 @@ class Source:
             try:
                 with urllib.request.urlopen(address, timeout=_WAIT_S) as answer:
                     content = answer.read(_MOST_BYTES)
-            except (urllib.error.URLError, TimeoutError) as error:
+            except (OSError, http.client.HTTPException) as error:
                 raise ConfigurationError(f"cannot fetch {address}: {error}") from None
-            self._require(path, content, address)
+            digest = hashlib.sha256(content).hexdigest()
+            if digest != self.files[path]:
+                raise ConfigurationError(
+                    f"what {address} sent is not the file that was measured: SHA-256 {digest},"
+                    f" expected {self.files[path]}; nothing was written, try again later"
+                )
             copy.parent.mkdir(parents=True, exist_ok=True)
             write_whole(copy, content)
-
-    def _require(self, path: str, content: bytes, where: str) -> None:
-        digest = hashlib.sha256(content).hexdigest()
-        if digest != self.files[path]:
-            raise ConfigurationError(
-                f"{where} is not the file that was measured: SHA-256 {digest}, expected"
-                f" {self.files[path]}; delete it and fetch it anew"
-            )
 
 
 JUSTIN = Source(
