@@ -1,5 +1,7 @@
 """Inputs whose checks a redrawing once moved or lost."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -10,8 +12,9 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.policy import NO_INPUTS
+from baselines.identification.servo_log import is_servo_log, read_servo_log
 from elastic_env.core.config import quantity
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.robots.robot.environment import EXAMPLE
 from elastic_env.robots.robot.joints import home_of_joints
@@ -81,3 +84,15 @@ def test_joints_that_are_no_mapping_are_refused() -> None:
     """Catches a traceback of a path."""
     with pytest.raises(ConfigurationError, match="joints must be a YAML file or a mapping"):
         gymnasium.make("elastic_env/Robot-v0", model=EXAMPLE, joints=5)
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.json", "log.parquet"])
+def test_a_pipe_in_the_place_of_a_log_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    """Catches a reader that opens a named pipe to see what kind of log it is."""
+    pipe = tmp_path / name
+    os.mkfifo(pipe)
+    if is_servo_log(pipe):
+        with pytest.raises((ConfigurationError, MissingExtraError)):
+            read_servo_log(pipe)
+    else:
+        assert pipe.suffix == ".csv"

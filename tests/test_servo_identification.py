@@ -269,11 +269,18 @@ def test_an_episode_of_lerobot_is_read(tmp_path: Path, monkeypatch: pytest.Monke
         }
     )
     monkeypatch.setattr(pd, "read_parquet", lambda path: table)
-    path = tmp_path / "log.parquet"
+    path = written(tmp_path)
     log = read_servo_log(path, LOAD, unit="deg", joint="1")
     np.testing.assert_allclose(log.position, columns["position"])
     with pytest.raises(ConfigurationError, match="2 joints"):
         read_servo_log(path, LOAD, unit="deg")
+
+
+def written(folder: Path) -> Path:
+    """A file in the place of an episode."""
+    path = folder / "log.parquet"
+    path.write_bytes(b"PAR1")
+    return path
 
 
 def with_units(goal: str, position: str) -> dict[str, Array]:
@@ -336,7 +343,7 @@ def test_another_joint_than_the_episode_has_is_refused(
     """Catches another joint that is read in its place."""
     episode(monkeypatch)
     with pytest.raises(ConfigurationError, match="--joints 0 to 1, got"):
-        read_servo_log(tmp_path / "log.parquet", LOAD, joint=joint)
+        read_servo_log(written(tmp_path), LOAD, joint=joint)
 
 
 BAD_CELLS: dict[str, tuple[list[object], str]] = {
@@ -356,7 +363,7 @@ def test_bad_episodes_are_refused_in_one_sentence(
     cells, said = BAD_CELLS[kind]
     episode(monkeypatch, **{"observation.state": cells})
     with pytest.raises(ConfigurationError, match=said) as caught:
-        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+        read_servo_log(written(tmp_path), LOAD, joint="1")
     assert "\n" not in str(caught.value)
 
 
@@ -365,7 +372,7 @@ def test_an_episode_without_rows_is_refused(
 ) -> None:
     episode(monkeypatch, **{"timestamp": [], "action": [], "observation.state": []})
     with pytest.raises(ConfigurationError, match="it has 0"):
-        read_servo_log(tmp_path / "log.parquet", LOAD, joint="1")
+        read_servo_log(written(tmp_path), LOAD, joint="1")
 
 
 def recorded_json(path: Path, **facts: object) -> Path:

@@ -3,6 +3,7 @@
 docs/identification.md describes the columns.
 """
 
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -120,6 +121,8 @@ def is_servo_log(path: Path) -> bool:
     if path.suffix.lower() in (".json", ".parquet"):
         return True
     try:
+        if not path.is_file():  # a named pipe would be waited for
+            return False
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             head = file.readline(10_000)
     except (OSError, ValueError):
@@ -477,7 +480,7 @@ def _read_parquet(path: Path, joint: str | None) -> _Content:
     import pandas as pd
 
     try:
-        table = pd.read_parquet(path)
+        table = pd.read_parquet(io.BytesIO(read_bounded(path, LARGEST_BYTES)))
     except ImportError:
         raise MissingExtraError(
             "reading parquet files needs the package pyarrow; install it with: pip install pyarrow"
