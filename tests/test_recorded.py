@@ -20,8 +20,6 @@ from train.recorded.justin import RecordedPoses, find_rigid, justin_spec, read_p
 from train.recorded.servos import servo_rows
 from train.recorded.sources import Source
 
-GENERATOR = np.random.default_rng(5)
-
 
 def craig(row: justin.Row, q: float) -> Array:
     """Rx(α) Tx(r) Rz(q + θ) Tz(d), written out."""
@@ -41,7 +39,7 @@ def craig(row: justin.Row, q: float) -> Array:
 
 def test_the_model_has_the_published_geometry() -> None:
     """Catches a row in another convention, and a length on the wrong side of its joint."""
-    q = GENERATOR.uniform(-1.0, 1.0, 11)
+    q = np.random.default_rng(5).uniform(-1.0, 1.0, 11)
     spec = justin_spec({"left": Rotation.identity()})
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -176,13 +174,14 @@ def test_shoulders_are_found_from_poses_alone() -> None:
     }
     model = justin_spec(turns).compile()
     data = mujoco.MjData(model)
-    theta = GENERATOR.uniform(-1.5, 1.5, (40, 18))
+    generator = np.random.default_rng(5)
+    theta = generator.uniform(-1.5, 1.5, (40, 18))
     measured = np.empty((40, 2, 3))
     for pose, q in enumerate(theta):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         measured[pose] = data.site_xpos
-    measured += GENERATOR.normal(0.0, 1e-4, measured.shape)
+    measured += generator.normal(0.0, 1e-4, measured.shape)
     poses = RecordedPoses(theta, measured)
     again = justin._problem(find_rigid(poses), poses, ("right", "left")).as_rigid()
     assert fit_geometry(again).noise_m == pytest.approx(1e-4, rel=0.3)

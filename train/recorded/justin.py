@@ -177,21 +177,22 @@ def _wxyz(rotation: Rotation) -> Array:
     return np.roll(rotation.as_quat(), 1)
 
 
-def find_shoulder(side: str, poses: RecordedPoses) -> Rotation:
-    """The rotation of a shoulder, among half turns, from which an arm alone fits best, rigid."""
+def find_shoulders(poses: RecordedPoses) -> dict[str, Rotation]:
+    """The rotations of the shoulders, among half turns, from which both arms fit best, rigid."""
+    turns = Rotation.create_group("D2")
+    pairs = [{"right": right, "left": left} for right in turns for left in turns]
 
-    def missed(rotation: Rotation) -> float:
-        spec = justin_spec({side: rotation})
-        fit = fit_geometry(_problem(spec, poses, (side,)).as_rigid())
-        return fit.noise_m
+    def missed(shoulders: dict[str, Rotation]) -> float:
+        problem = _problem(justin_spec(shoulders), poses, tuple(_MARKERS))
+        return fit_geometry(problem.as_rigid()).noise_m
 
-    return min(Rotation.create_group("D2"), key=missed)
+    return min(pairs, key=missed)
 
 
 def find_rigid(poses: RecordedPoses, mass_factors: Array = _AS_GUESSED) -> mujoco.MjSpec:
     """The robot with the shoulders and the places of the markers that fit poses best, rigid."""
     few = poses.of(np.arange(min(_POSES_OF_SEARCH, len(poses.theta))))
-    spec = justin_spec({side: find_shoulder(side, few) for side in _MARKERS}, mass_factors)
+    spec = justin_spec(find_shoulders(few), mass_factors)
     problem = _problem(spec, poses, tuple(_MARKERS)).as_rigid()
     return correct_model(spec, _tree(spec, problem.joints), fit_geometry(problem))
 
