@@ -38,7 +38,8 @@ def craig(row: justin.Row, q: float) -> Array:
 
 
 def test_the_model_has_the_published_geometry() -> None:
-    """Catches a row in another convention, and a length on the wrong side of its joint."""
+    """Catches a row in another convention, a length on the wrong side of its joint, and a mass
+    elsewhere than in the middle of its link."""
     q = np.random.default_rng(5).uniform(-1.0, 1.0, 11)
     spec = justin_spec({"left": Rotation.identity()})
     model = spec.compile()
@@ -55,6 +56,9 @@ def test_the_model_has_the_published_geometry() -> None:
         T = T @ craig(row, angle)
     hand = T @ [*justin._MARKERS["left"], 1.0]
     np.testing.assert_allclose(data.site("left_hand").xpos, hand[:3], atol=1e-12)
+    assert model.body_mass.sum() == pytest.approx(40.0 + 16.3)
+    for name, middle in (("torso_1", [0.15, 0.0, 0.0]), ("left_2", [0.0, 0.0, -0.2])):
+        np.testing.assert_allclose(model.body(name).ipos, middle, atol=1e-12)
 
 
 def table(poses: int) -> str:

@@ -118,7 +118,8 @@ class _Problem:
     def prior(self, p: Array) -> Array:
         """Deviations from what servos usually have, in standard deviations, (2,)."""
         volts = max(one.log.supply for one in self.replays)
-        limit, damping = p[_AT["torque_limit"]], p[_AT["motor_damping"]]
+        limit = p[_AT["torque_limit"]]
+        damping = p[_AT["motor_damping"]]
         speed = _NO_LOAD_SPEED
         if 0.0 < limit < 1e3 * self.scale[_AT["torque_limit"]] and damping > 0.0:
             speed = np.clip(limit * volts / damping, 0.1, 1e3)
@@ -127,7 +128,8 @@ class _Problem:
 
     def solve(self, z: Array, free: IntArray, evaluations: int) -> tuple[Array, float]:
         """Least squares over some of the parameters, from a start."""
-        low, high = self.lower[free], self.upper[free]
+        low = self.lower[free]
+        high = self.upper[free]
 
         def full(part: Array) -> Array:
             whole = z.copy()
@@ -261,7 +263,8 @@ def fit_servo(
             start[more] = _SATURATED * largest_pull(problem, best[0])
         trial = coarse.solve(start, np.append(free, more), 25)
         if _gain(coarse, best, trial) > _BETTER:
-            best, free = trial, np.append(free, more)
+            best = trial
+            free = np.append(free, more)
     z, _ = problem.solve(best[0], free, 40)
     say(STAGES)
     return _described(problem, tuple(logs), z, np.sort(free))
@@ -364,7 +367,8 @@ def _start(problem: _Problem, logs: Sequence[ServoLog]) -> Array:
     k g e − k c g e s σ − b w − B a − F s − d w − m g l o cos q = I a − τ(q), linear in k, k c, b,
     B, F, d and o, for the error e, the side s of motion and the side σ of the motor's torque.
     """
-    rows, right = [], []
+    rows = []
+    right = []
     for log in logs:
         w, a = log.derivatives()
         error = _drive(log, problem.duty)
@@ -530,7 +534,8 @@ def _gradient(problem: _Problem, z: Array, free: IntArray, r: Array) -> Array:
 
 def _blocks(logs: Sequence[ServoLog], seconds: float) -> IntArray:
     """Number of the block of each row over all logs, and one for each prior, (N,)."""
-    numbers, first = [], 0
+    numbers = []
+    first = 0
     for log in logs:
         own = ((log.time - log.time[0]) / seconds).astype(np.int64)
         numbers.append(first + own)

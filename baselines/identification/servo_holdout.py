@@ -108,7 +108,8 @@ def rivals(fitted: Sequence[ServoLog], log: ServoLog, *, slow: bool = False) -> 
     """
     own = [one for one in fitted if one.gain == log.gain and one.enabled.any()]
     own = own or [one for one in fitted if one.enabled.any()]
-    offset, line = 0.0, np.array([0.0, 1.0])
+    offset = 0.0
+    line = np.array([0.0, 1.0])
     if own:
         rows = [slow_rows(one) if slow else one.enabled for one in own]
         if not any(part.any() for part in rows):

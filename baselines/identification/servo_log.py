@@ -304,7 +304,8 @@ def require_usable(path: Path, log: ServoLog) -> None:
 
 
 def _require_plausible_goal(path: Path, log: ServoLog) -> None:
-    goal, position = log.goal[log.enabled], log.position[log.enabled]
+    goal = log.goal[log.enabled]
+    position = log.position[log.enabled]
     if np.ptp(goal) < _LEAST_MOTION and log.enabled.all():
         raise ConfigurationError(
             f"{path}: the goal is constant at {goal[0]:.3g} rad and tells nothing of the servo;"

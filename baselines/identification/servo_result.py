@@ -160,9 +160,9 @@ def _registers(logs: Sequence[ServoLog]) -> list[tuple[float, float]]:
 
 
 def _parameter(fit: ServoFit, name: str, supply: float) -> ServoParameter:
-    value, half = fit.value(name), fit.half(name)
-    if name in ("position_gain", "torque_limit"):
-        value, half = value * supply, half * supply
+    scale = supply if name in ("position_gain", "torque_limit") else 1.0
+    value = fit.value(name) * scale
+    half = fit.half(name) * scale
     is_known = name in fit.tied or bool(fit.sought[list(PARAMETERS).index(name)])
     if not is_known or not np.isfinite(value):
         return ServoParameter(

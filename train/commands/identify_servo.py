@@ -164,7 +164,8 @@ def verdict(held_out: ServoHoldout) -> str:
 
     A replay that goes wrong once the torque is off is named too.
     """
-    own, rival = held_out.errors[-1], held_out.best_rival
+    own = held_out.errors[-1]
+    rival = held_out.best_rival
     swing = ""
     if held_out.has_torque_off and held_out.replay_mrad > _MUCH_WORSE * rival.rms_mrad:
         swing = f"; with the torque off included the replay has {held_out.replay_mrad:.1f}"
