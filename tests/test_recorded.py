@@ -56,7 +56,7 @@ def test_the_model_has_the_published_geometry() -> None:
         T = T @ craig(row, angle)
     hand = T @ [*justin._MARKERS["left"], 1.0]
     np.testing.assert_allclose(data.site("left_hand").xpos, hand[:3], atol=1e-12)
-    assert model.body_mass.sum() == pytest.approx(40.0 + 16.3)
+    assert model.body_mass.sum() == pytest.approx(40.0 + 16.4)
     for name, middle in (("torso_1", [0.15, 0.0, 0.0]), ("left_2", [0.0, 0.0, -0.2])):
         np.testing.assert_allclose(model.body(name).ipos, middle, atol=1e-12)
 
