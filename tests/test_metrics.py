@@ -17,6 +17,7 @@ STATISTICS = {
     "min": np.min,
     "max": np.max,
     "peak": lambda x: np.abs(x).max(),
+    "last": lambda x: x[-1],
     "count": len,
 }
 METRICS = [Metric(f"x_{s}_rad", "x", s) for s in STATISTICS] + [  # type: ignore[arg-type]

@@ -65,6 +65,12 @@ INFO_KEYS = {
     "zmp_deviation",
     "zmp_deviation_x",
     "zmp_deviation_y",
+    "zmp_in_feet",
+    "zmp_in_feet_x",
+    "zmp_in_feet_y",
+    "foot_drift",
+    "foot_drift_x",
+    "foot_drift_y",
     "link_error",
     "link_error_lowest",
     "link_error_highest",
@@ -1185,6 +1191,7 @@ def statistic(name: str, values: Array) -> float:
         "min": np.min,
         "max": np.max,
         "mean": np.mean,
+        "last": lambda x: x[-1],
         "count": len,
     }[name](values)
 
@@ -1209,6 +1216,9 @@ def test_episode_metrics_are_those_of_the_recorded_signals(hard_walk: Recording)
         "double_loaded": walking & ~single & loaded,
         "single_loaded": single & loaded,
         "transition_loaded": transition & loaded,
+        # of one step both blocks are the whole walk
+        **{f"{block}_steps": walking for block in ("first", "last")},
+        **{f"{block}_steps_loaded": walking & loaded for block in ("first", "last")},
         "touchdown": end,
     }
     metrics = dict(hard_walk.results[-1][4]["episode_metrics"])
@@ -1230,7 +1240,8 @@ def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
     assert len(set(names)) == len(names)
     assert [name for name in names if not re.search("_(rad|rad_s|nm|m|s|share|count)$", name)] == []
     for metric in metrics:
-        if metric.signal.startswith(("pelvis", "zmp")) and metric.statistic != "count":
+        is_split = metric.signal.startswith(("pelvis", "zmp", "foot_drift"))
+        if is_split and metric.statistic not in ("count", "last"):
             phase = {"scored": "", "loaded": ""}.get(
                 metric.over, f"_{metric.over.removesuffix('_loaded')}"
             )
@@ -1246,6 +1257,10 @@ def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
     required |= {f"link_error_{s}_rad" for s in ("rms", "min", "max")}
     required |= {f"pelvis_error_{phase}_rms_rad" for phase in ("double", "single", "transition")}
     required |= {f"zmp_deviation_{phase}_rms_m" for phase in ("double", "single", "transition")}
+    for block in ("first_steps", "last_steps"):
+        required.add(f"pelvis_error_{block}_rms_rad")
+        for signal in ("zmp_deviation", "zmp_in_feet", "foot_drift"):
+            required.add(f"{signal}_{block}_rms_m")
     assert required <= set(names)
     others = {
         "link_error_rms_rad": ("link_error", "rms", "scored"),
@@ -1256,6 +1271,7 @@ def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
         "joint_torque_peak_nm": ("joint_torque", "peak", "all"),
         "early_touchdown_mean_s": ("early_touchdown", "mean", "touchdown"),
         "early_touchdown_max_s": ("early_touchdown", "max", "touchdown"),
+        "foot_drift_end_m": ("foot_drift", "last", "loaded"),
         "unloaded_samples_count": ("zmp_deviation", "count", "unloaded"),
         "command_rate_rms_rad_s": ("command_rate", "rms", "all"),
         "command_rate_peak_rad_s": ("command_rate", "peak", "all"),

@@ -51,6 +51,8 @@ class Gait(Model):
     """Last double support of a step [s]."""
     num_steps: int = quantity("1", 4, ge=1, le=1000)
     """Number of steps [1]."""
+    settling_steps: int = quantity("1", 0, ge=0)
+    """First steps, which are walked but not scored: ramps end in them [1]."""
     lift_m: float = quantity("m", 0.025, gt=0)
     """Height to which the swing foot is lifted [m]."""
     hip_height_m: float = quantity("m", 0.66, gt=0)
@@ -69,6 +71,15 @@ class Gait(Model):
     def duration_s(self) -> float:
         """Duration of the episode: the walk, and standing before and after it [s]."""
         return self.num_steps * self.step_period_s + 2.0 * STAND_S
+
+    @model_validator(mode="after")
+    def _some_step_is_scored(self) -> Self:
+        if self.settling_steps >= self.num_steps:
+            raise ValueError(
+                f"settling_steps must be less than num_steps = {self.num_steps}, so that a step is"
+                f" left to score, got {self.settling_steps}; take more steps"
+            )
+        return self
 
     @model_validator(mode="after")
     def _ramp_fits(self) -> Self:
@@ -116,20 +127,24 @@ class Timing:
 
     Attributes:
         time: Time from the start of the episode [s].
-        support: Support foot of the step, `LEFT` or `RIGHT`; before and after the walk that of the
-            next or last step.
+        step: Number of the step, from 0 on; before and after the walk that of the next or last
+            step.
+        support: Support foot of that step, `LEFT` or `RIGHT`.
         single: Whether the other foot is off the ground.
         swing: Progress of the swing, 0 to 1; 0 and 1 before and after it.
         transition: Within `TRANSITION_S` of a lift-off or touch-down.
-        walking: Whether it belongs to the walk, which is what is scored.
+        walking: Whether it belongs to the walk.
+        scored: The walk without its settling steps.
     """
 
     time: Array
+    step: IntArray
     support: IntArray
     single: BoolArray
     swing: Array
     transition: BoolArray
     walking: BoolArray
+    scored: BoolArray
 
 
 def step_timing(gait: Gait, control_period_s: float) -> Timing:
@@ -163,11 +178,13 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
+        step=of_walk,
         support=of_walk % 2,
         single=(within > 0) & (within < single),
         swing=swing,
         transition=walking & transition,
         walking=walking,
+        scored=walking & (of_walk >= gait.settling_steps),
     )
 
 

@@ -91,6 +91,28 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     return zmp.reshape(*shape[:-2], 2)
 
 
+def foot_drift(force: Array, ankle: Array, planned: Array) -> Array:
+    r"""Displacement of the feet that stand against the plan, in the ground plane.
+
+    .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
+
+    It is continuous, as the weights are. The ZMP minus d is the ZMP of the same wrenches on feet
+    that stand where they are planned.
+
+    Args:
+        force: Vertical force of the ground on each foot, (..., L) [N].
+        ankle: Positions of the ankles, (..., L, 3) [m].
+        planned: Where the plan has them, (..., L, 3) [m].
+
+    Returns:
+        d, (..., 2) [m]; nan where nothing is carried.
+    """
+    away = (ankle - planned)[..., :2]
+    carried = force.sum(axis=-1, keepdims=True)
+    weights = force / np.where(carried > 0.0, carried, np.nan)
+    return (weights[..., None] * away).sum(axis=-2)
+
+
 def _rows(values: Array, shape: tuple[int, ...], axes: int) -> Array:
     """Values of a shape with one row per robot: all but the last axes in one."""
     if values.shape != shape:

@@ -1,4 +1,4 @@
-"""Scores of an episode from the samples of its steps: RMS, peak, range, mean. One row per world."""
+"""Scores of an episode from the samples of its steps, such as RMS and peak. One row per world."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, Signals
 
-Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "count"]
+Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "last", "count"]
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,28 @@ def metrics_of(
     return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
 
 
-_FOLDS: dict[str, tuple[Callable[[Array], Array], np.ufunc, float]] = {
-    "rms": (np.square, np.add, 0.0),
-    "mean": (np.positive, np.add, 0.0),
-    "min": (np.positive, np.minimum, np.inf),
-    "max": (np.positive, np.maximum, -np.inf),
-    "peak": (np.abs, np.maximum, 0.0),
-    "count": (np.ones_like, np.add, 0.0),
+def _fold(join: np.ufunc) -> Callable[[Array], Array]:
+    """Join the values of steps in order, (num_rows, num_steps, num_worlds) to without steps."""
+    return lambda values: join.accumulate(values, axis=1)[:, -1].copy()
+
+
+def _last_known(values: Array) -> Array:
+    """The last value that is not nan, shapes as of `_fold`; nan where all are."""
+    back = (~np.isnan(values[:, ::-1])).argmax(axis=1)
+    row = values.shape[1] - 1 - back
+    return np.take_along_axis(values, row[:, None], axis=1)[:, 0]
+
+
+_FOLDS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array], float]] = {
+    "rms": (np.square, _fold(np.add), 0.0),
+    "mean": (np.positive, _fold(np.add), 0.0),
+    "min": (np.positive, _fold(np.minimum), np.inf),
+    "max": (np.positive, _fold(np.maximum), -np.inf),
+    "peak": (np.abs, _fold(np.maximum), 0.0),
+    "last": (np.positive, _last_known, np.nan),
+    "count": (np.ones_like, _fold(np.add), 0.0),
 }
-"""A function of every sample, how two of its values are joined, and what changes nothing, by
-statistic.
-"""
+"""A function of every sample, how its values are joined, and what changes nothing, by statistic."""
 
 
 class RunningStatistic:
@@ -68,7 +79,7 @@ class RunningStatistic:
         samples = np.where(sampled, self._function(values), self._neutral)
         self._count += sampled.sum(axis=1)
         steps = np.concatenate([self._total[:, None], samples], axis=1)
-        self._total = self._join.accumulate(steps, axis=1)[:, -1].copy()
+        self._total = self._join(steps)
 
     def values(self) -> Array:
         """The statistic of every row, (num_rows, num_worlds); nan without a sample."""

@@ -23,10 +23,10 @@ from elastic_env.world.robot_model import WalkerModel
 
 
 def support_changes(timing: Timing) -> IntArray:
-    """Control steps of a walk at which the support foot is another than a step before."""
+    """Scored control steps at which the support foot is another than a control step before."""
     changed = np.zeros(len(timing.support), dtype=np.bool_)
     changed[1:] = timing.support[1:] != timing.support[:-1]
-    return np.flatnonzero(changed & timing.walking)
+    return np.flatnonzero(changed & timing.scored)
 
 
 def tilt(R: Array) -> Array:

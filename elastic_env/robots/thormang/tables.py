@@ -91,21 +91,34 @@ PHASES = ("double", "single", "transition")
 and touch-down.
 """
 
+BLOCKS = ("first_steps", "last_steps")
+"""Masks of the first and of the last `BLOCK_STEPS` scored steps of the walk."""
+BLOCK_STEPS = 4
+
 _PELVIS = ("pelvis_roll", "pelvis_pitch", "pelvis_error")
 _ZMP = ("zmp_deviation", "zmp_deviation_x", "zmp_deviation_y")
+_PARTS_OF_ZMP = (
+    *("zmp_in_feet", "zmp_in_feet_x", "zmp_in_feet_y"),
+    *("foot_drift", "foot_drift_x", "foot_drift_y"),
+)
 
 
 def _metrics_of_the_body() -> Iterator[Metric]:
     for signal in _PELVIS:
         yield from metrics_of(signal, "rad", "rms", "peak")
-    for signal in _ZMP:
+    for signal in (*_ZMP, *_PARTS_OF_ZMP):
         yield from metrics_of(signal, "m", "rms", "peak", over="loaded")
+    yield Metric("foot_drift_end_m", "foot_drift", "last", over="loaded")
     for phase in PHASES:
         for signal in _PELVIS:
             yield Metric(f"{signal}_{phase}_rms_rad", signal, "rms", phase)
     for phase in PHASES:
         for signal in _ZMP:
             yield Metric(f"{signal}_{phase}_rms_m", signal, "rms", f"{phase}_loaded")
+    for block in BLOCKS:
+        yield Metric(f"pelvis_error_{block}_rms_rad", "pelvis_error", "rms", block)
+        for signal in ("zmp_deviation", "zmp_in_feet", "foot_drift"):
+            yield Metric(f"{signal}_{block}_rms_m", signal, "rms", f"{block}_loaded")
 
 
 METRICS = (

@@ -39,6 +39,10 @@ positions are in the plan's world frame, x forward, y to the left:
 | `zmp_reference_x`, `zmp_reference_y` | m | planned |
 | `zmp_deviation` | m | distance to the plan; nan likewise |
 | `zmp_deviation_x`, `zmp_deviation_y` | m | its parts, measured − planned |
+| `foot_drift` | m | displacement of the feet against the plan, by their shares of the force; nan likewise |
+| `foot_drift_x`, `foot_drift_y` | m | its parts |
+| `zmp_in_feet` | m | distance of the ZMP to the plan, were the feet where they are planned; nan likewise |
+| `zmp_in_feet_x`, `zmp_in_feet_y` | m | its parts, `zmp_deviation` − `foot_drift` |
 | `link_error` | rad | rms of q_ref − q over the twelve joints |
 | `link_error_lowest`, `link_error_highest` | rad | smallest and largest of them |
 | `deflection` | rad | rms of δ = θ − q over the joints |
@@ -83,7 +87,7 @@ from elastic_env.robots.thormang.config import (
 )
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.ground_contact import FootSensors, foot_drift
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.sensors import InertialSensor, is_due
@@ -237,9 +241,9 @@ class WalkTask(Task):
         self._draw_imu(world, generator)
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
-        """Time and direction of the push, in the walk."""
-        walking = np.flatnonzero(self.plan.timing.walking)
-        ends = (walking[0], walking[-1] + 1)
+        """Time and direction of the push, in the steps that are scored."""
+        scored = np.flatnonzero(self.plan.timing.scored)
+        ends = (scored[0], scored[-1] + 1)
         self._push_begin[world] = random.draw_trial(lambda own: own.integers(*ends))
         direction = random.draw_trial(lambda own: own.uniform(0.0, 2.0 * np.pi))
         unit = np.array([np.cos(direction), np.sin(direction), 0.0])
@@ -310,6 +314,9 @@ class WalkTask(Task):
         deflection = joints["theta"] - joints["q"]
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
+        drift = foot_drift(truth["force"], truth["ankles"], plan.ankles[row])
+        drift[np.isnan(deviation)] = np.nan
+        in_feet = deviation - drift
         return {
             "time_s": truth["step"] * self.config.control_period_s,
             "pelvis_roll": truth["roll"].copy(),
@@ -323,6 +330,12 @@ class WalkTask(Task):
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
             "zmp_deviation_x": deviation[:, 0],
             "zmp_deviation_y": deviation[:, 1],
+            "zmp_in_feet": np.hypot(in_feet[:, 0], in_feet[:, 1]),
+            "zmp_in_feet_x": in_feet[:, 0],
+            "zmp_in_feet_y": in_feet[:, 1],
+            "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
+            "foot_drift_x": drift[:, 0],
+            "foot_drift_y": drift[:, 1],
             "link_error": rms(error),
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
@@ -340,13 +353,14 @@ class WalkTask(Task):
         }
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
-        """Masks of the walk, without standing, of its phases, and where there is a ZMP."""
+        """Masks of the scored steps, of their phases and blocks, and where there is a ZMP."""
         truth = sample.worlds["truth"]
         loaded = ~np.isnan(truth["zmp"][:, 0])
         phases = self._phases[:, self._plan_row(truth)]
-        names = [f"{name}_loaded" for name in tables.PHASES]
+        parts = (*tables.PHASES, *tables.BLOCKS)
+        names = [f"{name}_loaded" for name in parts]
         return {
-            **dict(zip(["scored", *tables.PHASES, "touchdown"], phases, strict=True)),
+            **dict(zip(["scored", *parts, "touchdown"], phases, strict=True)),
             **dict(zip(["loaded", *names], phases[:-1] & loaded, strict=True)),
             "unloaded": phases[0] & ~loaded,
         }
@@ -364,7 +378,7 @@ class WalkTask(Task):
 
 def _joint_plan(walk: WalkPlan, *_: Any) -> Plan:
     """A walk plan as the joints' reference, the same in all episodes."""
-    scored = walk.timing.walking
+    scored = walk.timing.scored
     nowhere = np.full(len(scored), -1, dtype=np.int64)
     return Plan(walk.q, walk.q_dot, walk.q_ddot, scored, nowhere)
 
@@ -389,14 +403,17 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
 
 
 def _phase_rows(plan: WalkPlan) -> BoolArray:
-    """The walk, its phases as in `PHASES`, and the planned touch-downs, by control step."""
+    """Scored steps, as in `PHASES` and `BLOCKS`, and planned touch-downs, by control step."""
     timing = plan.timing
     single = timing.single
     touchdown = np.zeros_like(single)
     touchdown[1:] = single[:-1] & ~single[1:]
     all_of_it = np.ones_like(single)
-    phases = np.stack([all_of_it, ~single, single, timing.transition, touchdown])
-    return timing.walking & phases
+    gait = plan.gait
+    first = timing.step < gait.settling_steps + tables.BLOCK_STEPS
+    last = timing.step >= gait.num_steps - tables.BLOCK_STEPS
+    of_walk = (all_of_it, ~single, single, timing.transition)
+    return timing.scored & np.stack([*of_walk, first, last, touchdown])
 
 
 def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001
