@@ -30,6 +30,8 @@ SCENARIOS = [
     "slope",
     "push",
     "imu",
+    "foot_sensors",
+    "slip",
     "drawn",
     "soft+backlash",
 ]

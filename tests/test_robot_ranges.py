@@ -17,7 +17,13 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import DrawnRobot, RobotRanges, draw_robots, latin_hypercube
+from elastic_env.core.robot_ranges import (
+    FOOT_ERRORS,
+    DrawnRobot,
+    RobotRanges,
+    draw_robots,
+    latin_hypercube,
+)
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import static_deflection
 from elastic_env.robots.thormang import config as walk_config
@@ -86,6 +92,7 @@ def is_within(ranges: RobotRanges, robot: DrawnRobot) -> bool:
         (ranges.homing_rad, robot.homing_rad),
         (ranges.mounting_rad, robot.mounting_rad),
         (ranges.slope_rad, robot.slope_rad),
+        *((getattr(ranges, name), getattr(robot, name)) for name in FOOT_ERRORS),
     ]
     is_unpushed = robot.push_n == 0.0 and (ranges.push_share < 1.0 or ranges.push_n[0] == 0.0)
     if not is_unpushed:

@@ -1640,7 +1640,7 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         (
             {"gait": 3.0},
             (
-                r"gait must be a mapping of lift_m, hip_height_m, transfer, got 3\.0; see also"
+                r"gait must be a mapping of lift_m, hip_height_m, transfer, settling_steps, got 3\.0; see also"
                 r" step_period"
             ),
         ),

@@ -5,6 +5,7 @@ motion is drawn, the motion. A trial is what does not: noise, pushes. `reset(opt
 s})` begins a trial of the robot that `reset(seed=s)` draws, under noise of its own.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -34,6 +35,14 @@ class EpisodeRandom:
         """
         drawn = draw(self.robot)
         return drawn if self.trial is None else draw(self.trial)
+
+    def fork(self) -> np.random.Generator:
+        """A generator of its own for more of the robot, which leaves all other draws as they are.
+
+        A robot's is the same in all its trials.
+        """
+        ahead = copy.deepcopy(self.robot)
+        return np.random.default_rng([int(ahead.integers(2**63)), 1])
 
     def noise(self) -> np.random.Generator:
         """A generator of its own for noise."""

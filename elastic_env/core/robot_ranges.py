@@ -21,6 +21,18 @@ from elastic_env.core.signals import Array
 Interval: TypeAlias = tuple[float, float]
 """Lowest and highest value, both included."""
 
+FOOT_ERRORS = (
+    "force_bias_n",
+    "moment_bias_nm",
+    "force_drift_n_s",
+    "moment_drift_nm_s",
+    "cross_talk",
+)
+"""Errors of the feet's force-torque sensors, see `elastic_env.world.foot_sensors`."""
+CROSS_TALK_ENTRIES = 30
+"""Of a foot's sensor: six axes on the five others."""
+_OF_BOTH_FEET = dict.fromkeys(FOOT_ERRORS, 6) | {"cross_talk": 2 * CROSS_TALK_ENTRIES}
+
 
 def interval(unit: str, nominal: float, bounds: Interval) -> Any:
     """An interval of a `Model`.
@@ -72,6 +84,17 @@ class RobotRanges(Model):
     """Share of the robots whose measurements are one control step old [1]."""
     inertial_share: float = quantity("1", 0.0, ge=0, le=1)
     """Share of the robots whose IMU computes its attitude [1]."""
+    force_bias_n: Interval = interval("N", 0.0, bounds=(-1000, 1000))
+    """Bias of a foot's force sensor, of every foot and axis its own [N]."""
+    moment_bias_nm: Interval = interval("N·m", 0.0, bounds=(-100, 100))
+    """Bias of its moments, likewise [N·m]."""
+    force_drift_n_s: Interval = interval("N/s", 0.0, bounds=(-100, 100))
+    """Rate at which the bias of its forces changes, likewise [N/s]."""
+    moment_drift_nm_s: Interval = interval("N·m/s", 0.0, bounds=(-10, 10))
+    """Rate at which the bias of its moments changes, likewise [N·m/s]."""
+    cross_talk: Interval = interval("1", 0.0, bounds=(-1, 1))
+    """Share of the full scale of an axis that shows on another one, of every foot and pair of axes
+    its own [1]."""
 
     @model_validator(mode="after")
     def _intervals_are_in_order(self) -> Self:
@@ -86,8 +109,8 @@ class RobotRanges(Model):
         return self
 
     def on_fixed_base(self) -> Self:
-        """The same without what only a walker has: load and push on the torso, floor, its IMU."""
-        of_walkers = ("load_", "slope_rad", "push_n", "inertial_share")
+        """The same without what only a walker has: load, push, floor, its IMU and its feet."""
+        of_walkers = ("load_", "slope_rad", "push_n", "inertial_share", *FOOT_ERRORS)
         fields = type(self).model_fields
         left_out = [name for name in fields if name.startswith(of_walkers)]
         return self.replace(**{name: fields[name].default for name in left_out})
@@ -110,6 +133,9 @@ class DrawnRobot:
         slope_direction_rad: Direction in which the floor rises [rad].
         is_delayed: True if measurements are one control step old.
         is_inertial: True if the IMU computes its attitude.
+        force_bias_n, moment_bias_nm, force_drift_n_s, moment_drift_nm_s: Of left and right foot,
+            three axes each.
+        cross_talk: Of left and right foot, by rows of their matrices without the diagonals [1].
     """
 
     stiffness: tuple[float, ...]
@@ -127,14 +153,27 @@ class DrawnRobot:
     push_n: float = 0.0
     is_delayed: bool = False
     is_inertial: bool = False
+    force_bias_n: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["force_bias_n"]
+    moment_bias_nm: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["moment_bias_nm"]
+    force_drift_n_s: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["force_drift_n_s"]
+    moment_drift_nm_s: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["moment_drift_nm_s"]
+    cross_talk: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["cross_talk"]
 
     def record(self) -> dict[str, float]:
         """The robot in figures, by name with unit, for the records of episodes."""
         roll, pitch = self.mounting_rad
-        homing_rad = np.sqrt(np.mean(np.square(self.homing_rad)))
+        rms = {
+            name: np.sqrt(np.mean(np.square(getattr(self, name))))
+            for name in ("homing_rad", *FOOT_ERRORS)
+        }
         of_several = {
             "stiffness": {"stiffness": np.mean(self.stiffness)},
-            "homing_rad": {"homing_rms_rad": homing_rad},
+            "homing_rad": {"homing_rms_rad": rms["homing_rad"]},
+            "force_bias_n": {"force_bias_rms_n": rms["force_bias_n"]},
+            "moment_bias_nm": {"moment_bias_rms_nm": rms["moment_bias_nm"]},
+            "force_drift_n_s": {"force_drift_rms_n_s": rms["force_drift_n_s"]},
+            "moment_drift_nm_s": {"moment_drift_rms_nm_s": rms["moment_drift_nm_s"]},
+            "cross_talk": {"cross_talk_rms": rms["cross_talk"]},
             "mounting_rad": {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch},
         }
         return {
@@ -188,8 +227,10 @@ def _draw(
     ranges: RobotRanges, number: int, joints: int, seed: Sequence[int]
 ) -> Iterator[DrawnRobot]:
     """Robots of one set of ranges."""
-    width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2}
-    names = [*RobotRanges.model_fields, "slope_direction"]
+    width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2, **_OF_BOTH_FEET}
+    names = [name for name in RobotRanges.model_fields if name not in FOOT_ERRORS]
+    # in this order, so that the draws of the first stay as they were
+    names += ["slope_direction", *FOOT_ERRORS]
     unit: dict[str, Array] = {}
     for index, name in enumerate(names):
         generator = np.random.default_rng([*seed, index])
@@ -203,6 +244,7 @@ def _draw(
     for i in range(number):
         is_pushed = unit["push_share"][i, 0] < ranges.push_share
         roll, pitch = drawn["mounting_rad"][i].tolist()
+        feet: dict[str, Any] = {name: tuple(drawn[name][i].tolist()) for name in FOOT_ERRORS}
         yield DrawnRobot(
             stiffness=tuple(stiffness[i].tolist()),
             homing_rad=tuple(drawn["homing_rad"][i].tolist()),
@@ -212,4 +254,5 @@ def _draw(
             is_delayed=bool(unit["delay_share"][i, 0] < ranges.delay_share),
             is_inertial=bool(unit["inertial_share"][i, 0] < ranges.inertial_share),
             **{name: float(drawn[name][i, 0]) for name in _OF_ONE},
+            **feet,
         )

@@ -523,6 +523,9 @@ def measure(
             for i in range(3):
                 error = noise.wrench[foot, part, i] * sigma.wrench[foot, part, i]
                 shown.wrench[foot, part, i] = error + row.wrench[foot, part, i]
+    if walker.bias[world].has_foot_errors:
+        seconds = row.step * step.rules[step.kind[world]].control_period_s
+        add_foot_errors(walker.bias[world], row.wrench, seconds, shown.wrench)
     if not imu_is_due or show_inertial(inertial, walker, step, world):
         return
     bias = walker.bias[world].imu_attitude
@@ -533,6 +536,27 @@ def measure(
         )
     for i in range(3):
         shown.imu_rate[i] = noise.imu_rate[i] * sigma.imu_rate[i] + row.pelvis_rate[i]
+
+
+@compiled
+def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> None:
+    """Add bias, drift and cross-talk of the feet's sensors, see `elastic_env.world.foot_sensors`.
+
+    Args:
+        bias: Errors of the world.
+        wrench: True wrench, (2, 2, 3) [N], [N·m].
+        seconds: Since the start of the episode [s].
+        shown: To be added to, as `wrench`.
+    """
+    for foot in range(2):
+        for row in range(6):
+            part = row // 3
+            i = row % 3
+            error = bias.wrench[foot, part, i] + seconds * bias.wrench_rate[foot, part, i]
+            for column in range(6):
+                share = bias.cross_talk[foot, row, column]
+                error += share * wrench[foot, column // 3, column % 3]
+            shown[foot, part, i] += error
 
 
 @compiled

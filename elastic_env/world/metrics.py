@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -32,26 +33,26 @@ def metrics_of(
     return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
 
 
-def _fold(join: np.ufunc) -> Callable[[Array], Array]:
-    """Join the values of steps in order, (num_rows, num_steps, num_worlds) to without steps."""
-    return lambda values: join.accumulate(values, axis=1)[:, -1].copy()
+def _join(join: np.ufunc, values: Array) -> Array:
+    """Values joined in the order of their steps, (num_rows, num_steps, num_worlds)."""
+    return join.accumulate(values, axis=1)[:, -1].copy()
 
 
 def _last_known(values: Array) -> Array:
-    """The last value that is not nan, shapes as of `_fold`; nan where all are."""
+    """The last value that is not nan, of those that `_join` takes; nan where all are."""
     back = (~np.isnan(values[:, ::-1])).argmax(axis=1)
     row = values.shape[1] - 1 - back
     return np.take_along_axis(values, row[:, None], axis=1)[:, 0]
 
 
 _FOLDS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array], float]] = {
-    "rms": (np.square, _fold(np.add), 0.0),
-    "mean": (np.positive, _fold(np.add), 0.0),
-    "min": (np.positive, _fold(np.minimum), np.inf),
-    "max": (np.positive, _fold(np.maximum), -np.inf),
-    "peak": (np.abs, _fold(np.maximum), 0.0),
+    "rms": (np.square, partial(_join, np.add), 0.0),
+    "mean": (np.positive, partial(_join, np.add), 0.0),
+    "min": (np.positive, partial(_join, np.minimum), np.inf),
+    "max": (np.positive, partial(_join, np.maximum), -np.inf),
+    "peak": (np.abs, partial(_join, np.maximum), 0.0),
     "last": (np.positive, _last_known, np.nan),
-    "count": (np.ones_like, _fold(np.add), 0.0),
+    "count": (np.ones_like, partial(_join, np.add), 0.0),
 }
 """A function of every sample, how its values are joined, and what changes nothing, by statistic."""
 

@@ -3,6 +3,10 @@
 Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` (the paper's robot:
 friction, sensor noise, encoder counts), and changes on top of either. A change alone is meant on
 top of `nominal`; `ideal+soft` puts it on `ideal`, and changes can be joined: `soft+payload`.
+
+[AndradeChavez2019] F. J. Andrade Chavez, S. Traversaro, D. Pucci, "Six-Axis Force Torque Sensor
+Model-Based In Situ Calibration Method and Its Impact in Floating-Based Robot Dynamic Performance",
+Sensors 19(24), 5521.
 """
 
 import math
@@ -13,7 +17,7 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.robot_ranges import DrawnRobot, RobotRanges
+from elastic_env.core.robot_ranges import FOOT_ERRORS, DrawnRobot, RobotRanges
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
@@ -44,6 +48,8 @@ class Scenario(Model):
     """Walker: duration of the push [s]."""
     slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5)
     """Walker: slope of the floor, direction drawn [rad]."""
+    floor_friction: float | None = quantity("1", None, gt=0)
+    """Walker: friction of soles and floor, None for that of the robot [1]."""
     encoder_counts: bool = True
     """True if the encoders have whole counts."""
     encoder_bias_rad: float = quantity("rad", 0.0, ge=0)
@@ -62,6 +68,17 @@ class Scenario(Model):
     """Walker: standard deviation of the foot forces [N]."""
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0)
     """Walker: standard deviation of the foot moments [N·m]."""
+    force_bias_n: float = quantity("N", 0.0, ge=0)
+    """Walker: half-width of a bias of the foot forces, of every foot and axis its own [N]."""
+    moment_bias_nm: float = quantity("N·m", 0.0, ge=0)
+    """Walker: the same of the foot moments [N·m]."""
+    force_drift_n_s: float = quantity("N/s", 0.0, ge=0)
+    """Walker: half-width of the rate at which the bias of the forces changes [N/s]."""
+    moment_drift_nm_s: float = quantity("N·m/s", 0.0, ge=0)
+    """Walker: the same of the moments [N·m/s]."""
+    cross_talk: float = quantity("1", 0.0, ge=0, le=1)
+    """Walker: half-width of the share of the full scale of an axis of a foot sensor that shows on
+    another one [1]."""
     sensor_noise: float = quantity("1", 0.0, ge=0)
     """Factor on the errors of further sensors [1]."""
     delay_steps: int = quantity("control steps", 0, ge=0, le=1)
@@ -122,8 +139,8 @@ class Scenario(Model):
         That is in joints, offsets of sensors, push or slope.
         """
         spreads = (self.imu.bias_spread_rad, self.pelvis_imu.bias_spread_rad)
-        drawn = (self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad)
-        return bool(self.ranges) or self.inertial is not None or any(drawn + spreads)
+        drawn = [getattr(self, name) for name in _DRAWN]
+        return bool(self.ranges) or self.inertial is not None or any([*drawn, *spreads])
 
     @property
     def is_random(self) -> bool:
@@ -139,7 +156,7 @@ class Scenario(Model):
         return max([self.encoder_bias_rad, *drawn])
 
 
-_DRAWN = ("stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad")
+_DRAWN = ("stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad", *FOOT_ERRORS)
 _LEFT_TO_RANGES = (*_DRAWN, "inertial", "delay_steps")
 """Parameters that `RobotRanges` has, too, for each robot its own."""
 
@@ -152,6 +169,17 @@ _GYRO_NOISE_RAD_S = 1.0e-3
 # an assumption for the six-axis sensors of the feet, whose data were not found
 _FORCE_NOISE_N = 1.0
 _MOMENT_NOISE_NM = 0.05
+# assumptions: a six-axis sensor as it is sold is accurate to 2 % of 200 N and 8 N·m (RealMan), that
+# is 4 N and 0.16 N·m. THORMANG3 tares its feet in the air (thormang3_feet_ft_module), and from then
+# on the temperature of strain gauges makes them drift [AndradeChavez2019]: 1.2 N a minute. Good
+# sensors have up to 2 % of the full scale in cross-talk
+_FOOT_ERRORS = {
+    "force_bias_n": 5.0,
+    "moment_bias_nm": 0.15,
+    "force_drift_n_s": 0.02,
+    "moment_drift_nm_s": 0.0006,
+    "cross_talk": 0.01,
+}
 # an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
 _HOMING_ERROR_RAD = 2e-3
 
@@ -188,6 +216,8 @@ CHANGES: dict[str, ScenarioChange] = {
     "imu": lambda _: {"inertial": InertialSensor(), "delay_steps": 1},
     "push": lambda _: {"push_n": 50.0},
     "slope": lambda _: {"slope_rad": math.radians(1.0)},
+    "foot_sensors": lambda _: _FOOT_ERRORS,
+    "slip": lambda _: {"floor_friction": 0.3},
 }
 """Parameters that a change sets on its ground."""
 
@@ -232,7 +262,7 @@ DISTRIBUTIONS: dict[str, ScenarioChange] = {
 that have one quantity beyond these."""
 
 
-WALKER_FIELDS = ("push_n", "slope_rad")
+WALKER_FIELDS = ("push_n", "slope_rad", "floor_friction", *FOOT_ERRORS)
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(
     name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS}

@@ -133,8 +133,10 @@ class WalkConfig(TaskConfig):
     @property
     def true_robot(self) -> Thormang:
         """The robot as the plant has it."""
-        load_kg = self.robot.torso_load_kg + self.scenario.torso_load_kg
-        return self.robot.replace(torso_load_kg=load_kg)
+        scenario = self.scenario
+        load_kg = self.robot.torso_load_kg + scenario.torso_load_kg
+        friction = scenario.floor_friction or self.robot.friction
+        return self.robot.replace(torso_load_kg=load_kg, friction=friction)
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""

@@ -53,6 +53,11 @@ BIAS = record_type(
     ("imu_attitude", REAL, 2),  # of mounting [rad]
     ("gyro", REAL, 3),
     ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
+    # of the feet's sensors, as in `elastic_env.world.foot_sensors`
+    ("has_foot_errors", np.bool_),
+    ("wrench", REAL, _FEET_WRENCH),  # [N], [N·m]
+    ("wrench_rate", REAL, _FEET_WRENCH),  # [N/s], [N·m/s]
+    ("cross_talk", REAL, (2, 6, 6)),
 )
 """Errors that are drawn per episode."""
 

@@ -87,6 +87,7 @@ from elastic_env.robots.thormang.config import (
 )
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
+from elastic_env.world.foot_sensors import foot_errors
 from elastic_env.world.ground_contact import FootSensors, foot_drift
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
@@ -239,6 +240,9 @@ class WalkTask(Task):
         fit = (kind, robot.is_delayed, robot.is_inertial)
         self._kind[world] = self._fits.index(fit)
         self._draw_imu(world, generator)
+        errors = foot_errors(kind.config.scenario, robot, random.fork())
+        for name, values in errors.items():
+            bias[name][world] = values
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
         """Time and direction of the push, in the steps that are scored."""

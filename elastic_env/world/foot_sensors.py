@@ -1,0 +1,67 @@
+r"""Errors of the six-axis force-torque sensors of the feet, beside their noise.
+
+A foot's sensor shows its wrench w = (f, n) with a constant bias b, a drift of rate d, and
+cross-talk:
+
+.. math:: w_{shown} = w + b + d \, t + S C S^{-1} w
+
+C has zeros on its diagonal. Its other entries are shares of the full scale, as data sheets have
+them: that many of the range of one axis show at full load on another one. S holds the ranges of the
+axes, of which only the ratio of moments to forces counts.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
+from elastic_env.core.signals import Array
+from elastic_env.world.scenario import Scenario
+
+_RANGE_RATIO_M = 0.04
+"""Range of the moments over that of the forces [m]: 8 N·m over 200 N of a six-axis sensor as it is
+sold (RealMan), 120 N·m over 2800 N of the name of an ATI Mini58-SI-2800-120."""
+
+
+def cross_talk_matrix(shares: Array) -> Array:
+    """S C S⁻¹ of one sensor.
+
+    Args:
+        shares: Entries of C beside its diagonal by rows, (..., 30) [1].
+
+    Returns:
+        (..., 6, 6); rows and columns are forces, then moments [1], [m], [1/m].
+    """
+    matrix = np.zeros((*shares.shape[:-1], 6, 6))
+    matrix[..., ~np.eye(6, dtype=np.bool_)] = shares
+    ranges = np.repeat([1.0, _RANGE_RATIO_M], 3)
+    return matrix * ranges[:, None] / ranges
+
+
+def foot_errors(
+    scenario: Scenario, robot: DrawnRobot, generator: np.random.Generator
+) -> dict[str, Any]:
+    """Errors of both feet's sensors in an episode: the robot's, and those the scenario draws.
+
+    Args:
+        scenario: Its half-widths.
+        robot: What it was drawn with.
+        generator: Of nothing else.
+
+    Returns:
+        Fields of the walker's record `BIAS`.
+    """
+    drawn: dict[str, Array] = {}
+    for name in FOOT_ERRORS:
+        own = np.array(getattr(robot, name))
+        drawn[name] = own + getattr(scenario, name) * generator.uniform(-1.0, 1.0, len(own))
+    force, moment, force_rate, moment_rate = (
+        drawn[name].reshape(2, 3) for name in FOOT_ERRORS if name != "cross_talk"
+    )
+    shares = drawn["cross_talk"].reshape(2, CROSS_TALK_ENTRIES)
+    return {
+        "has_foot_errors": any(values.any() for values in drawn.values()),
+        "wrench": np.stack([force, moment], axis=1),
+        "wrench_rate": np.stack([force_rate, moment_rate], axis=1),
+        "cross_talk": cross_talk_matrix(shares),
+    }
