@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
 from elastic_env.core.signals import Array
 from elastic_env.world.scenario import Scenario
@@ -38,23 +39,23 @@ def cross_talk_matrix(shares: Array) -> Array:
     return matrix * ranges[:, None] / ranges
 
 
-def foot_errors(
-    scenario: Scenario, robot: DrawnRobot, generator: np.random.Generator
-) -> dict[str, Any]:
+def foot_errors(scenario: Scenario, robot: DrawnRobot, random: EpisodeRandom) -> dict[str, Any]:
     """Errors of both feet's sensors in an episode: the robot's, and those the scenario draws.
 
     Args:
         scenario: Its half-widths.
         robot: What it was drawn with.
-        generator: Of nothing else.
+        random: Of the episode; all other draws stay as they are.
 
     Returns:
         Fields of the walker's record `BIAS`.
     """
-    drawn: dict[str, Array] = {}
-    for name in FOOT_ERRORS:
-        own = np.array(getattr(robot, name))
-        drawn[name] = own + getattr(scenario, name) * generator.uniform(-1.0, 1.0, len(own))
+    drawn = {name: np.array(getattr(robot, name)) for name in FOOT_ERRORS}
+    widths = {name: getattr(scenario, name) for name in FOOT_ERRORS}
+    if any(widths.values()):
+        generator = random.fork()
+        for name, width in widths.items():
+            drawn[name] += width * generator.uniform(-1.0, 1.0, len(drawn[name]))
     force, moment, force_rate, moment_rate = (
         drawn[name].reshape(2, 3) for name in FOOT_ERRORS if name != "cross_talk"
     )

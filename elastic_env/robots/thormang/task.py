@@ -240,7 +240,7 @@ class WalkTask(Task):
         fit = (kind, robot.is_delayed, robot.is_inertial)
         self._kind[world] = self._fits.index(fit)
         self._draw_imu(world, generator)
-        errors = foot_errors(kind.config.scenario, robot, random.fork())
+        errors = foot_errors(kind.config.scenario, robot, random)
         for name, values in errors.items():
             bias[name][world] = values
 
