@@ -99,12 +99,8 @@ class WalkSignals(LearnedSignals):
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
         """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
-        missing = asked[:, self._zmp] - self.measured_zmp(seen)
+        missing = asked[:, self._zmp] - self._feet.zmp(seen)
         return np.hstack([seen[:, self._attitude], missing])
-
-    def measured_zmp(self, seen: Array) -> Array:
-        """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
-        return self._feet.zmp(seen)
 
     @override
     def offsets(self, table: Array) -> Array:

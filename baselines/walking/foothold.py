@@ -1,9 +1,10 @@
-r"""Foothold correction: each foot lands where the plan has it, by the forces that closed legs carry.
+r"""Foothold correction: feet land where the plan has them, by the forces that closed legs carry.
 
-A robot on elastic joints puts its foot down beside its foothold: the joints of the standing leg give
-way under the load. Encoders and IMU do not show by how much. Once both feet stand, the legs and the
-ground close a chain, whose springs pull the feet to where the joints are commanded. The ground
-holds the feet apart by friction, so that a landing error e shows as a pair of horizontal forces,
+A robot on elastic joints puts its foot down beside its foothold: the joints of the standing leg
+give way under the load. Encoders and IMU do not show by how much. Once both feet stand, the legs
+and the ground close a chain, whose springs pull the feet to where the joints are commanded. The
+ground holds the feet apart by friction, so that a landing error e shows as a pair of horizontal
+forces,
 
 .. math:: e = p_l - p_r - (p_l - p_r)_{plan} = C \, \tfrac12 (f_l - f_r) + o_l - o_r
 
@@ -12,9 +13,9 @@ the feet that are commanded. It adds up to where the feet are, from landing to l
 
 .. math:: P_{landed} = P_{standing} \pm e
 
-An error of C, or a constant one of e, does not add up: left and right take turns, and their signs
-with them. The next swing is offset by −P − b, where P is the place of the foot that stands and b the
-error with which this foot landed before. While the foot takes over the load, its offset goes.
+A constant error of e does not add up: left and right take turns, and their signs with them. The
+next swing is offset by −P − b, where P is the place of the foot that stands and b the error with
+which this foot landed before. While the foot takes over the load, its offset goes.
 """
 
 from typing import Any, NamedTuple

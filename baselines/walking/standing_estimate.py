@@ -20,7 +20,7 @@ from typing_extensions import override
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.world.robot_model import WalkerModel
 
@@ -51,7 +51,7 @@ class StandingMemory(NamedTuple):
         inner: Memory of the policy.
     """
 
-    steps: Array
+    steps: IntArray
     total: Array
     inner: Any
 
@@ -74,8 +74,8 @@ class StandingEstimate(PolicyAround):
         steps = round(STAND_S / model.control_period_s) - self._samples
         waiting = np.zeros(self._samples)
         self._ramp = np.concatenate([waiting, minimum_jerk(np.arange(steps + 1) / steps)])
-        self._scale = np.array([gains.zmp_x, gains.zmp_y])
-        self._pitch_scale = np.array([gains.pitch_m_rad, 0.0])
+        per_mean = np.array([[gains.zmp_x, 0.0], [0.0, gains.zmp_y], [gains.pitch_m_rad, 0.0]])
+        self._per_total = per_mean / self._samples
         self._constant = np.array([gains.constant_m, 0.0])
         self._limit = gains.limit_m
 
@@ -88,15 +88,14 @@ class StandingEstimate(PolicyAround):
     def act(self, rows: Array, memory: StandingMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
         total = memory.total
-        rests = memory.steps < self._samples
-        if rests.any():
-            shown = np.column_stack([self._feet.zmp_error(rows), rows[:, self._pitch]])
-            total = total + np.where(rests[:, None], shown, 0.0)
         steps = memory.steps + 1
-        mean = total / self._samples
-        error = self._scale * mean[:, :2] + self._pitch_scale * mean[:, 2:] + self._constant
-        ramp = self._ramp.take(steps, mode="clip")[:, None]
-        shift = ramp * np.clip(-error, -self._limit, self._limit)
+        rests = steps <= self._samples
+        if np.count_nonzero(rests) > 0:
+            shown = np.column_stack([self._feet.zmp_error(rows), rows[:, self._pitch]])
+            total = total + rests[:, None] * shown
+        error = total @ self._per_total + self._constant
+        shift = np.minimum(np.maximum(-error, -self._limit), self._limit)
+        shift *= self._ramp.take(steps, mode="clip")[:, None]
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, StandingMemory(steps, total, inner)

@@ -18,9 +18,9 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from baselines.walking.flat_feet import FlatFeet
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -63,7 +63,8 @@ class ZmpOffset(PolicyAround):
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
         error = self._feet.zmp_error(rows)
-        shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
+        shift = memory.shift - self._rate * error
+        shift = np.minimum(np.maximum(shift, -self._limit), self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, ZmpOffsetMemory(shift, inner)
