@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from baselines.identification import servo_fit
-from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
+from baselines.identification.servo_file import AngleUnit
+from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_holdout import (
     PREDICTIONS,
     LogErrors,
@@ -23,7 +24,8 @@ from baselines.identification.servo_holdout import (
     judge_servo,
 )
 from baselines.identification.servo_load import GRAVITY, Load
-from baselines.identification.servo_log import AngleUnit, ServoLog, read_servo_log
+from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_problem import drive, duty_per_torque_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
@@ -513,7 +515,7 @@ def test_the_start_limits_the_torque_where_the_replay_does() -> None:
     _, logs = short_logs(5)
     log = replace(logs[0], supply=12.0)
     duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
-    torque = 1e-3 * servo_fit._drive(log, duty)
+    torque = 1e-3 * drive(log, duty)
     pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
     limit = 1e-3 * duty * log.supply
     np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from baselines.identification.servo_fit import USUAL_LOSS, ServoFit
+from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_holdout import ServoHoldout
 from baselines.identification.servo_log import ServoLog
+from baselines.identification.servo_problem import USUAL_LOSS
 from baselines.identification.servo_replay import PARAMETERS
 from elastic_env.core.config import Model
 from elastic_env.core.yaml_text import yaml_line

@@ -8,10 +8,11 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 
+from baselines.identification.servo_file import AngleUnit, is_servo_log
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
-from baselines.identification.servo_log import AngleUnit, ServoLog, is_servo_log, read_servo_log
+from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError
