@@ -15,14 +15,21 @@ from baselines.identification.geometry_fit import (
 )
 from baselines.identification.geometry_model import GeometryModel, Parameters
 from baselines.identification.geometry_result import correct_model, describe_geometry
-from baselines.identification.holdout import FITTED, HeldOut, HeldOutError, judge, split
+from baselines.identification.holdout import (
+    FITTED,
+    HeldOut,
+    HeldOutError,
+    Judged,
+    judge,
+    split,
+)
 from baselines.identification.pose_log import read_log, write_poses
 from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.links import Tree
 from train.commands.cli import main
-from train.commands.identify_geometry import verdict
+from train.commands.held_out import verdict
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base" pos="0 0 0.3">
 <joint name="pan" axis="0 0 1" range="-2 2" limited="true"/>
@@ -207,7 +214,7 @@ def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
             geometry, weight=scale * geometry.weight, weight_moment=scale * geometry.weight_moment
         )
         own = GeometryProblem(scaled, problem.theta, problem.measured, JOINTS, "dh", JOINTS)
-        errors.append(judge(own, parts, 0, lambda done: None).errors[-1].rms_mm)
+        errors.append(judge(Judged.of_geometry(own), parts, 0, lambda done: None).errors[-1].rms)
     assert np.ptp(errors) < 0.1 * errors[1]
 
 
@@ -239,11 +246,11 @@ def test_a_rival_that_is_ahead_comes_first(own: float, first: str) -> None:
     """Catches a table that hides that regression does better."""
     errors = [("rigid", 18.0), ("kernel regression", 16.0), (FITTED, own)]
     held_out = HeldOut(
+        of="markers",
+        unit="mm",
         poses=10,
         held_out=10,
-        errors=tuple(
-            HeldOutError(name=name, rms_mm=rms, mean_mm=rms, worst_mm=rms) for name, rms in errors
-        ),
+        errors=tuple(HeldOutError(name=name, rms=rms, mean=rms, worst=rms) for name, rms in errors),
         curve=(),
     )
     assert verdict(held_out).startswith(first)
@@ -295,10 +302,23 @@ def test_a_marker_has_three_columns(tmp_path: Path, columns: list[str], message:
         read_log(path, {"pan": (-2.0, 2.0)})
 
 
-def test_too_few_poses_for_a_split_are_said() -> None:
-    """Catches an error of two poses that looks like evidence."""
-    with pytest.raises(ConfigurationError, match=r"12 poses leave 4 .*--holdout 0"):
-        split(12, share=0.3, folds=1, seed=0)
+@pytest.mark.parametrize(
+    ("count", "folds", "said"),
+    [
+        (12, 1, "12 poses leave 8 to fit and 4 to hold out, 10 and 10 are needed; log more poses"),
+        (9, 3, "9 poses leave 6 to fit and 9 to hold out"),
+        (20, 5, ""),
+        (12, 20, ""),
+    ],
+)
+def test_too_few_poses_for_a_split_are_said(
+    geometry: GeometryModel, count: int, folds: int, said: str
+) -> None:
+    """Catches an error of two poses that looks like evidence, and folds judged one by one."""
+    judged = Judged.of_geometry(made_up(geometry, 7, count=count, noise_m=3e-4)[0])
+    parts = split(count, share=0.3, folds=folds, seed=0)
+    assert judged.too_few(parts).startswith(said)
+    assert bool(judged.too_few(parts)) == bool(said)
 
 
 def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
@@ -318,7 +338,7 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4)
     parts = split(40, share=0.3, folds=4, seed=0)
     assert sorted(np.concatenate(parts)) == list(range(40))
-    held_out = judge(problem, parts, 0, lambda done: None)
+    held_out = judge(Judged.of_geometry(problem), parts, 0, lambda done: None)
     assert held_out.held_out == 40
     assert held_out.is_ahead
     assert [point.poses for point in held_out.curve] == [15, 30]

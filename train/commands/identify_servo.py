@@ -25,7 +25,7 @@ from train.runs.progress import show_progress
 
 
 class ServoOptions(Model):
-    """Options of `elastic identify` for logs in time of one servo."""
+    """Logs in time of one servo: its load, and what the logs do not say."""
 
     mass_kg: float | None = quantity("kg", None, gt=0)
     """Mass of a pendulum on the servo, whose logs have time, goal and position [kg]."""
