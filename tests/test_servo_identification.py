@@ -33,7 +33,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
-from train.commands.identify_servo import show_result, verdict
+from train.commands.identify_servo import fitted_logs, show_result, verdict
 from train.recorded.servos import servo_figures
 
 MASS_KG, LENGTH_M = 0.5, 0.1
@@ -606,9 +606,9 @@ def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
         (["--robot", "arm.xml"], "--joints"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "one to fit"),
         (["copy.csv", "--mass-kg", "0.5", "--lever-m", "0.1"], "the same log"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "one to fit"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.002"], "holds out 0"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.9"], "fits 20 rows"),
     ],
@@ -627,6 +627,20 @@ def test_options_that_do_not_go_together_are_refused(
         main(["identify", "--log", str(path), *options])
     assert ended.value.code == 2
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["./b.csv", "copy.csv"])
+def test_a_log_that_is_named_twice_is_left_out_of_the_fit(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a log that is fitted and judged, by another path or as a copy."""
+    monkeypatch.chdir(tmp_path)
+    for file, gain in (("a.csv", 1.0), ("b.csv", 2.0), ("copy.csv", 2.0)):
+        csv_of(tmp_path / file, **good(), gain=np.full(len(good()["time"]), gain))
+    said = StringIO()
+    console = Console(file=said, width=200)
+    assert fitted_logs(["a.csv", "b.csv"], [name], console) == ["a.csv"]
+    assert said.getvalue() == "not fitted, as --unfitted says: b.csv\n"
 
 
 def test_a_log_that_is_not_there_is_named(
