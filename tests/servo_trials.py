@@ -2,19 +2,23 @@
 
 Every trial is a servo of known parameters that plays three motions: two sweeps at two gains, and
 a lift whose torque is taken off. The truth is played at a hundredth of the fit's step, and read by
-an encoder of 4096 counts a turn with noise.
+an encoder of 4096 counts a turn with noise. Writes docs/results/servo_coverage.csv; some minutes.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import tyro
 
 from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_load import Load
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import NAMES, Replay
 from elastic_env.core.signals import Array
+from train.runs.escaping import write_records
 
 SOUGHT = (
     "position_gain",
@@ -29,6 +33,8 @@ SOUGHT = (
 """Parameters that every trial has and that the logs tell."""
 COUNT_RAD = 2.0 * np.pi / 4096
 NOISE_RAD = 1e-3
+SMALLEST = 1e-3
+"""Value that a half-width is relative to at least, in the unit of the parameter."""
 
 
 def draw_servo(rng: np.random.Generator) -> Array:
@@ -95,22 +101,37 @@ def holds(fit: ServoFit, truth: Array) -> dict[str, bool]:
     }
 
 
-def main(trials: int = 100) -> None:
-    """Print how many of the intervals hold the truth, and their median half-width."""
-    counts: dict[str, int] = dict.fromkeys(SOUGHT, 0)
-    widths: dict[str, list[float]] = {name: [] for name in SOUGHT}
+def records(trials: int) -> Iterator[dict[str, Any]]:
+    """Rows of the table, one per parameter."""
+    held: list[dict[str, bool]] = []
+    widths: list[dict[str, float]] = []
     for seed in range(trials):
         rng = np.random.default_rng(seed)
         truth = draw_servo(rng)
         fit = fit_servo(make_logs(truth, rng))
-        for name, held in holds(fit, truth).items():
-            counts[name] += held
-            widths[name].append(fit.half(name) / max(abs(truth[NAMES.index(name)]), 1e-3))
+        held.append(holds(fit, truth))
+        sizes = np.maximum(np.abs(truth), SMALLEST)
+        widths.append({name: fit.half(name) / sizes[NAMES.index(name)] for name in SOUGHT})
         if seed % 10 == 9:
-            print(seed + 1, counts, flush=True)
+            print(f"{seed + 1} servos", flush=True)
     for name in SOUGHT:
-        print(f"{name}: {counts[name]} of {trials}, ± {100 * np.median(widths[name]):.2g} %")
+        yield {
+            "parameter": name,
+            "trials": trials,
+            "holds": sum(own[name] for own in held),
+            "half_width_median": f"{np.median([own[name] for own in widths]):.4g}",
+        }
+
+
+def main(trials: int = 100) -> None:
+    """Write how many of the intervals hold the truth, and their median half-width.
+
+    Args:
+        trials: Servos.
+    """
+    folder = Path(__file__).parents[1] / "docs" / "results"
+    print(f"wrote {write_records(list(records(trials)), folder / 'servo_coverage.csv')}")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

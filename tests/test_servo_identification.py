@@ -28,13 +28,14 @@ from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_problem import drive, duty_per_torque_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
+from docs.pages.recorded import priors, slow_beside_swings
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
 from train.commands.identify_servo import fitted_logs, show_result, verdict
-from train.recorded.servos import servo_figures
+from train.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 
 MASS_KG, LENGTH_M = 0.5, 0.1
 WEIGHT = MASS_KG * GRAVITY * LENGTH_M
@@ -755,6 +756,14 @@ def test_figures_of_recorded_servos_are_made(tmp_path: Path) -> None:
     assert [row["gain"] for row in figures["xl330"]["sag"]] == [100.0, 400.0]
     assert all(row["identified"] < row["the goal itself"] for row in figures["xl330"]["sag"])
     assert (tmp_path / "sts3250.png").exists()
+    rows = servo_rows(figures)
+    measures = [(row["servo"], row["measure"]) for row in rows]
+    assert measures.count(("xl330", "replay from other starts")) == len(FURTHER_SEEDS)
+    assert ("xl330", "replay without priors") in measures
+    assert ("sts3250", "slow, driven motions alone fitted") in measures
+    texts = [{name: str(value) for name, value in row.items()} for row in rows]
+    assert priors(texts).startswith("* **Priors.**")
+    assert slow_beside_swings(texts).startswith("* **`lift and drop`")
 
 
 def _recording(path: Path, motor: str, gain: float, name: str) -> None:

@@ -82,6 +82,8 @@ def fit_servo(
     progress: Callable[[int], None] | None = None,
     seed: int = 0,
     starts: int = STARTS,
+    *,
+    priors: bool = True,
 ) -> ServoFit:
     """Estimate the parameters of a servo.
 
@@ -90,6 +92,7 @@ def fit_servo(
         progress: Called with the number of finished stages, of `STAGES`.
         seed: Seed of the further starts.
         starts: Number of starts, against local minima.
+        priors: Whether the usual loss of gears and the usual no-load speed count.
 
     Raises:
         ElasticError: No parameters replay the logs better than a joint that stands still.
@@ -108,7 +111,7 @@ def fit_servo(
         found.append(coarse.solve(start, free, 25))
         say(count + 1)
     best = min(found, key=lambda pair: pair[1])
-    weight = _deviation(coarse, best[0])
+    weight = _deviation(coarse, best[0]) if priors else _LEAST_WEIGHT
     coarse = replace(coarse, weight=weight)
     found = [coarse.solve(z, free, 20) for z, _ in found]
     best = min(found, key=lambda pair: pair[1])
