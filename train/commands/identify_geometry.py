@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
+import numpy as np
 from rich import box
 from rich.console import Console
 
@@ -13,7 +14,7 @@ from baselines.identification.geometry_fit import (
     align_tracker,
     fit_geometry,
 )
-from baselines.identification.geometry_model import Geometry, GeometryModel
+from baselines.identification.geometry_model import AxialTorques, Geometry, GeometryModel
 from baselines.identification.geometry_result import (
     GeometryIdentification,
     correct_model,
@@ -125,8 +126,20 @@ def pose_problem(
         lateral=options.lateral,
         priors=options.priors,
         free=options.free,
+        axial=_axial(log),
     )
     return problem, tree
+
+
+def _axial(log: PoseLog) -> AxialTorques | None:
+    """Sides of approach and known torques of a log; None where it has neither."""
+    if log.direction is None and log.known is None:
+        return None
+    nothing = np.zeros_like(log.theta)
+    return AxialTorques(
+        direction=nothing if log.direction is None else log.direction,
+        known=nothing if log.known is None else log.known,
+    )
 
 
 def show_result(result: GeometryIdentification, console: Console) -> None:
@@ -134,14 +147,19 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     if result.held_out is not None:
         show_held_out(result.held_out, console)
     rows = []
+    friction = {one.name: one for one in result.parameters if one.kind == "friction"}
     for joint in result.joints:
         stiffness = _number(joint.stiffness_nm_per_rad).replace("inf", "rigid")
         ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
         rows.append([joint.joint, stiffness, *map(_number, ends)])
+        if friction:
+            own = friction.get(joint.joint)
+            rows[-1].append(_number(own.value if own is not None and own.is_told else None))
     noise = f"{result.noise_mm:.2f} mm"
     console.print(f"unexplained: {noise} in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"
-    console.print(make_table(title, ["joint", "K", "from", "to"], rows, box=box.SIMPLE))
+    head = ["joint", "K", "from", "to", *["F [N·m]"] * bool(friction)]
+    console.print(make_table(title, head, rows, box=box.SIMPLE))
     if result.numbers < len(result.parameters):
         console.print(
             f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
