@@ -29,16 +29,19 @@ SOUGHT = (
     "viscous_friction",
     "zero_offset",
     "delay",
+    "switch_lead",
 )
 """Parameters that every trial has and that the logs tell."""
 COUNT_RAD = 2.0 * np.pi / 4096
 NOISE_RAD = 1e-3
+STEP_S = 5e-3
+"""Time between rows, within which the torque is switched [s]."""
 SMALLEST = 1e-3
 """Value that a half-width is relative to at least, in the unit of the parameter."""
 
 
 def draw_servo(rng: np.random.Generator) -> Array:
-    """Parameters of a small servo, as in `NAMES`, (12,)."""
+    """Parameters of a small servo, as in `NAMES`, (13,)."""
     values: dict[str, float] = dict.fromkeys(NAMES, 0.0)
     values |= {
         "position_gain": rng.uniform(1.5e-3, 4e-3),
@@ -51,11 +54,12 @@ def draw_servo(rng: np.random.Generator) -> Array:
         "stribeck_speed": 0.3,
         "zero_offset": rng.uniform(-0.02, 0.02),
         "delay": rng.uniform(0.002, 0.02),
+        "switch_lead": rng.uniform(0.0, STEP_S),
     }
     return np.array([values[name] for name in NAMES])
 
 
-def make_logs(truth: Array, rng: np.random.Generator, step_s: float = 5e-3) -> list[ServoLog]:
+def make_logs(truth: Array, rng: np.random.Generator, step_s: float = STEP_S) -> list[ServoLog]:
     """Logs of three motions of a servo."""
     return [_record(log, truth, rng) for log in _motions(step_s)]
 
@@ -85,10 +89,11 @@ def _record(log: ServoLog, truth: Array, rng: np.random.Generator) -> ServoLog:
         gain=log.gain,
         load=log.load,
     )
-    # the torque goes off at the row that says so
-    at = np.minimum(np.searchsorted(log.time, fine + 1e-12, side="right") - 1, len(log.time) - 1)
+    told = fine + truth[NAMES.index("switch_lead")] + 1e-12
+    at = np.minimum(np.searchsorted(log.time, told, side="right") - 1, len(log.time) - 1)
     dense = replace(dense, enabled=log.enabled[at])
-    q = Replay.of(dense).play(truth)[::100][: len(log.time)]
+    at_once = np.where(np.array(NAMES) == "switch_lead", 0.0, truth)
+    q = Replay.of(dense).play(at_once)[::100][: len(log.time)]
     q = q + NOISE_RAD * rng.normal(size=len(q))
     return replace(log, position=np.round(q / COUNT_RAD) * COUNT_RAD)
 

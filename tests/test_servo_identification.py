@@ -28,7 +28,7 @@ from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_problem import drive, duty_per_torque_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
-from docs.pages.recorded import priors, slow_beside_swings
+from docs.pages.recorded import priors
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
@@ -733,6 +733,24 @@ def test_each_gain_is_that_of_its_own_supply() -> None:
     assert "torque_limit at 7.4 V" in shown
 
 
+def test_a_torque_that_is_switched_before_its_row_is_replayed_so() -> None:
+    """A lead of a whole row is the row before; half a row lies between, as a fall has it."""
+    log = log_of(np.full(40, 1.0 + WEIGHT * np.sin(1.0) / 5.0), start=1.0, step_s=0.02)
+    late = replace(log, enabled=np.arange(40) < 20)
+    early = replace(log, enabled=np.arange(40) < 19)
+    own = parameters(position_gain=5.0, rotor_inertia=1e-3, motor_damping=0.05)
+    lead = NAMES.index("switch_lead")
+    played = {}
+    for share in (0.0, 0.5, 1.0):
+        own[lead] = share * 0.02
+        played[share] = Replay.of(late).play(own)
+    own[lead] = 0.0
+    np.testing.assert_allclose(played[1.0], Replay.of(early).play(own), atol=1e-12)
+    fallen = {share: played[share][19] - played[share][20] for share in played}
+    assert fallen[0.0] == pytest.approx(0.0, abs=1e-6)
+    assert fallen[0.5] == pytest.approx(fallen[1.0] / 4.0, rel=0.1)
+
+
 @pytest.mark.slow
 def test_intervals_hold_the_truth() -> None:
     """Few of many; `python -m tests.servo_trials` makes 100."""
@@ -760,10 +778,8 @@ def test_figures_of_recorded_servos_are_made(tmp_path: Path) -> None:
     measures = [(row["servo"], row["measure"]) for row in rows]
     assert measures.count(("xl330", "replay from other starts")) == len(FURTHER_SEEDS)
     assert ("xl330", "replay without priors") in measures
-    assert ("sts3250", "slow, driven motions alone fitted") in measures
     texts = [{name: str(value) for name, value in row.items()} for row in rows]
     assert priors(texts).startswith("* **Priors.**")
-    assert slow_beside_swings(texts).startswith("* **`lift and drop`")
 
 
 def _recording(path: Path, motor: str, gain: float, name: str) -> None:

@@ -50,9 +50,9 @@ class ServoFit:
 
     Attributes:
         logs: What was fitted.
-        values: Estimates, as in `NAMES`, (12,).
-        half_width: Of their 95 % intervals, nan for those that were not sought, (12,).
-        sought: Those that the fit moved, (12,).
+        values: Estimates, as in `NAMES`, (13,).
+        half_width: Of their 95 % intervals, nan for those that were not sought, (13,).
+        sought: Those that the fit moved, (13,).
         tied: Names that follow from others, with the reason.
         rms: Of the replay at the fitted logs [rad].
     """

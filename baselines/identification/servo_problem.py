@@ -37,6 +37,8 @@ _MOVING = 0.05
 _MOST_ROWS = 600
 _COARSE_S = 3.4e-3
 _DELAY_S = 0.06
+_LEAD_SCALE_S = 0.01
+_LONGEST_LEAD_S = 0.2  # where nothing is switched
 _LEAST_TORQUE = 1e-9
 _FEWEST_IN_PART = 5
 _FEWEST_AT_LIMIT = 20
@@ -52,8 +54,8 @@ class ServoProblem:
 
     Attributes:
         replays: Logs to replay.
-        scale: Units of the parameters, (12,).
-        lower, upper: Bounds of the parameters in these units, (12,).
+        scale: Units of the parameters, (13,).
+        lower, upper: Bounds of the parameters in these units, (13,).
         duty: T/k, where the logs tell it [rad].
         split_damping: Whether the logs tell viscous friction apart from the back-EMF.
         weight: Of a prior's deviation among the residuals; 0 for no priors.
@@ -96,6 +98,7 @@ class ServoProblem:
             "stribeck_speed": 0.3,
             "zero_offset": 0.02,
             "delay": 0.01,
+            "switch_lead": _LEAD_SCALE_S,
         }
         bounds = dict.fromkeys(NAMES, (0.0, 1e3)) | {
             "torque_limit": (0.0, 1e9),
@@ -103,6 +106,7 @@ class ServoProblem:
             "stribeck_speed": (0.05, 10.0),
             "zero_offset": (-10.0, 10.0),
             "delay": (0.0, _DELAY_S / 0.01),
+            "switch_lead": (0.0, _shortest_gap(logs) / _LEAD_SCALE_S),
         }
         lower, upper = np.transpose([bounds[name] for name in NAMES])
         return cls(
@@ -154,6 +158,8 @@ class ServoProblem:
             names += ["position_gain", "motor_damping", "delay"]
         if self.split_damping:
             names.append("viscous_friction")
+        if any(len(_switches(log)) for log in self.logs):
+            names.append("switch_lead")
         if any(log.load.torque > 0.0 for log in self.logs):
             names.append("zero_offset")
         return np.sort([AT[name] for name in names])
@@ -250,6 +256,17 @@ def prepare(log: ServoLog, longest_s: float = STEP_S) -> Replay:
     return Replay.of(log, 0.0, float(np.mean(log.position[:FIRST_ROWS])), longest_s)
 
 
+def _switches(log: ServoLog) -> IntArray:
+    """Rows before which the torque is switched."""
+    return 1 + np.flatnonzero(np.diff(log.enabled))
+
+
+def _shortest_gap(logs: Sequence[ServoLog]) -> float:
+    """Time from the row before a switch of the torque to that after it, the shortest one [s]."""
+    gaps = [np.diff(log.time)[_switches(log) - 1] for log in logs]
+    return float(np.concatenate(gaps).min(initial=_LONGEST_LEAD_S))
+
+
 def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
     """T/k, limit of the torque over the position gain, from logged PWM [rad]; None if unknown.
 
@@ -276,7 +293,7 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
 
 
 def regress(problem: ServoProblem) -> Array:
-    """Parameters that solve the equation of motion where the joint moves, in their scales, (12,).
+    """Parameters that solve the equation of motion where the joint moves, in their scales, (13,).
 
     k g e − k c g e s σ − b w − B a − F s − d w − m g l o cos q = I a − τ(q), linear in k, k c, b,
     B, F, d and o, for the error e, the side s of motion and the side σ of the motor's torque.

@@ -12,8 +12,11 @@ F = F₀ + c |τ_J| + F_s exp(−(ω/ω_s)²). A DC motor under a voltage that t
 
 where V is the supply's voltage, k the position gain for one volt and one unit of the register g, T
 the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque
-enabled τ_m is zero, and the rotor's inertia stays. At rest friction balances whatever is not above
-F. So a joint at rest tells a band of torques, and motion tells the torque.
+enabled τ_m is zero, and the rotor's inertia stays. A program that switches the torque, then reads
+the angle, logs the switch up to a row late: the torque changes a lead before the row.
+
+At rest friction balances whatever is not above F. So a joint at rest tells a band of torques, and
+motion tells the torque.
 """
 
 from dataclasses import dataclass
@@ -22,7 +25,7 @@ import numpy as np
 
 from baselines.identification.servo_log import ServoLog
 from elastic_env.core.compiled import compiled
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array
 
 PARAMETERS = {
     "position_gain": "N·m/rad",
@@ -37,6 +40,7 @@ PARAMETERS = {
     "stribeck_speed": "rad/s",
     "zero_offset": "rad",
     "delay": "s",
+    "switch_lead": "s",
 }
 """Parameters of a servo with their units.
 
@@ -83,7 +87,7 @@ class Replay:
         return Replay(log, (angle, speed), middle, known)
 
     def play(self, parameters: Array) -> Array:
-        """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (12,)."""
+        """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (13,)."""
         log = self.log
         goal = np.interp(self.middle - parameters[11], log.time, log.goal)
         load = log.load
@@ -93,12 +97,25 @@ class Replay:
             np.diff(log.time),
             goal,
             self.known,
-            log.enabled,
+            self._share_on(parameters[12]),
             np.array([*self.start, log.gain, log.supply, load.torque, load.rest, inertia]),
             np.ascontiguousarray(parameters, dtype=np.float64),
             out,
         )
         return out
+
+    def _share_on(self, lead: float) -> Array:
+        """Share of each step in which the torque is on, (N − 1, s).
+
+        It is switched a lead before the first row that says so, at most a row before [s].
+        """
+        step = np.diff(self.log.time)[:, None]
+        count = self.middle.shape[1]
+        enabled = self.log.enabled.astype(np.float64)
+        before, after = enabled[:-1, None], enabled[1:, None]
+        # part of each step that lies beyond the switch
+        beyond = np.clip(np.arange(1, count + 1) - count * (1.0 - lead / step), 0.0, 1.0)
+        return before + (after - before) * beyond
 
 
 @compiled
@@ -106,7 +123,7 @@ def _play(
     steps: Array,
     goal: Array,
     known: Array,
-    enabled: BoolArray,
+    on: Array,
     setting: Array,
     p: Array,
     out: Array,
@@ -126,14 +143,12 @@ def _play(
     substeps = goal.shape[1]
     for k in range(len(steps)):
         h = steps[k] / substeps
-        b = p[2] if enabled[k] else 0.0
         for j in range(substeps):
             left = h
+            b = p[2] * on[k, j]
             if w != 0.0:
                 middle = q + 0.5 * h * w
-                pull = 0.0
-                if enabled[k]:
-                    pull = min(max(gain * (goal[k, j] - middle), -limit), limit)
+                pull = on[k, j] * min(max(gain * (goal[k, j] - middle), -limit), limit)
                 other = known[k, j] - setting[4] * np.sin(middle - setting[5] - p[10])
                 F = p[5]
                 if p[8] > 0.0:
@@ -149,9 +164,7 @@ def _play(
                 q += 0.5 * w * stop
                 w = 0.0
                 left = h - stop
-            pull = 0.0
-            if enabled[k]:
-                pull = min(max(gain * (goal[k, j] - q), -limit), limit)
+            pull = on[k, j] * min(max(gain * (goal[k, j] - q), -limit), limit)
             other = known[k, j] - setting[4] * np.sin(q - setting[5] - p[10])
             needed = pull + other
             if abs(needed) > at_rest + p[6] * abs(pull):

@@ -95,18 +95,6 @@ def slow_motion(rows: Rows) -> str:
     return _servo_table("gain, slow motion, not fitted", own, {})
 
 
-def slow_beside_swings(rows: Rows) -> str:
-    """What the motion that swings costs the driven motions of the STS3250."""
-    own = {row["measure"]: float(row["replay_mrad"]) for row in rows if row["servo"] == "sts3250"}
-    apart = own["slow, driven motions alone fitted"]
-    together = own["slow, driven motions"]
-    return (
-        "* **`lift and drop` costs the STS3250 accuracy.** Left out of all fits, slow motion of"
-        f" the other three has {apart:.1f} mrad, and otherwise {together:.1f}. One\n"
-        "  friction does not fit the free swing and the driven motion.\n"
-    )
-
-
 def priors(rows: Rows) -> str:
     """What priors and starts change of the first motions of the XL330."""
     own = [row for row in rows if row["servo"] == "xl330"]
@@ -146,6 +134,7 @@ _PARAMETERS = {
     "viscous_friction": "viscous friction",
     "zero_offset": "zero offset",
     "delay": "delay",
+    "switch_lead": "lead of a switched torque",
 }
 _ALL_ROWS = "identified, torque off included"
 _PREDICTIONS = {

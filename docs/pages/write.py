@@ -218,7 +218,6 @@ PARTS: Mapping[str, Part] = {
     "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
     "replays of recorded servos": _of(recorded.replays, "recorded_servos"),
     "recorded servos in slow motion": _of(recorded.slow_motion, "recorded_servos"),
-    "recorded servos beside swings": _of(recorded.slow_beside_swings, "recorded_servos"),
     "priors of recorded servos": _of(recorded.priors, "recorded_servos"),
     "coverage of a servo": _of(recorded.coverage, "servo_coverage"),
     "recorded in short": _of(recorded.in_short, "recorded_justin"),

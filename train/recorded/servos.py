@@ -26,8 +26,6 @@ STS3250_LEFT_OUT = (("up_and_down",), ("sin_sin",), ("lift_and_drop",), ("sin_ti
 """Motions of the STS3250 that are left out in turn; the last is faster than those that are left."""
 FURTHER_SEEDS = (1, 2, 3)
 """Seeds of further starts of the first fit of the XL330."""
-SWINGING = "lift_and_drop"
-"""The motion of the STS3250 that swings with the torque off."""
 _LARGEST_JSON = 20_000_000
 
 
@@ -57,8 +55,6 @@ def servo_figures(
         motions that was left out; `sag`, for each gain the error in slow motion over all groups
         [mrad]; and `identified`, the parameters from all logs. For `xl330` also `without_priors`
         and `other_starts`, the first of `held_out` by fits without priors and from other starts.
-        For `sts3250` also `driven` and `driven_alone`, the error in slow motion of the motions
-        that do not swing, by fits with and without the motion that does.
 
     Raises:
         ConfigurationError: A servo has no log.
@@ -82,16 +78,13 @@ def servo_figures(
         tell(f"{motor}: fit to all")
         all_logs = fit_servo([one.log for one in own])
         figures[motor] = _described(all_logs, groups, held_out)
-        vary = _xl330_varied if motor == "xl330" else _sts3250_varied
-        figures[motor] |= vary(own, held_out, tell)
+        if motor == "xl330":
+            figures[motor] |= _varied(own, tell)
     return figures
 
 
-def _xl330_varied(
-    logs: Sequence[RecordedLog], held_out: Sequence[ServoHoldout], tell: Callable[[str], None]
-) -> dict[str, Any]:
+def _varied(logs: Sequence[RecordedLog], tell: Callable[[str], None]) -> dict[str, Any]:
     """The first motions that are left out, by fits without priors and from other starts."""
-    del held_out
     group = XL330_LEFT_OUT[0]
     outer = [one.log for one in logs if one.trajectory in group]
     inner = [one.log for one in logs if one.trajectory not in group]
@@ -105,23 +98,6 @@ def _xl330_varied(
         judged = judge_servo(fit_servo(inner, seed=seed), outer)
         figures["other_starts"].append(judged.model_dump(mode="json"))
     return figures
-
-
-def _sts3250_varied(
-    logs: Sequence[RecordedLog], held_out: Sequence[ServoHoldout], tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """Slow motion of what does not swing, by fits with and without the motion that does."""
-    driven = [one for one in logs if one.trajectory != SWINGING]
-    own = [
-        part for part, (name,) in zip(held_out, STS3250_LEFT_OUT, strict=True) if name != SWINGING
-    ]
-    alone = []
-    for (name,) in STS3250_LEFT_OUT:
-        if name != SWINGING:
-            tell(f"sts3250: fit without {SWINGING} and {name}")
-            fit = fit_servo([one.log for one in driven if one.trajectory != name])
-            alone.append(judge_servo(fit, [one.log for one in driven if one.trajectory == name]))
-    return {"driven": sag_by_gain(own), "driven_alone": sag_by_gain(alone)}
 
 
 def read_recordings(files: Sequence[Path]) -> list[RecordedLog]:
@@ -140,8 +116,7 @@ def read_recordings(files: Sequence[Path]) -> list[RecordedLog]:
 
 def num_fits() -> int:
     """How often `servo_figures` says what is being done."""
-    variations = 1 + len(FURTHER_SEEDS) + len(STS3250_LEFT_OUT) - 1
-    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2 + variations
+    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2 + 1 + len(FURTHER_SEEDS)
 
 
 def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -167,22 +142,13 @@ def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             of = ", ".join(part["motions"])
             row = {"servo": motor, "measure": measure, "of": of, **errors}
             rows.append({**row, "replay_all_mrad": part["replay_mrad"]})
-        for name, measure in _SLOW.items():
-            for gain in figure.get(name, ()):
-                errors = dict(zip(_COLUMNS, (gain[name] for name in PREDICTIONS), strict=True))
-                rows.append(
-                    {"servo": motor, "measure": measure, "of": f"{gain['gain']:g}", **errors}
-                )
+        for gain in figure["sag"]:
+            errors = dict(zip(_COLUMNS, (gain[name] for name in PREDICTIONS), strict=True))
+            rows.append({"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}", **errors})
     return rows
 
 
 _COLUMNS = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
-_SLOW = {
-    "sag": "slow",
-    "driven": "slow, driven motions",
-    "driven_alone": "slow, driven motions alone fitted",
-}
-"""Measures of slow motion by the name of their figure."""
 
 
 def sag_by_gain(held_out: Sequence[ServoHoldout]) -> list[dict[str, float]]:
