@@ -25,7 +25,7 @@ import numpy as np
 
 from baselines.identification.servo_log import ServoLog
 from elastic_env.core.compiled import compiled
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, BoolArray
 
 PARAMETERS = {
     "position_gain": "N·m/rad",
@@ -97,25 +97,23 @@ class Replay:
             np.diff(log.time),
             goal,
             self.known,
-            self._share_on(parameters[12]),
+            log.enabled,
+            self._switched(parameters[12]),
             np.array([*self.start, log.gain, log.supply, load.torque, load.rest, inertia]),
             np.ascontiguousarray(parameters, dtype=np.float64),
             out,
         )
         return out
 
-    def _share_on(self, lead: float) -> Array:
-        """Share of each step in which the torque is on, (N − 1, s).
+    def _switched(self, lead: float) -> Array:
+        """Share of each step after the torque is switched, (N − 1, s); 0 where it is not.
 
         It is switched a lead before the first row that says so, at most a row before [s].
         """
         step = np.diff(self.log.time)[:, None]
         count = self.middle.shape[1]
-        enabled = self.log.enabled.astype(np.float64)
-        before, after = enabled[:-1, None], enabled[1:, None]
-        # part of each step that lies beyond the switch
-        beyond = np.clip(np.arange(1, count + 1) - count * (1.0 - lead / step), 0.0, 1.0)
-        return before + (after - before) * beyond
+        share = np.clip(np.arange(1, count + 1) - count * (1.0 - lead / step), 0.0, 1.0)
+        return np.where(np.diff(self.log.enabled)[:, None], share, 0.0)
 
 
 @compiled
@@ -123,7 +121,8 @@ def _play(
     steps: Array,
     goal: Array,
     known: Array,
-    on: Array,
+    enabled: BoolArray,
+    switched: Array,
     setting: Array,
     p: Array,
     out: Array,
@@ -142,13 +141,20 @@ def _play(
     out[0] = q
     substeps = goal.shape[1]
     for k in range(len(steps)):
-        h = steps[k] / substeps
-        for j in range(substeps):
+        for part in range(2 * substeps):  # each step before and after the torque is switched
+            j = part // 2
+            share = switched[k, j] if part % 2 else 1.0 - switched[k, j]
+            if share == 0.0:
+                continue
+            h = share * (steps[k] / substeps)
+            on = enabled[k + part % 2]
+            b = p[2] if on else 0.0
             left = h
-            b = p[2] * on[k, j]
             if w != 0.0:
                 middle = q + 0.5 * h * w
-                pull = on[k, j] * min(max(gain * (goal[k, j] - middle), -limit), limit)
+                pull = 0.0
+                if on:
+                    pull = min(max(gain * (goal[k, j] - middle), -limit), limit)
                 other = known[k, j] - setting[4] * np.sin(middle - setting[5] - p[10])
                 F = p[5]
                 if p[8] > 0.0:
@@ -164,7 +170,9 @@ def _play(
                 q += 0.5 * w * stop
                 w = 0.0
                 left = h - stop
-            pull = on[k, j] * min(max(gain * (goal[k, j] - q), -limit), limit)
+            pull = 0.0
+            if on:
+                pull = min(max(gain * (goal[k, j] - q), -limit), limit)
             other = known[k, j] - setting[4] * np.sin(q - setting[5] - p[10])
             needed = pull + other
             if abs(needed) > at_rest + p[6] * abs(pull):
