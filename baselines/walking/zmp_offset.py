@@ -7,9 +7,9 @@ foot sensors show it, and an integral takes it off:
 .. math:: \dot s = -\frac{1}{T} (p - p_{ref}), \quad |s_x|, |s_y| \le s_{max}
 
 s is the shift of the planned ZMP (input `zmp` of the policy inside), p the ZMP by the foot sensors
-as if the feet lay flat on their footholds. T is several steps long: within a step the ZMP is the
-controller's matter. The sensors show the ZMP against the feet, so feet that have drifted from their
-footholds are not seen.
+as if the feet lay flat on their footholds (`baselines.walking.flat_feet`), all in the plan's local
+frame. T is several steps long: within a step the ZMP is the controller's matter. The sensors show
+the ZMP against the feet, so feet that have drifted from their footholds are not seen.
 """
 
 from typing import Any, NamedTuple
@@ -18,9 +18,9 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
 _LEAST_LOAD = 0.05
@@ -54,12 +54,8 @@ class ZmpOffset(PolicyAround):
 
     def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
         super().__init__(policy, model)
-        table = model.observation_table
-        self._ankles = model.biped.ankles
-        self._sensors = FootSensors.of_biped(model.biped)
-        self._wrench = table.group("wrench")
-        self._zmp = table.group("zmp_reference")
-        self._least_n = _LEAST_LOAD * model.biped.weight
+        self._feet = FlatFeet(model, _LEAST_LOAD * model.biped.weight)
+        self._wrench = model.observation_table.group("wrench")
         self._rate = model.control_period_s / gains.time_constant_s
         self._limit = gains.limit_m
 
@@ -70,9 +66,8 @@ class ZmpOffset(PolicyAround):
     @override
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
-        wrench = rows[:, self._wrench]
-        measured = self._sensors.zmp_of_flat_feet(wrench, self._ankles, self._least_n)
-        error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
+        error = self._feet.zmp_error(rows, rows[:, self._wrench])
+        error = np.nan_to_num(error, nan=0.0)
         shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))

@@ -21,7 +21,7 @@ from elastic_env.rendering.picture import Picture
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
-from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_z
 from elastic_env.robots.thormang import humanoid
 from elastic_env.robots.thormang.humanoid import PLAN, ZMP, ZMP_REFERENCE
 from elastic_env.robots.thormang.model import LEG_JOINTS
@@ -71,8 +71,8 @@ class Posture:
     @classmethod
     def of_plan(cls, plan: WalkPlan, row: int) -> "Posture":
         """That of the plan, with pelvis and feet level."""
-        level = np.eye(3)
-        return cls(plan.pelvis[row], level, plan.ankles[row], np.stack([level, level]))
+        R = rotation_z(plan.heading[row])
+        return cls(plan.pelvis[row], R, plan.ankles[row], rotation_z(plan.foot_yaw[row]))
 
     def joint_angles(self, robot: Biped) -> Array:
         """Its joint angles, (12,) [rad]; of a straight leg where a foot is out of reach."""
@@ -114,8 +114,8 @@ def enlarge_posture(
     # takes a quarter of a second, and few draw
     from scipy.spatial.transform import Rotation
 
-    turned = Rotation.from_matrix(true.R).as_rotvec()
-    R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix()
+    turned = Rotation.from_matrix(true.R @ planned.R.T).as_rotvec()
+    R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix() @ planned.R
     legs = hip_to_ankle(robot, pelvis, R, true.ankles)
     reaches = (np.linalg.norm(legs, axis=-1) <= robot.leg.reach).all(axis=-1)
     reaches[-1] = True  # the true posture
