@@ -5,7 +5,7 @@ attitude; the feet, the ZMP and its reference are drawn to scale, so that the ro
 floor and the ZMP is where it is under the soles. The legs connect both, which enlarges the link
 errors of the supporting leg to first order by the same factor. The factor becomes smaller, down to
 one, where the legs could not reach the feet: a fall is drawn as it is. The translucent robot is the
-plan.
+plan. Camera and light go with its feet.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.rendering.picture import Picture
+from elastic_env.rendering.picture import CAMERA, Picture
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
@@ -135,6 +135,8 @@ class WalkerPicture(Picture):
         super().__init__(humanoid.display_spec(task.config.robot), _LEGEND)
         self._task = task
         self._factor = LARGEST_FACTOR
+        self._eye = self._model.camera(CAMERA).pos[:2].copy()
+        self._lights = self._model.light_pos[:, :2].copy()
 
     def alone(self) -> Alone:
         """The robot of a side-by-side picture."""
@@ -163,6 +165,8 @@ class WalkerPicture(Picture):
         true = Posture.of_truth(truth, world)
         planned = Posture.of_plan(plan, row)
         robot = truth.model.biped
+        self._model.camera(CAMERA).pos[:2] = self._eye + plan.origin[row]
+        self._model.light_pos[:, :2] = self._lights + plan.origin[row]
         drawn, self._factor = enlarge_posture(true, planned, plan.share[row], robot)
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)

@@ -342,7 +342,7 @@ class WalkTask(Task):
             "single_support": timing.single[row],
             "support": timing.support[row],
             "position_error": np.hypot(*(middle - plan.origin[row]).T),
-            "heading_error": self._heading_error(truth, row),
+            "heading_error": heading_error(truth["quaternion"], plan.heading[row]),
             "early_touchdown": self._earliness(truth, row),
         }
 
@@ -362,13 +362,6 @@ class WalkTask(Task):
     def _plan_row(self, truth: Records) -> IntArray:
         """Rows of the plan's tables."""
         return np.minimum(truth["step"], self.num_steps)
-
-    def _heading_error(self, truth: Records, row: IntArray) -> Array:
-        """Heading of the pelvis less the planned one, within half a turn [rad]."""
-        w, x, y, z = truth["quaternion"].T
-        heading = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-        error = heading - self.plan.heading[row]
-        return error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
 
     def _earliness(self, truth: Records, row: IntArray) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
@@ -462,6 +455,18 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
     rows["time_constant_s"] = [kind.inertial.time_constant_s for kind, _, _ in fits]
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
+
+
+def heading_error(quaternion: Array, planned: Array) -> Array:
+    """Heading (of yaw, pitch, roll) less the planned one, within half a turn, (n,) [rad].
+
+    Args:
+        quaternion: Orientation w, x, y, z, (n, 4).
+        planned: Heading, counted over full turns, (n,) [rad].
+    """
+    w, x, y, z = quaternion.T
+    error = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - planned
+    return error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
 
 
 TOUCHDOWN = -1
