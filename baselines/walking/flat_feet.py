@@ -27,9 +27,10 @@ class FlatFeet:
         self._period_s = model.control_period_s
         self._clock = table.group("clock").start
         self._zmp = table.group("zmp_reference")
-        self._ankles = plan.ankles * [1.0, 1.0, 0.0] + [0.0, 0.0, model.biped.ankle_height]
-        self._foot_R = rotation_z(plan.foot_yaw)
-        self._heading = np.stack([np.cos(plan.heading), np.sin(plan.heading)], axis=-1)
+        ankles = plan.ankles.copy()
+        ankles[..., 2] = model.biped.ankle_height
+        heading = np.stack([np.cos(plan.heading), np.sin(plan.heading)], axis=-1)
+        self._tables = (rotation_z(plan.foot_yaw), ankles, heading)  # a row per control step
 
     def zmp_error(self, rows: Array, wrench: Array) -> Array:
         """ZMP of wrenches less the planned one, in the plan's local frame, (num_worlds, 2) [m].
@@ -46,11 +47,14 @@ class FlatFeet:
 
     def ground(self, rows: Array, wrench: Array) -> tuple[Array, Array]:
         """Force of the ground on the feet in the world, (num_worlds, 2, 3) [N], and `zmp_error`."""
-        periods = np.rint(rows[:, self._clock] / self._period_s).astype(np.int64)
-        row = np.clip(periods, 0, len(self._ankles) - 1)
+        row = np.rint(rows[:, self._clock] / self._period_s).astype(np.int64)
+        foot_R, ankles, heading = (table.take(row, 0, mode="clip") for table in self._tables)
         seen = wrench.reshape(-1, 2, 2, 3)
-        force, moment = self._sensors.ground_wrench(seen, self._foot_R[row])
-        zmp = zero_moment_point(force, moment, self._ankles[row], self._least_n)
+        force, moment = self._sensors.ground_wrench(seen, foot_R)
+        zmp = zero_moment_point(force, moment, ankles, self._least_n)
         x, y = (zmp - rows[:, self._zmp]).T
-        cosine, sine = self._heading[row].T
-        return force, np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+        cosine, sine = heading.T
+        error = np.empty(zmp.shape)
+        error[:, 0] = cosine * x + sine * y
+        error[:, 1] = cosine * y - sine * x
+        return force, error
