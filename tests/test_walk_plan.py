@@ -231,6 +231,17 @@ def test_the_cart_table_keeps_its_zmp_within_a_millimetre(step_period: float) ->
     np.testing.assert_allclose(plan.com[-1], plan.zmp[-1], rtol=0.0, atol=1e-3)
 
 
+@pytest.mark.parametrize(("step_period", "bound"), [(3.0, 1.2e-3), (1.6, 2.5e-3), (1.1, 4e-3)])
+@pytest.mark.parametrize("goes", [{"step_length_m": 0.1}, {"step_length_m": 0.1, "turn_rad": 0.1}])
+def test_the_zmp_of_a_walk_forward_is_near_its_reference(
+    step_period: float, bound: float, goes: dict[str, float]
+) -> None:
+    """Catches legs that swing forward as if they weighed nothing: 5, 12 and 18 mm rms."""
+    plan = plan_walk(make_gait(step_period, num_steps=4, **goes), ROBOT, PERIOD_S)
+    error = (plan.zmp_of_motion - plan.zmp)[plan.timing.walking]
+    assert np.sqrt((error**2).sum(axis=1).mean()) < bound
+
+
 @pytest.mark.parametrize(
     ("step_period", "bound"), [(24.0, 2e-4), (3.0, 0.003), (1.6, 0.007), (1.1, 0.01)]
 )
