@@ -78,6 +78,8 @@ INFO_KEYS = {
     "swing",
     "single_support",
     "support",
+    "position_error",
+    "heading_error",
     "early_touchdown",
     "clipped",
     "reward_terms",
@@ -1107,6 +1109,7 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
     error = plan.q[1:] - q
     offsets = HARD_ACTIONS[:, 1].astype(np.float64)
     zmp = np.stack([hard_walk.info("zmp_x"), hard_walk.info("zmp_y")], axis=1)
+    pelvis_R = hard_walk.truth("pelvis_R")[1:]
 
     def rms(values: Array) -> Array:
         return np.sqrt(np.mean(values**2, axis=1))
@@ -1133,6 +1136,10 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
         "single_support": plan.timing.single[1:],
         "support": plan.timing.support[1:],
         "clipped": np.zeros(NUM_STEPS),
+        "position_error": np.linalg.norm(
+            (hard_walk.truth("ankles")[1:, :, :2] - plan.ankles[1:, :, :2]).mean(axis=1), axis=1
+        ),
+        "heading_error": np.arctan2(pelvis_R[:, 1, 0], pelvis_R[:, 0, 0]) - plan.heading[1:],
     }
     for name, values in expected.items():
         np.testing.assert_allclose(hard_walk.info(name), values, rtol=0.0, atol=1e-8, err_msg=name)
@@ -1210,6 +1217,7 @@ def test_episode_metrics_are_those_of_the_recorded_signals(hard_walk: Recording)
         "single_loaded": single & loaded,
         "transition_loaded": transition & loaded,
         "touchdown": end,
+        "end": np.arange(1, NUM_STEPS + 1) == NUM_STEPS,
     }
     metrics = dict(hard_walk.results[-1][4]["episode_metrics"])
     assert (metrics.pop("fell"), metrics.pop("diverged")) == (False, False)
@@ -1624,8 +1632,8 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         (
             {"gait": 3.0},
             (
-                r"gait must be a mapping of lift_m, hip_height_m, transfer, got 3\.0; see also"
-                r" step_period"
+                r"gait must be a mapping of step_length_m, step_width_m, turn_rad, lift_m,"
+                r" hip_height_m, transfer, got 3\.0; see also step_period"
             ),
         ),
         (
