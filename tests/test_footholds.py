@@ -476,6 +476,7 @@ def test_the_robot_walks_forward_and_turns(scenario: str, goes: dict[str, float]
         done = terminated or truncated
     assert not terminated
     metrics = info["episode_metrics"]
+    turned = env.unwrapped.task.plan.heading[-1]
     assert metrics["pelvis_error_rms_rad"] < 4e-3
     assert metrics["end_position_error_m"] < 0.06
-    assert abs(metrics["end_heading_error_rad"]) < 0.06
+    assert abs(metrics["end_heading_error_rad"]) < 0.01 + 0.04 * turned
