@@ -23,10 +23,11 @@ from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.foot_clearance import sole_gap
 from elastic_env.motion.gait import LEFT, RIGHT, Footholds, footholds, make_gait
 from elastic_env.motion.walk_plan import derivatives, plan_walk
+from elastic_env.rendering.picture import CAMERA
 from elastic_env.rigid.leg_kinematics import foot_pose, rotation_z, turn
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG_JOINTS, SIDES, Thormang, biped
-from elastic_env.robots.thormang.picture import Posture, enlarge_posture
+from elastic_env.robots.thormang.picture import Posture, WalkerPicture, enlarge_posture
 from elastic_env.robots.thormang.task import WalkTask, heading_error
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
@@ -455,6 +456,27 @@ def test_the_picture_has_the_plans_headings() -> None:
         assert factor > 1.0
         np.testing.assert_allclose(drawn.R, planned.R, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(drawn.pelvis, planned.pelvis, rtol=0.0, atol=1e-12)
+
+
+def test_camera_and_light_go_with_the_plan() -> None:
+    """Catches a robot that walks out of its picture."""
+    env: Any = gymnasium.make(
+        "elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=3, scenario="ideal", gait=ARC
+    )
+    env.reset(seed=0)
+    task = env.unwrapped.task
+    picture = WalkerPicture(task)
+    signals = {name: float(values[0]) for name, values in task.signals().items()}
+    eyes = []
+    lights = []
+    for row in (0, task.num_steps):
+        picture._pose({**signals, "time_s": row * PERIOD_S}, 0)
+        eyes.append(picture._model.camera(CAMERA).pos.copy())
+        lights.append(picture._model.light_pos[0].copy())
+    way = np.append(task.plan.footholds.positions[-1].mean(axis=0), 0.0)
+    assert np.linalg.norm(way) > 0.1
+    for places in (eyes, lights):
+        np.testing.assert_allclose(places[1] - places[0], way, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -3,9 +3,9 @@
 The pelvis stays level at one height, heads where the feet do on average, and moves so that the
 center of mass of the whole robot, not the pelvis, follows the preview control.
 
-Feet that swing forward move the ZMP off that of the cart-table. Where the robot walks elsewhere than
-in place, the error of the motion's ZMP passes the preview control once more [Kajita2003], which
-leaves about a sixth of it.
+Feet that swing forward move the ZMP off that of the cart-table. Where the robot does not walk in
+place, the error of the motion's ZMP passes the preview control once more [Kajita2003], which leaves
+about a sixth of it.
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the
