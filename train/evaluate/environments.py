@@ -221,10 +221,14 @@ class _Walker(Environment):
         parts = _durations(reference)
         texts = (f"{p:g}" if isinstance(p, int | float) else str(p) for p in parts)
         label = f"{'+'.join(texts)} s"
-        steps = reference.get("num_steps") if isinstance(reference, dict) else None
+        given = reference if isinstance(reference, dict) else {}
+        steps = given.get("num_steps")
         usual = Gait.model_fields["num_steps"].default
         is_usual = steps in (None, usual, _STEPS_OF_THE_PAPER.get(label))
-        return label if is_usual else f"{label} num_steps={steps}"
+        gait = given.get("gait")
+        differs = gait if isinstance(gait, dict) else {}
+        further = {**({} if is_usual else {"num_steps": steps}), **differs}
+        return " ".join([label, *(f"{name}={value}" for name, value in further.items())])
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
