@@ -16,6 +16,7 @@ from rich.console import Console
 import train.commands.compare
 import train.speed.step_times
 from baselines.catalogue import Track
+from docs.pages.standings import read_leaderboard
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
@@ -31,7 +32,6 @@ from train.report.leaderboard import (
     claims_table,
     leaderboard_markdown,
     print_leaderboard,
-    read_leaderboard,
     scenarios_board,
     three_digits,
     write_leaderboard,
