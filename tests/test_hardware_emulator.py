@@ -8,9 +8,8 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.packets import Packet, Parser
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import Faults, damage
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, damage
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.testbed.config import TestbedConfig

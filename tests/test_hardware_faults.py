@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import RunningEmulator
+from elastic_env.hardware.emulator.launch import Faults, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.live import plant
 from elastic_env.hardware.safety import supervised_bus

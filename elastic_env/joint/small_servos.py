@@ -153,13 +153,8 @@ def _identified(
     constant: float, resistance: float, voltage: float, pwm_limit: float = 1.0
 ) -> Motor:
     """A motor of which one constant k_t = k_e [N·m/A] was identified."""
-    return Motor(
-        torque_constant=constant,
-        back_emf=constant,
-        resistance=resistance,
-        voltage=voltage,
-        pwm_limit=pwm_limit,
-    )
+    own = {"torque_constant": constant, "back_emf": constant, "resistance": resistance}
+    return Motor(**own, voltage=voltage, pwm_limit=pwm_limit)
 
 
 _XL330 = Gear(rotor_inertia=0.002596, base=0.00232, share=0.2641, viscous=0.0169)

@@ -21,8 +21,7 @@ from baselines.identification.identify import identify
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
 from elastic_env.hardware.safety.processes import child_command, child_environment
 from elastic_env.hardware.safety.realtime import (

@@ -17,7 +17,6 @@ from rich.table import Table
 
 from baselines.policies import is_saved
 from elastic_env.core.config import (
-    LARGEST_SEED,
     MOST_ENTRIES,
     Entries,
     Locator,
@@ -29,13 +28,12 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec, cell_of
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec, Seed, cell_of
 from train.evaluate.episodes import Evaluation
 from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel, load_without_code
+from train.runs.user_code import CodeNamingModel, is_a, load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
@@ -51,7 +49,7 @@ class BenchCase(Model):
     scenario: Title = "nominal"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
+    seed: Seed = 0
     """Seed of the episode."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""

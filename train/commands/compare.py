@@ -13,13 +13,11 @@ from rich.console import Console
 
 from baselines.policies import is_saved
 from elastic_env.core.config import (
-    LARGEST_SEED,
     MOST_ENTRIES,
     Entries,
     Model,
     Title,
     load_yaml,
-    quantity,
 )
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
@@ -31,7 +29,9 @@ from train.evaluate.conditions import (
     Condition,
     GivenRanges,
     GivenReference,
+    NumEpisodes,
     PolicySpec,
+    Seed,
     require_drawn,
 )
 from train.evaluate.environments import Environment, Reference, environment
@@ -51,8 +51,7 @@ from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel, recorded_config
+from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -88,13 +87,13 @@ class CompareConfig(CodeNamingModel):
     scenarios: Entries[Title] = ["nominal"]
     policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    episodes: NumEpisodes = 1
     """Episodes per cell."""
     scenario_episodes: dict[str, int] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is
     random.
     """
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
@@ -164,8 +163,7 @@ class CompareConfig(CodeNamingModel):
         require_known("policy of the figures", self.figure_policies, titles)
         known = self.scenarios
         own = self.reference_scenarios
-        episodes = self.scenario_episodes
-        require_known("scenario with episodes of its own", episodes, known)
+        require_known("scenario with episodes of its own", self.scenario_episodes, known)
         require_known("reference with scenarios of its own", own, references)
         once: dict[str, list[Any]] = {"reference": references, "scenario": known}
         once["value of the sweep"] = self.sweep.values if self.sweep else []
@@ -177,7 +175,7 @@ class CompareConfig(CodeNamingModel):
         for what, values in once.items():
             for value in _repeated(values):
                 yield f"the {what} {quote(value)} stands twice; its episodes would count double"
-        for name, count in episodes.items():
+        for name, count in self.scenario_episodes.items():
             if not 1 <= count <= MOST_EPISODES:
                 bounds = f">= 1 and <= {MOST_EPISODES}"
                 yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"

@@ -20,8 +20,7 @@ from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import RATES, require_ids
 from elastic_env.hardware.buses.servo_models import servo_models
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus

@@ -12,7 +12,7 @@ import gymnasium
 from rich.console import Console
 from rich.progress import track
 
-from elastic_env.core.config import LARGEST_SEED, Model, quantity
+from elastic_env.core.config import Model
 from elastic_env.core.errors import (
     ElasticError,
     ResultsExistError,
@@ -21,7 +21,7 @@ from elastic_env.core.errors import (
     shorten,
 )
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options
-from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec, cell_of
+from train.evaluate.conditions import Condition, PolicySpec, Seed, cell_of
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
@@ -177,7 +177,7 @@ class WatchedEpisode(Model):
     """Scenario."""
     reference: MotionOrDefault = None
     """MotionOrDefault, as in elastic evaluate; default sine, on the walker 3."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the episode."""
     max_s: float | None = None
     """Stop after this much simulated time [s]."""

@@ -23,6 +23,9 @@ from train.evaluate.environments import (
 )
 
 MOST_EPISODES = 100_000
+NumEpisodes = Annotated[int, quantity("1", ge=1, le=MOST_EPISODES)]
+Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
+"""Seed of the first episode; others follow."""
 """Episodes of a cell."""
 SCENARIO = "scenario."
 """Prefix of a field of the scenario that is varied, such as scenario.stiffness_scale."""
@@ -147,9 +150,9 @@ class Condition(Model):
     """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it
     one of the scenario.
     """
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    episodes: NumEpisodes = 1
     """Number of episodes [1]."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the first episode; the next ones follow [1]."""
 
     _checked = field_validator("env_options")(_options)

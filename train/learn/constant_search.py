@@ -16,9 +16,8 @@ from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.learn.algorithm_options import complete_options
-from train.learn.finite import require_finite
 from train.learn.train_config import first_episode, joints_of, training_worlds
-from train.learn.trainer import Trainer
+from train.learn.trainer import Trainer, require_finite
 
 _TOLD = "told.json"
 _FALL_COST = 1e6

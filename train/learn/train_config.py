@@ -12,18 +12,17 @@ from elastic_env.core.config import Entries, Locator, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
-    MOST_EPISODES,
     Condition,
     GivenRanges,
     GivenReference,
+    NumEpisodes,
     PolicySpec,
     require_drawn,
 )
 from train.evaluate.environments import environment
 from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel
+from train.runs.user_code import CodeNamingModel, is_a
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
@@ -76,7 +75,7 @@ class TrainConfig(CodeNamingModel):
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
-    evaluation_episodes: int = quantity("1", 4, ge=1, le=MOST_EPISODES)
+    evaluation_episodes: NumEpisodes = 4
     """Episodes per scenario in an evaluation."""
     checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between checkpoints.

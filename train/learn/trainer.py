@@ -5,12 +5,36 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ElasticError, shorten
 from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
-from train.learn.finite import DivergedError
 from train.learn.scores import Scores
 from train.learn.train_config import TrainConfig
+
+
+class DivergedError(ElasticError):
+    """A quantity of a training is no longer a finite number.
+
+    Args:
+        quantity: What it is, such as the reward.
+    """
+
+    def __init__(self, quantity: str) -> None:
+        super().__init__(f"{quantity} is not a finite number")
+        self.quantity = quantity
+
+
+def require_finite(quantity: str, values: Any) -> None:
+    """Refuse nan and infinity among the numbers of a training.
+
+    Raises:
+        DivergedError: There is one.
+    """
+    if not np.isfinite(values).all():
+        raise DivergedError(quantity)
+
 
 CHECKPOINT = "checkpoint"
 """Folder, within that of a training seed, to go on from."""

@@ -27,7 +27,6 @@ from baselines.residual.settings import ResidualDescription
 from train.learn.algorithm_options import complete_options
 from train.learn.checkpoint import read_state, write_state
 from train.learn.export import algorithm_class, name_options, network_of
-from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.train_config import (
     FIRST_TRAINING_SEED,
@@ -35,7 +34,7 @@ from train.learn.train_config import (
     joints_of,
     training_worlds,
 )
-from train.learn.trainer import Trainer
+from train.learn.trainer import Trainer, require_finite
 
 _OF_MODEL = ("num_timesteps", "_n_updates", "_episode_num")
 """Attributes of an algorithm of SB3 that a training goes on from."""

@@ -19,10 +19,9 @@ import numpy as np
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import damage
 from elastic_env.hardware.emulator.imu import EmulatedImu
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, damage
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
