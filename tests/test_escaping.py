@@ -325,6 +325,6 @@ def test_a_table_is_escaped_in_every_format(tmp_path: Path) -> None:
     page.add("table", table)
     path = write_records([{"a|<b>\x1b": "=1+a|<b>\x1b"}], tmp_path / "table.csv")
     assert to_markdown(table) == "| a\\|&lt;b&gt;� |\n| --- |\n| =1+a\\|&lt;b&gt;� |"
-    assert to_markdown(table) in page.markdown()
+    assert to_markdown(table) in page.as_markdown()
     assert '<td class="words">=1+a|&lt;b&gt;�</td>' in page.html(plotly_js="")
     assert path.read_bytes().decode() == "a|<b>�\r\n'=1+a|<b>�\r\n"

@@ -22,12 +22,12 @@ def make_servo(number: int = 54024, servo_id: int = 1) -> EmulatedServo:
 
 def write(servo: EmulatedServo, name: str, value: int) -> int:
     register = servo.model.table[name]
-    return servo.write(register.address, register.encode(value))
+    return servo.write_memory(register.address, register.encode(value))
 
 
 def read(servo: EmulatedServo, name: str) -> int:
     register = servo.model.table[name]
-    error, data = servo.read(register.address, register.size)
+    error, data = servo.read_memory(register.address, register.size)
     assert error & ~packets.ALERT == 0
     return register.decode(data)
 
@@ -38,8 +38,8 @@ def test_registers_keep_their_rights() -> None:
     assert write(servo, "present_position", 5) == packets.ACCESS_ERROR
     assert write(servo, "goal_position", 300_000) == packets.LIMIT_ERROR
     assert write(servo, "torque_enable", 2) == packets.RANGE_ERROR
-    assert servo.write(596, b"\x01\x02") == packets.LENGTH_ERROR
-    assert servo.write(597, b"\x01\x02\x03\x04") == packets.ACCESS_ERROR
+    assert servo.write_memory(596, b"\x01\x02") == packets.LENGTH_ERROR
+    assert servo.write_memory(597, b"\x01\x02\x03\x04") == packets.ACCESS_ERROR
     assert write(servo, "goal_position", -131_073) == 0
     assert read(servo, "goal_position") == -131_073
 
@@ -69,7 +69,7 @@ def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
     write(servo, "torque_enable", 1)
     servo.overload(True)
     assert not servo.is_on
-    error, data = servo.read(611, 4)
+    error, data = servo.read_memory(611, 4)
     assert error == packets.ALERT
     assert len(data) == 4
     assert write(servo, "torque_enable", 1) == packets.ALERT | packets.RESULT_FAIL
@@ -102,8 +102,8 @@ def test_watchdog_stops_models_that_have_one() -> None:
 
 
 def answers(bus: EmulatedBus, wire: bytes) -> list[Packet]:
-    (instruction,) = Parser().feed(wire)
-    return [reply for sent in bus.answer(instruction, 0.0) for reply in Parser().feed(sent)]
+    (instruction,) = Parser().parse(wire)
+    return [reply for sent in bus.answer(instruction, 0.0) for reply in Parser().parse(sent)]
 
 
 def test_sync_instructions_reach_their_servos_in_order() -> None:

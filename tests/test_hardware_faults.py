@@ -219,7 +219,7 @@ def test_the_lower_limit_on_the_temperature_holds_in_motion_and_before(limit: st
     for degrees, words in ((60, ""), (61, "too hot: servo 2 at one: 61.*at most 60 °C")):
         line = attached("one", 1, 2)
         if limit == "servo":
-            line.write(2, "temperature_limit", 60)
+            line.write_register(2, "temperature_limit", 60)
         line.servos[2]["present_temperature"] = degrees
         (answer,) = served([line], enable)
         assert ("message" in answer) == bool(words)

@@ -98,7 +98,7 @@ class Line(DynamixelBus):
             packet = Packet(servo_id, instruction, parameters, number not in self.damaged)
             wire = b"".join(self._line.answer(packet, 0.0))
             self._coming += [
-                reply for reply in Parser().feed(wire) if reply.servo_id not in self.silent
+                reply for reply in Parser().parse(wire) if reply.servo_id not in self.silent
             ]
 
     def _receive(self) -> tuple[int, int, bytes] | None:
@@ -215,7 +215,7 @@ def test_a_goal_that_is_refused_keeps_torque_off() -> None:
     """Catches torque that is switched on at whatever goal the servo has."""
     line = attached("one", 1)
     line.motors[1].position = 0.3
-    line.write(1, "max_position_limit", 1000)
+    line.write_register(1, "max_position_limit", 1000)
     (answer,) = served([line], ENABLE)
     assert "beyond the servo's limit" in answer["message"]
     assert (1, "torque_enable", 1) not in line.events
@@ -314,7 +314,7 @@ def test_an_error_number_that_nobody_knows_is_no_success() -> None:
     line = Strange("one", 1)
     line.attach_known({1: 54024})
     with pytest.raises(ReplyError, match="refuses: error 9"):
-        line.write(1, "torque_enable", 0)
+        line.write_register(1, "torque_enable", 0)
 
 
 def test_a_program_that_was_killed_and_still_has_its_channel_loses_torque_at_once() -> None:

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
+_Values = Mapping[str, Any]
 """Keys and numbers of entries that lead to a value."""
 
 
@@ -95,9 +96,7 @@ class ModelError(ConfigurationError):
         return "\n".join(said)
 
 
-def problems_of(
-    model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]
-) -> list[Problem]:
+def problems_of(model: type[BaseModel], error: ValidationError, values: _Values) -> list[Problem]:
     """Problems that a validation found, those of models within the model among them.
 
     Args:
@@ -105,24 +104,18 @@ def problems_of(
         error: What Pydantic says.
         values: What was given.
     """
-    return [
-        found
-        for problem in error.errors(include_url=False)
-        for found in _problems(model, problem, values)
-    ]
+    found: list[Problem] = []
+    for problem in error.errors(include_url=False):
+        path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
+        cause = problem.get("ctx", {}).get("error")
+        if isinstance(cause, ModelError):  # of a model within this one
+            found += [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
+        else:
+            found.append(_problem(model, path, problem))
+    return found
 
 
-def _problems(
-    model: type[BaseModel], problem: Mapping[str, Any], values: Mapping[str, Any]
-) -> list[Problem]:
-    path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
-    cause = problem.get("ctx", {}).get("error")
-    if isinstance(cause, ModelError):  # of a model within this one
-        return [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
-    return [_problem(model, path, problem)]
-
-
-def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
+def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Problem:
     given = quote(problem["input"])
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
@@ -164,7 +157,7 @@ _REQUIREMENTS = {
 """Requirements in the words of a configuration, where Pydantic's are those of Python."""
 
 
-def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
+def _path(location: ParameterPath, values: Any, is_missing: bool) -> ParameterPath:
     """A location without what Pydantic adds to it: the member of a union."""
     path: list[str | int] = []
     for number, part in enumerate(location):

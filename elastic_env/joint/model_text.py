@@ -149,10 +149,9 @@ def parse_xml(text: str, name: str) -> ET.Element:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
-            raise ConfigurationError(
-                f"{name} must be nested at most {DEEPEST} elements deep; line"
-                f" {parser.CurrentLineNumber} is deeper"
-            )
+            problem = f"{name} must be nested at most {DEEPEST} elements deep"
+            cure = f"line {parser.CurrentLineNumber} is deeper"
+            raise ConfigurationError(f"{problem}; {cure}")
         tree.start(tag, attributes)
 
     def end(tag: str) -> None:

@@ -53,6 +53,9 @@ _DAMPING_RATIO = 0.17
 _KG_CM = 0.0980665
 """A kilogram-force at a centimetre [N·m]."""
 
+_Given = float | None
+"""A gain or a voltage [V]; None for the usual one."""
+
 
 @dataclass(frozen=True)
 class Gear:
@@ -97,7 +100,7 @@ class SmallServo:
     per_gain: float
     gain: float
 
-    def joint(self, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+    def joint(self, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
         """The elastic joint with this servo.
 
         Args:
@@ -183,7 +186,7 @@ SMALL_SERVOS = {
 """Small servos by name."""
 
 
-def small_servo(name: str, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+def small_servo(name: str, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
     """The elastic joint of a named servo.
 
     Args:

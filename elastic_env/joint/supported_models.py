@@ -147,10 +147,9 @@ def require_few(joints: Collection[str]) -> None:
         ConfigurationError: There are more than `MOST_ELASTIC`.
     """
     if len(joints) > MOST_ELASTIC:
-        raise ConfigurationError(
-            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that"
-            " matter"
-        )
+        problem = f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}"
+        cure = "name those that matter"
+        raise ConfigurationError(f"{problem}; {cure}")
 
 
 def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:

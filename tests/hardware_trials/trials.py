@@ -605,9 +605,9 @@ def header_positions(share: float) -> Trial:
         ):
             bus.attach([1, 2, 0xFC])
             for value in (-131073, -131072, -131074, -3, -1, -513, 0xFDFF, 0xFFFF, -65537, 131071):
-                bus.write(1, "goal_position", value)
+                bus.write_register(1, "goal_position", value)
                 bus.write_all("goal_position", {2: value, 0xFC: value})
-                wrong += [bus.read(i, "goal_position") for i in bus.ids] != [value] * 3
+                wrong += [bus.read_register(i, "goal_position") for i in bus.ids] != [value] * 3
                 tried += 1
     return Trial(
         "header-positions",

@@ -158,7 +158,7 @@ class _Playing:
         given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self.store is None else self.store.folder.parent
-            with self.place.open(len(given), folder) as pool:
+            with self.place.open_pool(len(given), folder) as pool:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:

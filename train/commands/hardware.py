@@ -267,12 +267,7 @@ class Emulate(Model):
 class Hardware(Model):
     """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate."""
 
-    command: (
-        Annotated[Scan, tyro.conf.subcommand("scan")]
-        | Annotated[Check, tyro.conf.subcommand("check")]
-        | Annotated[Run, tyro.conf.subcommand("run")]
-        | Annotated[Emulate, tyro.conf.subcommand("emulate")]
-    )
+    command: Scan | Check | Run | Emulate
 
     def run(self, console: Console) -> None:
         """Do what was asked for."""

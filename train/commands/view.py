@@ -31,7 +31,7 @@ from rich.console import Console
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.commands.play import WatchedEpisode, episode, steps_within
-from train.commands.view_proxy import LOOPBACK, Access, Proxy, listen
+from train.commands.view_proxy import LOOPBACK, Access, Proxy, open_listener
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import make_policy
 
@@ -89,7 +89,7 @@ class Playback:
             self.time_s = self.time_s + now - last if self.time_s < end else 0.0
 
 
-def record(condition: Condition, console: Console, max_s: float | None = None) -> Recording:
+def record(condition: Condition, console: Console, max_s: float | None) -> Recording:
     """Play an episode and keep what is drawn.
 
     Args:
@@ -215,7 +215,7 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
         ConfigurationError: Host or port cannot be.
         SystemFailedError: The port is taken.
     """
-    browsers = listen(host, port)
+    browsers = open_listener(host, port)
     access = Access(host, browsers.getsockname()[1])
     with (
         contextlib.closing(browsers),
@@ -274,7 +274,7 @@ class View(WatchedEpisode):
     def run(self, console: Console) -> None:
         """Play an episode, then show it until Ctrl-C."""
         # what cannot be is said before the episode
-        listen(self.host, self.port).close()
+        open_listener(self.host, self.port).close()
         condition = self.condition
         console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)

@@ -214,7 +214,7 @@ def _is_loopback(host: str) -> bool:
     return is_name or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
-def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
+def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
     """A socket that listens for browsers.
 
     Args:
@@ -253,7 +253,7 @@ class Proxy:
     """Answers browsers in a thread, until it is closed.
 
     Args:
-        listener: Where browsers come in, see `listen`.
+        listener: Where browsers come in, see `open_listener`.
         viewer: Path of the Unix socket at which the viewer answers.
         access: Who is let in.
     """

@@ -20,7 +20,8 @@ from train.figures.colours import REFERENCE, dash_of
 
 Colours = Mapping[str, str]
 """Colour of every policy."""
-Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
+Evaluations = Sequence[Evaluation]
+Cells = Mapping[str, Mapping[float | None, Evaluations]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
 
 
@@ -98,7 +99,7 @@ class Chart:
 
 
 def time_chart(
-    policies: Mapping[str, Sequence[Evaluation]],
+    policies: Mapping[str, Evaluations],
     signals: Sequence[TracedSignal],
     colours: Colours,
     most_points: int | None = None,
@@ -132,7 +133,7 @@ def time_chart(
     return Chart("", "time [s]", panels, shaded=intervals(single, time_s))
 
 
-def _longest(evaluations: Sequence[Evaluation]) -> Mapping[str, Array]:
+def _longest(evaluations: Evaluations) -> Mapping[str, Array]:
     """The longest trace."""
     traces = [e.trace for e in evaluations]
     return max(traces, key=lambda trace: len(trace["time_s"]))
@@ -141,7 +142,7 @@ def _longest(evaluations: Sequence[Evaluation]) -> Mapping[str, Array]:
 def _median_curve(
     title: str,
     colour: str,
-    own: Sequence[Evaluation],
+    own: Evaluations,
     signal: TracedSignal,
     stride: int,
 ) -> Curve:
@@ -149,7 +150,7 @@ def _median_curve(
     values = np.full((len(own), len(time_s)), np.nan)
     for row, e in zip(values, own, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
-    low, middle, high = spread(values[:, ::stride])
+    low, middle, high = quantiles(values[:, ::stride])
     return Curve(
         title,
         colour,
@@ -161,7 +162,7 @@ def _median_curve(
     )
 
 
-def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[float, float]:
+def _limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
     """Range of a signal and its reference, shortly before a fall left out, with a margin."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
     parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
@@ -180,7 +181,7 @@ def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
     return [(float(time[begin]), float(time[end - 1])) for begin, end in pairs]
 
 
-def spread(values: Array) -> tuple[Array, Array, Array]:
+def quantiles(values: Array) -> tuple[Array, Array, Array]:
     """Least, median and most over the first axis, nan where there is nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
@@ -188,13 +189,13 @@ def spread(values: Array) -> tuple[Array, Array, Array]:
     return low, middle, high
 
 
-def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
+def median(cell: Evaluations, column: Column) -> Estimate:
     """Median over the episodes of a cell that did not fail [SI]; nan where all did."""
     values = np.concatenate([e.values(column.metric) for e in cell])
     return Estimate(float(np.median(values)) if len(values) else float("nan"))
 
 
-Statistic = Callable[[Sequence[Evaluation], Column], Estimate]
+Statistic = Callable[[Evaluations, Column], Estimate]
 
 
 def sweep_chart(
@@ -275,7 +276,7 @@ def learning_chart(
         curves = []
         for title, found in learning.items():
             ratios = found.ratios[column.metric]
-            low, middle, high = spread(ratios)
+            low, middle, high = quantiles(ratios)
             band = (low, high) if len(ratios) > 1 else None
             line = {"band": band, "width": 2.0, "has_points": True}
             curves.append(Curve(title, colours[title], found.decisions, middle, **line))

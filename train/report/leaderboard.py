@@ -184,7 +184,7 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
     """The tables of the leaderboard, without a title."""
     page = Page("", "")
     add_leaderboard(page, found)
-    return "\n\n".join(page.sections[0].markdown[1:]) + "\n"
+    return "\n\n".join(page.sections[0].as_markdown[1:]) + "\n"
 
 
 def paired_text() -> str:

@@ -30,7 +30,7 @@ def page_chart(chart: Chart) -> Spec:
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
     legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
-    rows = [shorten(row) for panel in chart.panels for row in panel.rows]
+    rows = [cut_name(row) for panel in chart.panels for row in panel.rows]
     left = max(76, 7.4 * max(map(len, rows), default=0) + 20)
     layout = base_layout(left=left, top=28 + 20 * legend_rows, bottom=50)
     total = sum(panel.height for panel in chart.panels)
@@ -65,7 +65,7 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
     if panel.is_log:
         options = {"type": "log", "dtick": "D2", "tickformat": "~r"}
     if panel.rows:
-        titles = [chart_text(shorten(row)) for row in panel.rows]
+        titles = [chart_text(cut_name(row)) for row in panel.rows]
         places = list(range(len(titles)))
         options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
@@ -120,7 +120,7 @@ def _shade(begin: float, end: float) -> Spec:
     return {"type": "rect", **x, **y, **look}
 
 
-def shorten(name: str) -> str:
+def cut_name(name: str) -> str:
     """The end of a name that is too long: of a path it is what differs."""
     return name if len(name) <= LONGEST_NAME else "…" + name[1 - LONGEST_NAME :]
 

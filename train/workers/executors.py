@@ -61,7 +61,7 @@ class Executors:
         """Processes of this machine for some calls: no more than those."""
         return min(self.jobs or os.cpu_count() or 1, calls)
 
-    def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
+    def open_pool(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.
 
         Args:

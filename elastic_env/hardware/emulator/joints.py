@@ -29,10 +29,9 @@ class Joints:
         if joint.servo is None:
             raise ConfigurationError("an emulated joint needs a servo, got None")
         if joint.servo.motor is not None:
-            raise ConfigurationError(
-                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
-                " its servo out"
-            )
+            problem = "an emulated servo controls its current, so that it has no motor"
+            cure = "leave `motor` of its servo out"
+            raise ConfigurationError(f"{problem}; {cure}")
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         model = spec.compile()
         self._simulation = simulate(model, num_joints, num_threads=1)

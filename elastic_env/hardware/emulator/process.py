@@ -59,7 +59,7 @@ class Terminal:
         with contextlib.suppress(OSError):
             os.write(self.master, data)
 
-    def read(self) -> bytes:
+    def read_bytes(self) -> bytes:
         """Bytes that have come."""
         with contextlib.suppress(OSError):
             return os.read(self.master, 4096)
@@ -207,11 +207,11 @@ class Emulator:
 
     def _hear(self, terminal: Terminal) -> float:
         """Answer the instructions that have come; returns when they were read."""
-        data = terminal.read()
+        data = terminal.read_bytes()
         now = time.monotonic()
         if not terminal.has_rate(self.config.baudrate):
             return now  # noise
-        for packet in self._parser.feed(data):
+        for packet in self._parser.parse(data):
             if self._instruction_faults.random() < self.faults.unheard:
                 continue
             for reply in self._bus.answer(packet, now):
