@@ -38,7 +38,7 @@ from train.learn.mixed_env import MixedVectorEnv, threads_of_each
 from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.scores import play_together
+from train.learn.trainer import play_together
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Curves, Training
 from train.runs.folders import lock_run
@@ -730,7 +730,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
             {"algorithm": "A2C", **options(batch_size=8)},
             "unknown parameter of algorithm_options 'batch_size'",
         ),
-        ({"seeds": [0, 1, 0]}, r"can stand but once, got \[0, 1, 0\]"),
+        ({"seeds": [0, 1, 0]}, "seeds: 0 stands twice"),
     ],
 )
 def test_a_training_that_cannot_be_says_why(

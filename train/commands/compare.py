@@ -16,6 +16,7 @@ from elastic_env.core.config import (
     MOST_ENTRIES,
     Entries,
     Model,
+    Once,
     Title,
     load_yaml,
 )
@@ -63,7 +64,7 @@ class Sweep(Model):
 
     option: Title
     """Option of the policies, such as stiffness_scale."""
-    values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
+    values: Annotated[list[float], Once] = Field(min_length=2, max_length=MOST_ENTRIES)
     label: Title | None = None
     """Label of the axis; None for the option's name."""
 
@@ -84,7 +85,7 @@ class CompareConfig(CodeNamingModel):
     env: str = "testbed"
     references: Entries[GivenReference]
     """Motions, see `Condition.reference`; default the environment's."""
-    scenarios: Entries[Title] = ["nominal"]
+    scenarios: Annotated[Entries[Title], Once] = ["nominal"]
     policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: NumEpisodes = 1
@@ -107,9 +108,9 @@ class CompareConfig(CodeNamingModel):
     """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are
     then the references.
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, Annotated[Entries[str], Once]] = {}
     """Scenarios that paired changes are also pooled over, by the name of the group."""
-    reference_scenarios: dict[str, list[Title]] = {}
+    reference_scenarios: dict[str, Annotated[Entries[Title], Once]] = {}
     """Scenarios of single references, by their names in tables, where not all are played: {24 s:
     [nominal]}.
     """
@@ -165,27 +166,18 @@ class CompareConfig(CodeNamingModel):
         own = self.reference_scenarios
         require_known("scenario with episodes of its own", self.scenario_episodes, known)
         require_known("reference with scenarios of its own", own, references)
-        once: dict[str, list[Any]] = {"reference": references, "scenario": known}
-        once["value of the sweep"] = self.sweep.values if self.sweep else []
         for name, scenarios in own.items():
-            once[f"scenario of {name!r}"] = scenarios
             require_known(f"scenario of {name!r}", scenarios, known)
-            if not scenarios:
-                yield f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
-        for what, values in once.items():
-            for value in _repeated(values):
-                yield f"the {what} {quote(value)} stands twice; its episodes would count double"
+        if repeated := _repeated(references):
+            yield f"the reference {quote(repeated[0])} stands twice; leave out one of them"
         for name, count in self.scenario_episodes.items():
             if not 1 <= count <= MOST_EPISODES:
                 bounds = f">= 1 and <= {MOST_EPISODES}"
                 yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
-            if name in known or not scenarios or _repeated(scenarios):
-                yield (
-                    f"group {name!r} must have a name that no scenario has, and scenarios, each"
-                    f" once; got {quote(scenarios)}"
-                )
+            if name in known:
+                yield f"group {name!r} must have a name that no scenario has"
         is_real = environment(self.env).is_real
         if self.leaderboard and (self.sweep or self.map or is_real):
             yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"

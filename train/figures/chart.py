@@ -121,7 +121,7 @@ def time_chart(
     panels = []
     for signal in signals:
         curves = [
-            _median_curve(title, colours[title], own, signal, stride)
+            _trace_curve(title, colours[title], own, signal, stride)
             for title, own in policies.items()
         ]
         if signal.reference is not None:
@@ -139,27 +139,22 @@ def _longest(evaluations: Evaluations) -> Mapping[str, Array]:
     return max(traces, key=lambda trace: len(trace["time_s"]))
 
 
-def _median_curve(
-    title: str,
-    colour: str,
-    own: Evaluations,
-    signal: TracedSignal,
-    stride: int,
+def _trace_curve(
+    title: str, colour: str, own: Evaluations, signal: TracedSignal, stride: int
 ) -> Curve:
     time_s = _longest(own)["time_s"]
     values = np.full((len(own), len(time_s)), np.nan)
     for row, e in zip(values, own, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
-    low, middle, high = quantiles(values[:, ::stride])
-    return Curve(
-        title,
-        colour,
-        time_s[::stride],
-        middle,
-        dash=dash_of(title),
-        band=(low, high) if len(own) > 1 else None,
-        fails=len(own) == 1 and own[0].first_failed,
-    )
+    look = {"dash": dash_of(title), "fails": len(own) == 1 and own[0].first_failed}
+    return _median_curve(title, colour, time_s[::stride], values[:, ::stride], **look)
+
+
+def _median_curve(name: str, colour: str, x: Array, values: Array, **look: Any) -> Curve:
+    """Median of values, (series, n), with the band of all where there are several."""
+    low, middle, high = quantiles(values)
+    band = (low, high) if len(values) > 1 else None
+    return Curve(name, colour, x, middle, band=band, **look)
 
 
 def _limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
@@ -275,11 +270,8 @@ def learning_chart(
     for column in columns:
         curves = []
         for title, found in learning.items():
-            ratios = found.ratios[column.metric]
-            low, middle, high = quantiles(ratios)
-            band = (low, high) if len(ratios) > 1 else None
-            line = {"band": band, "width": 2.0, "has_points": True}
-            curves.append(Curve(title, colours[title], found.decisions, middle, **line))
+            line = (title, colours[title], found.decisions, found.ratios[column.metric])
+            curves.append(_median_curve(*line, width=2.0, has_points=True))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
         ratios = [own.ratios[column.metric].ravel() for own in learning.values()]
         all_ratios = np.concatenate(ratios)

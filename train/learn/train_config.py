@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 import baselines
 from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import Entries, Locator, Title, quantity
+from elastic_env.core.config import Entries, Locator, Once, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
@@ -71,7 +71,7 @@ class TrainConfig(CodeNamingModel):
     """Worlds, shared out to the scenarios."""
     decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
     """Decisions of all worlds together."""
-    seeds: Entries[Annotated[int, Field(ge=0, lt=2**32)]] = [0]
+    seeds: Annotated[Entries[Annotated[int, Field(ge=0, lt=2**32)]], Once] = [0]
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
@@ -107,16 +107,6 @@ class TrainConfig(CodeNamingModel):
         cls, options: dict[str, Any], others: ValidationInfo
     ) -> dict[str, Any]:
         return checked_options(str(others.data.get("algorithm")), options)
-
-    @field_validator("seeds")
-    @classmethod
-    def _each_seed_once(cls, seeds: list[int]) -> list[int]:
-        if len(set(seeds)) < len(seeds):
-            raise ValueError(
-                "every training seed has a folder of its own and can stand but once, got"
-                f" {quote(seeds)}"
-            )
-        return seeds
 
     @property
     def names_of_code(self) -> list[str]:
@@ -179,8 +169,7 @@ def first_episode(seed: int) -> int:
 
 def joints_of(worlds: Any) -> list[str]:
     """Names of the joints of the robot that is trained on."""
-    names: list[str] = worlds.unwrapped.assumed_model.joint_names
-    return names
+    return worlds.unwrapped.assumed_model.joint_names
 
 
 def training_worlds(

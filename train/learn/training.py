@@ -169,7 +169,7 @@ class Training(Trainer):
         state = {
             "model": {name: getattr(model, name) for name in _OF_MODEL},
             "statistics": [[s.mean, s.var, float(s.count)] for s in self._statistics],
-            "best": self._scores.best,
+            "best": self._best,
             "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002
             "python": _to_lists(random.getstate()),
             "actions": model.action_space.np_random.bit_generator.state,
@@ -188,7 +188,7 @@ class Training(Trainer):
             setattr(model, name, value)
         for rms, own in zip(self._statistics, state["statistics"], strict=True):
             rms.mean, rms.var, rms.count = own
-        self._scores.best = state["best"]
+        self._best = state["best"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_to_tuples(state["python"]))
         model.action_space.np_random.bit_generator.state = state["actions"]

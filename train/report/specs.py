@@ -76,9 +76,10 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
-    where = {"type": "scatter", "yaxis": f"y{axis}", **_abscissa(curve.x)}
     line = {
-        **where,
+        "type": "scatter",
+        "yaxis": f"y{axis}",
+        **_abscissa(curve.x),
         "mode": "lines+markers" if curve.has_points else "lines",
         "y": numbers(curve.y),
         "name": chart_text(curve.name),
@@ -93,14 +94,8 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
         return [{**line, "mode": "markers", "marker": marker, "hoverinfo": "skip"}]
     if curve.band is None:
         return [line]
-    hidden = {
-        **where,
-        "mode": "lines",
-        "legendgroup": curve.name,
-        "showlegend": False,
-        "hoverinfo": "skip",
-        "line": {"width": 0},
-    }
+    style = {"mode": "lines", "showlegend": False, "hoverinfo": "skip"}
+    hidden = {**line, **style, "line": {"width": 0}}
     low, high = map(numbers, curve.band)
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
     return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
