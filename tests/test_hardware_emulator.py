@@ -10,7 +10,7 @@ from elastic_env.hardware.buses.packets import Packet, Parser
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, damage
-from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.world.scenario import make_scenario
@@ -56,7 +56,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
 def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
     """Catches an emulator that forgives a program which switches torque on before it has set the
     goal."""
-    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=Motor(position=0.25))
+    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motion=lambda: (0.25, 0.0, 0.0))
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
     assert read(servo, "goal_position") == 1000
@@ -165,12 +165,12 @@ def test_emulated_joint_is_the_testbeds_own() -> None:
     torque = config.true_pendulum.torque(joints.q)
     assert config.true_joint.stiffness * deflection[0] == pytest.approx(torque[0], rel=2e-3)
     assert torque[0] > 25.0
-    assert joints.motors[0].position == joints.theta[0]
-    assert joints.motors[0].torque == pytest.approx(torque[0], rel=0.1)
+    assert joints.motion(0)[0] == joints.theta[0]
+    assert joints.motion(0)[2] == pytest.approx(torque[0], rel=0.1)
     assert joints.q[1] == 0.0
     joints.set_torque(0, is_on=False)
     joints.advance(4.9)
-    assert joints.motors[0].torque == 0.0
+    assert joints.motion(0)[2] == 0.0
 
 
 def test_emulator_that_cannot_be_is_refused() -> None:

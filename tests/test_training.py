@@ -38,8 +38,8 @@ from train.learn.mixed_env import MixedVectorEnv, threads_of_each
 from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.trainer import play_together
 from train.learn.train_config import TrainConfig, training_worlds
+from train.learn.trainer import play_together
 from train.learn.training import Curves, Training
 from train.runs.folders import lock_run
 from train.workers.executors import Executors

@@ -9,7 +9,7 @@ import baselines
 from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import Entries, Locator, Once, Title, quantity
-from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
     Condition,
@@ -87,17 +87,8 @@ class TrainConfig(CodeNamingModel):
     _checked = field_validator("base")(require_plain_base)
 
     @model_validator(mode="after")
-    def _weights_are_of_scenarios(self) -> Self:
-        for name in self.weights:
-            if name not in self.scenarios:
-                raise ValueError(
-                    f"weights must be of scenarios that are learned from, {quote(self.scenarios)},"
-                    f" got {quote(name)}"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _ranges_are_of_a_scenario(self) -> Self:
+    def _scenarios_fit(self) -> Self:
+        require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
         return self
 

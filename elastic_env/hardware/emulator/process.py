@@ -104,12 +104,11 @@ class Emulator:
         self._instruction_faults = np.random.default_rng([config.seed, 2])
         self._joints = Joints(config.testbed, len(config.ids), now)
         claimed = config.claimed_model_number
-        self._servos = [
-            EmulatedServo(servo_id, model, partial(self._note, index), claimed, motor)
-            for index, (servo_id, motor) in enumerate(
-                zip(config.ids, self._joints.motors, strict=True)
-            )
-        ]
+        self._servos: list[EmulatedServo] = []
+        for index, servo_id in enumerate(config.ids):
+            motion = partial(self._joints.motion, index)
+            note = partial(self._note, index)
+            self._servos.append(EmulatedServo(servo_id, model, note, claimed, motion))
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
         self._parser = packets.Parser()

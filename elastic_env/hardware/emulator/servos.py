@@ -22,18 +22,6 @@ _WATCHDOG_FIRED = -1
 
 
 @dataclass
-class Motor:
-    """The motor side of a joint, as its servo measures it."""
-
-    position: float = 0.0
-    """Angle [rad]."""
-    velocity: float = 0.0
-    """Its rate [rad/s]."""
-    torque: float = 0.0
-    """Torque of the servo [N·m]."""
-
-
-@dataclass
 class EmulatedServo:
     """One servo on an emulated bus.
 
@@ -42,14 +30,14 @@ class EmulatedServo:
         model: Its type, by which its registers and units go.
         notify: Called with id, register and value when torque, goal or watchdog change.
         model_number: Number that it claims, if another one than its type's.
-        motor: What it measures.
+        motion: Gives what it measures: angle, its rate and torque [rad], [rad/s], [N·m].
     """
 
     servo_id: int
     model: ServoModel
     notify: Notify
     model_number: int | None = None
-    motor: Motor = field(default_factory=Motor)
+    motion: Callable[[], tuple[float, float, float]] = lambda: (0.0, 0.0, 0.0)
     _memory: bytearray = field(init=False)
     _heard_s: float = 0.0
 
@@ -90,9 +78,10 @@ class EmulatedServo:
 
     def measure(self) -> None:
         """Put what it measures into its registers."""
-        self["present_position"] = round(self.motor.position / self.model.position_unit)
-        self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        current = servo_models.current_of_torque(self.motor.torque)
+        position, velocity, torque = self.motion()
+        self["present_position"] = round(position / self.model.position_unit)
+        self["present_velocity"] = round(velocity / self.model.velocity_unit)
+        current = servo_models.current_of_torque(torque)
         self["present_current"] = round(current / self.model.current_unit)
 
     def heat(self, is_hot: bool) -> None:
