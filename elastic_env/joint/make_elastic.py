@@ -24,7 +24,7 @@ from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
-from elastic_env.joint.keyframes import give_keyframes, take_keyframes
+from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.motor import Motor
 from elastic_env.joint.supported_models import require_few
@@ -121,11 +121,10 @@ def transform_hinges(
     require_known("form", [form], get_args(Form))
     require_known("actuator rule", [actuators], get_args(ActuatorRule))
     elastic = spec.copy()
-    keyframes = take_keyframes(elastic)
-    _resolve_springdampers(elastic, list(joints))
-    for name, joint in joints.items():
-        _transform(elastic, _hinge(elastic, name), joint, form, actuators)
-    give_keyframes(elastic, keyframes, list(joints))
+    with carry_keyframes(elastic, list(joints)):
+        _resolve_springdampers(elastic, list(joints))
+        for name, joint in joints.items():
+            _transform(elastic, _hinge(elastic, name), joint, form, actuators)
     return elastic
 
 
