@@ -677,12 +677,12 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
         ({"base": "inptu"}, "'inptu'.*input"),
         ({"scenarios": ["sotf"]}, "'sotf'.*soft"),
         ({"weights": {"soft": 2.0}}, r"learned from, \['nominal'\], got 'soft'"),
-        ({"weights": {"nominal": -1.0}}, "greater than 0"),
+        ({"weights": {"nominal": -1.0}}, "weights.nominal must be > 0, got -1"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"base": "zero"}, "acts on deflection, which Zero does not have.*command"),
         (
             {"weights": {"nominal": 1e200}},
-            "weights.nominal must be less than or equal to 1000000, got 1e\\+200",
+            "weights.nominal must be <= 1000000, got 1e\\+200",
         ),
         (
             {"env_options": {"reward": {"link_error": 1e200}}},
@@ -702,7 +702,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
         ),
         (
             network(net_arch=[64, 10**9]),
-            r"net_arch: must be a list .*<= 4096.*, got \[64, 1000000000\]",
+            r"net_arch.1 must be <= 4096, got 1000000000",
         ),
         (
             options(learning_rate="x"),

@@ -26,7 +26,6 @@ from train.cells.store import CELLS, Store
 from train.commands.options import OnHardware
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import (
-    MOST_EPISODES,
     Condition,
     GivenRanges,
     GivenReference,
@@ -90,7 +89,7 @@ class CompareConfig(CodeNamingModel):
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: NumEpisodes = 1
     """Episodes per cell."""
-    scenario_episodes: dict[str, int] = {}
+    scenario_episodes: dict[str, NumEpisodes] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is
     random.
     """
@@ -170,10 +169,6 @@ class CompareConfig(CodeNamingModel):
             require_known(f"scenario of {name!r}", scenarios, known)
         if repeated := _repeated(references):
             yield f"the reference {quote(repeated[0])} stands twice; leave out one of them"
-        for name, count in self.scenario_episodes.items():
-            if not 1 <= count <= MOST_EPISODES:
-                bounds = f">= 1 and <= {MOST_EPISODES}"
-                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
             if name in known:

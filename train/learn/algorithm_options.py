@@ -28,30 +28,21 @@ _OURS = {
 """Arguments of the algorithms that are no options, and what stands in their place."""
 
 _LARGEST_WEIGHT = 1e3
-_WIDEST = 4096
-_MOST_LAYERS = 16
 
 
-def _network(*parts: str) -> Any:
-    """Annotation of the widths of hidden layers: of all networks, or a mapping by their names."""
-
-    def require(given: Any) -> Any:
-        named = given if isinstance(given, dict) else dict.fromkeys(parts, given)
-        if named.keys() != set(parts) or not all(map(_are_widths, named.values())):
-            raise ValueError(
-                f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <="
-                f" {_WIDEST}, or a mapping of such lists by {' and '.join(parts)}, got"
-                f" {quote(given)}"
-            )
-        return given
-
-    return Annotated[Any, AfterValidator(require)]
+_Width = Annotated[int, Field(ge=1, le=4096)]
+_Widths = Annotated[list[_Width], Field(max_length=16)]
+"""Widths of the hidden layers of a network."""
 
 
-def _are_widths(given: Any) -> bool:
-    if not isinstance(given, list) or len(given) > _MOST_LAYERS:
-        return False
-    return all(type(width) is int and 1 <= width <= _WIDEST for width in given)
+class _ActorAndValue(Model):
+    pi: _Widths
+    vf: _Widths
+
+
+class _ActorAndCritics(Model):
+    pi: _Widths
+    qf: _Widths
 
 
 def _entropy_weight(given: Any) -> Any:
@@ -100,7 +91,7 @@ class _NetworkOptions(Model):
 class _ActorCriticNetwork(_NetworkOptions):
     """Parameters of the network of PPO and A2C."""
 
-    net_arch: _network("pi", "vf") = [64, 64]  # pyright: ignore[reportInvalidTypeForm]
+    net_arch: _Widths | _ActorAndValue = [64, 64]
     """Widths of the hidden layers of both networks, or of actor (pi) and value (vf)."""
     share_features_extractor: bool = True
     ortho_init: bool = True
@@ -111,10 +102,7 @@ class _ActorCriticNetwork(_NetworkOptions):
 class _SACNetwork(_NetworkOptions):
     """Parameters of the networks of SAC."""
 
-    net_arch: _network("pi", "qf") = {  # pyright: ignore[reportInvalidTypeForm]
-        "pi": [64, 64],
-        "qf": [256, 256],
-    }
+    net_arch: _Widths | _ActorAndCritics = _ActorAndCritics(pi=[64, 64], qf=[256, 256])
     """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
     activation_fn: Literal["Tanh", "ReLU"] = "ReLU"
     log_std_init: float = quantity("1", -3.0, ge=-20, le=2)
