@@ -727,7 +727,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
         ({"algorithm": "m:C", **options(device="cuda")}, "leave out 'device'"),
         (
             {"algorithm": "SAC", **options(ent_coef="auot")},
-            "ent_coef: must be the weight .* got 'auot'",
+            "ent_coef must be as follows: Weight of the entropy, .* Got 'auot'",
         ),
         (
             {"algorithm": "A2C", **options(batch_size=8)},

@@ -4,14 +4,12 @@ A number beyond its bound would become nan, or fill the memory, in the midst of 
 refused before one.
 """
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.errors import quote
 
 CONSTANTS = "CMA-ES"
 """Algorithm that searches constants instead of training a network."""
@@ -45,18 +43,7 @@ class _ActorAndCritics(Model):
     qf: _Widths
 
 
-def _entropy_weight(given: Any) -> Any:
-    """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
-    if isinstance(given, str):
-        is_right = re.fullmatch(r"auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?", given)
-    else:
-        is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
-    if not is_right:
-        raise ValueError(
-            f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn"
-            f" it, or such as auto_0.1 to begin with it, got {quote(given)}"
-        )
-    return given
+_Auto = Annotated[str, Field(pattern=r"^auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?$")]
 
 
 class _Options(Model):
@@ -159,7 +146,7 @@ class _A2C(_OnPolicy):
 
 
 class _SAC(_StableBaselines):
-    ent_coef: Annotated[Any, AfterValidator(_entropy_weight)] = "auto"
+    ent_coef: _Auto | Annotated[float, Field(ge=0, le=_LARGEST_WEIGHT)] = "auto"
     """Weight of the entropy, at most 1000; auto to learn it, auto_0.1 to begin at 0.1."""
     batch_size: int = quantity("1", 512, ge=1, le=10**7)
     """Decisions in a minibatch."""
