@@ -139,7 +139,7 @@ def dask_cluster(
         started = [subprocess.Popen(command, env=known, **QUIET) for command in commands]  # type: ignore[call-overload]
         try:
             _wait_for_port(port)
-            yield Executors(f"dask://{at}"), started[1:]
+            yield Executors(on=f"dask://{at}"), started[1:]
         finally:
             for process in reversed(started):
                 process.terminate()

@@ -70,7 +70,7 @@ def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone
     expected = [evaluate(condition, num_threads=1) for condition in CONDITIONS]
     found = run_conditions(CONDITIONS, Console(quiet=True), dask)
     assert [e.episodes for e in found] == [e.episodes for e in expected]
-    with dask.open(3, tmp_path) as pool:
+    with dask.open_pool(3, tmp_path) as pool:
         outcomes = run_calls(killed_once, [("",), (str(tmp_path / "mark"),), ("",)], pool, Watch())
     assert [outcome is not None and outcome.error is None for outcome in outcomes] == [True] * 3
     assert (tmp_path / "mark").exists()
@@ -229,8 +229,10 @@ def test_other_versions_are_refused_with_both() -> None:
 
 @pytest.mark.parametrize("on", ["dask://nowhere", "ssh://host:1", "slurmy", ""])
 def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
-    with pytest.raises(ConfigurationError, match="on must be local, dask://HOST:PORT"):
-        Executors(on)
+    with pytest.raises(
+        ConfigurationError, match="on must be as follows: Executors: local, dask://HOST:PORT"
+    ):
+        Executors(on=on)
 
 
 @pytest.mark.parametrize(
@@ -241,7 +243,7 @@ def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
         (Executors(), 20, 1),
         (Executors(jobs=2), 20, 4),
         (Executors(jobs=12), 20, 1),
-        (Executors("dask://host:1"), 1, 1),
+        (Executors(on="dask://host:1"), 1, 1),
     ],
 )
 def test_calls_share_the_cores_of_this_machine(
@@ -259,7 +261,7 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(
     port = free_port()
     with (
         pytest.raises(SystemFailedError, match=f"no dask scheduler answers at 127.0.0.1:{port}"),
-        Executors(f"dask://127.0.0.1:{port}").open_pool(1, tmp_path),
+        Executors(on=f"dask://127.0.0.1:{port}").open_pool(1, tmp_path),
     ):
         pass
 

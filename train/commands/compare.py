@@ -23,7 +23,7 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
-from train.commands.options import OnHardware
+from train.commands.options import OnHardware, name_options
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import (
     Condition,
@@ -485,7 +485,8 @@ class Compare(Model):
             real["env_options"] = {**config.env_options, **real["env_options"]}
             simulated = {"scenario_episodes": {}, "groups": {}}
             config = config.replace(scenarios=["hardware"], **simulated, **real)
-        executors = Executors(self.on, self.jobs)
+        with name_options():
+            executors = Executors(on=self.on, jobs=self.jobs)
         output = self.resume or self.output
         is_resumed = self.resume is not None
         finished = compare(config, console, output, executors, is_resumed, self.fresh)
