@@ -12,7 +12,7 @@ import gymnasium
 from rich.console import Console
 from rich.progress import track
 
-from elastic_env.core.config import Model
+from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import (
     ElasticError,
     ResultsExistError,
@@ -70,14 +70,9 @@ def steps_within(task: Any, max_s: float | None) -> int:
     Args:
         task: Of the environment.
         max_s: Stop after this much simulated time [s]; None for the whole episode.
-
-    Raises:
-        ElasticError: That is no time.
     """
     if max_s is None:
         return task.num_steps
-    if not max_s > 0.0:
-        raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
     steps = max_s / task.assumed_model.control_period_s
     return max(round(min(steps, task.num_steps)), 1)
 
@@ -179,7 +174,7 @@ class WatchedEpisode(Model):
     """MotionOrDefault, as in elastic evaluate; default sine, on the walker 3."""
     seed: Seed = 0
     """Seed of the episode."""
-    max_s: float | None = None
+    max_s: float | None = quantity("s", None, gt=0)
     """Stop after this much simulated time [s]."""
 
     @property

@@ -28,6 +28,7 @@ from mujoco.studio import (
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from rich.console import Console
 
+from elastic_env.core.config import quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.commands.play import WatchedEpisode, episode, steps_within
@@ -98,7 +99,7 @@ def record(condition: Condition, console: Console, max_s: float | None) -> Recor
         max_s: Stop after this much simulated time [s].
 
     Raises:
-        ElasticError: The picture of the robot cannot be drawn side by side, or `max_s` is no time.
+        ElasticError: The picture of the robot cannot be drawn side by side.
     """
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     task = env.unwrapped.task
@@ -268,7 +269,7 @@ class View(WatchedEpisode):
     """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others
     reach it too.
     """
-    port: int = 0
+    port: int = quantity("1", 0, ge=0, le=65535)
     """Port of the page; 0 takes the first free one from 8080 on."""
 
     def run(self, console: Console) -> None:
