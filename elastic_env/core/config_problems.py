@@ -72,13 +72,13 @@ class ModelError(ConfigurationError):
     """
 
     def __init__(self, model: str, problems: Sequence[Problem]) -> None:
-        super().__init__(model, problems)
         self.model = model
         self.problems = tuple(problems)
+        super().__init__(self.describe(model))
 
-    def __str__(self) -> str:
-        """All problems, one per line, in the words of who made the model in Python."""
-        return self.describe(self.model)
+    def __reduce__(self) -> Any:
+        """What makes it anew in another process."""
+        return type(self), (self.model, self.problems)
 
     def describe(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = join_path) -> str:
         """All problems, one per line, for who wrote a file or options.
