@@ -22,11 +22,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, joint_torque
 from elastic_env.joint.friction import dry_friction
-from elastic_env.joint.joint_names import (
-    JointAddresses,
-    friction_name,
-    spring_name,
-)
+from elastic_env.joint.joint_names import JointAddresses, friction_name, spring_name
 
 _TERMS = 4
 _Fields = Callable[[str], Array]

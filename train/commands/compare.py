@@ -12,14 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from baselines.policies import is_saved
-from elastic_env.core.config import (
-    MOST_ENTRIES,
-    Entries,
-    Model,
-    Once,
-    Title,
-    load_yaml,
-)
+from elastic_env.core.config import MOST_ENTRIES, Entries, Model, Once, Title, load_yaml
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
