@@ -220,9 +220,8 @@ def load_json(
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(
-            f"{shorten(path)} describes no {what}: {error.describe()}"
-        ) from None
+        problem = f"{shorten(path)} describes no {what}: {error.describe()}"
+        raise ConfigurationError(problem) from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:

@@ -172,9 +172,8 @@ def _matching(pattern: str) -> list[Path]:
             disk.
     """
     if "**" in pattern:
-        raise ConfigurationError(
-            f"* stands for one part of a path, got {quote(pattern)}; leave ** out"
-        )
+        problem = f"* stands for one part of a path, got {quote(pattern)}; leave ** out"
+        raise ConfigurationError(problem)
     anchor = Path(pattern).anchor
     try:
         found = Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
