@@ -288,11 +288,11 @@ def test_a_residual_that_is_called_like_its_base_is_not_taken_for_it() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scenarios": ["nominal", "soft", "nominal"]}, "the scenario 'nominal' stands twice"),
+        ({"scenarios": ["nominal", "soft", "nominal"]}, "scenarios: 'nominal' stands twice"),
         ({"references": [3, 1.6, {"step_period": 3.0}]}, "the reference '3 s' stands twice"),
         (
             {"sweep": {"option": "stiffness_scale", "values": [1, 1]}},
-            "the value of the sweep 1.0 stands twice",
+            "sweep.values: 1.0 stands twice",
         ),
         (
             {

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -10,6 +11,7 @@ from rich.table import Table
 
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.identification.identify import Identification, identify_points
+from baselines.policies import is_saved
 from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare import CompareConfig
@@ -25,44 +27,27 @@ PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 """Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
 
 
-def _policies(*names: str) -> list[PolicySpec]:
-    return [PolicySpec(name=name) for name in names]
+def _part(reference: Any, *names: str, scenario: str = "nominal") -> CompareConfig:
+    """A motion, with some policies, of which a saved one is called residual."""
+    labels = {name: "residual" if is_saved(name) else None for name in names}
+    return CompareConfig(
+        name="demo",
+        env="testbed" if isinstance(reference, str) else "walker",
+        references=[reference],
+        scenarios=[scenario],
+        policies=[PolicySpec(name=name, label=label) for name, label in labels.items()],
+    )
 
 
-_STATIC = CompareConfig(
-    name="demo", references=["hold"], policies=_policies("uncompensated", "input")
-)
-_MOTION = CompareConfig(
-    name="demo",
-    references=["sine"],
-    policies=[
-        *_policies("uncompensated", "input", "dynamic", "oracle"),
-        PolicySpec(name="residual:testbed/seed_0", label="residual"),
-    ],
-)
-_SLOW_WALK = CompareConfig(
-    name="demo",
-    env="walker",
-    references=[{"step_period": 24, "num_steps": 2}],
-    policies=_policies("uncompensated", "input_output"),
-)
-_WALK = CompareConfig(
-    name="demo",
-    env="walker",
-    references=[3],
-    policies=_policies("uncompensated", "input_output", "input_wrench"),
-)
-# where the model is right, a residual leaves its base alone
-_SOFT_WALK = CompareConfig(
-    name="demo",
-    env="walker",
-    references=[3],
-    scenarios=["soft"],
-    policies=[
-        *_policies("input_output"),
-        PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
-    ],
-)
+_PARTS = [
+    _part("hold", "uncompensated", "input"),
+    _part("sine", "uncompensated", "input", "dynamic", "oracle", "residual:testbed/seed_0"),
+    _part({"step_period": 24, "num_steps": 2}, "uncompensated", "input_output"),
+    _part(3, "uncompensated", "input_output", "input_wrench"),
+    # where the model is right, a residual leaves its base alone
+    _part(3, "input_output", "residual:walker_3s/seed_0", scenario="soft"),
+]
+"""Static poses and a motion of the testbed, then walks."""
 
 
 class Demo(Model):
@@ -74,8 +59,7 @@ class Demo(Model):
     def run(self, console: Console) -> None:
         """Run, print the tables beside the paper's figures, and say where the pictures are."""
         plots.require_matplotlib()
-        shown = (_STATIC, _MOTION, _SLOW_WALK, _WALK, _SOFT_WALK)
-        parts = [config.conditions() for config in shown]
+        parts = [config.conditions() for config in _PARTS]
         conditions = list(chain(*parts))
         recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:

@@ -12,7 +12,7 @@ from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import spread
+from train.figures.chart import quantiles
 from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
@@ -39,7 +39,7 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
     rows = []
     for title, curves in learning.items():
         for column in columns:
-            best, median, worst = spread(curves.ratios[column.metric])
+            best, median, worst = quantiles(curves.ratios[column.metric])
             for at, *values in zip(curves.decisions, median, best, worst, strict=True):
                 figures = (f"{value:.2f}" for value in values)
                 rows.append([title, column.title, f"{at:.0f}", *figures])
