@@ -166,7 +166,9 @@ def legend(found: Sequence[Standing]) -> str:
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
     episodes = f"episodes of a scenario, per training seed: {span}"
-    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}"
+    over = dict.fromkeys(s.interval_over for s in found if s.interval_over)
+    intervals = f" Intervals are 95 % over {', or '.join(over)}." if over else ""
+    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}"
 
 
 def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
@@ -254,14 +256,17 @@ def read_leaderboard(path: Path) -> list[Standing]:
 def _standing(row: Mapping[str, str]) -> Standing:
     fields = {}
     for name in Standing.__dataclass_fields__:
+        if name == "interval_over" and name not in row:
+            continue  # of a leaderboard that was written before there was one
         cells = [row[column] for column in _COLUMNS.get(name, (name,))]
         fields[name] = _FIELDS[len(cells)](*cells)
     return _STANDING.validate_python(fields)
 
 
 def _estimate(value: str, low: str, high: str) -> Estimate:
-    ends = (float(low), float(high)) if low else ()
-    return Estimate(float(value), *ends)
+    if not low:
+        return Estimate(float(value))
+    return Estimate(float(value), float(low), float(high))
 
 
 def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
