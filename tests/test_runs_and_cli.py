@@ -1007,14 +1007,14 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch.setattr(
         train.commands.demo,
         "_SOFT_WALK",
-        train.commands.demo._SOFT_WALK.replace(references=[short_walk]),
+        train.commands.demo._SOFT_WALK.replace(references=[{**short_walk, "num_steps": 2}]),
     )
     main(["demo"])
     printed = capsys.readouterr().out
     walks = {
-        f"{name}_0.3+0.5+0.3_s_num_steps=1_{scenario}.png"
+        f"{name}_0.3+0.5+0.3_s_num_steps={steps}_{scenario}.png"
         for name in ("pelvis", "zmp")
-        for scenario in ("nominal", "soft")
+        for steps, scenario in ((1, "nominal"), (2, "soft"))
     }
     names = {
         "fig5_identification.png",
