@@ -32,10 +32,13 @@ from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
 from baselines.walking.foot_balance import FootBalance
+from baselines.walking.foot_tare import FootTare
+from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.hip_torque import HipTorque
 from baselines.walking.posture import PostureFeedback
 from baselines.walking.stance_roll import StanceRoll
-from baselines.walking.zmp_offset import ZmpOffset
+from baselines.walking.standing_estimate import StandingEstimate
+from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
@@ -131,8 +134,9 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
 
 def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """The compensated policy that a feedback is built on."""
-    require_known("base of a feedback", [options.base], COMPENSATED)
-    return COMPENSATED[options.base](env, model, options)
+    base = options.base or _BASE
+    require_known("base of a feedback", [base], COMPENSATED)
+    return COMPENSATED[base](env, model, options)
 
 
 def _weighing(build: Builder) -> Builder:
@@ -163,6 +167,27 @@ def _with_posture(build: Builder) -> Builder:
         return ZmpOffset(policy, model, options.zmp_offset)
 
     return built
+
+
+_adaptive_posture = _weighing(_with_posture(_adaptive))
+
+
+def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """`adaptive_posture` whose feet land as planned, whose ZMP has no mean error."""
+    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
+        options = options.replace(base="dynamic", output=options.output or "taylor")
+    if options.zmp_offset is None:
+        options = options.replace(zmp_offset=ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S))
+    policy: Any = _adaptive_posture(env, model, options)
+    policy = StandingEstimate(policy, model, options.standing)
+    policy = FootholdCorrection(policy, model, options.foothold)
+    return FootTare(policy, model, options.foot_tare)
+
+
+_BASE = "input_output"
+_FAST_STEP_S = 2.0
+"""Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
+_ZMP_OFFSET_S = 23.0
 
 
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
@@ -233,6 +258,7 @@ _CONTROLLER = ("gains", "com_feedback", "ramp_s")
 _COMPENSATED = (*_COMPENSATOR, "gains", "com_feedback")
 _ADAPTIVE = (*_COMPENSATED, "base", "adaptation")
 _POSTURE = ("posture", "zmp_offset")
+_FOOTHOLD = ("foothold", "standing", "foot_tare")
 _LEARNED = ("learned_base", "learning")
 _PUBLISHED = ("stance_roll", "foot_balance", "ramp_s")
 _TALOS = (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque")
@@ -263,7 +289,8 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
     "adaptive": NamedPolicy(_weighing(_adaptive), _ADAPTIVE),
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
-    "adaptive_posture": NamedPolicy(_weighing(_with_posture(_adaptive)), (*_ADAPTIVE, *_POSTURE)),
+    "adaptive_posture": NamedPolicy(_adaptive_posture, (*_ADAPTIVE, *_POSTURE)),
+    "foothold": NamedPolicy(_foothold, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD)),
     "torque_sensor": _measured(TORQUE_SENSOR, (*_COMPENSATED, "adaptation")),
     "hip_sensor": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation"), ("hip",)),
     "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation")),
@@ -283,7 +310,7 @@ def policies_of(is_walker: bool) -> Mapping[str, NamedPolicy]:
     return ON_THE_WALKER if is_walker else ON_JOINTS
 
 
-BEST_ON_THE_WALKER: str | None = "adaptive_posture"
+BEST_ON_THE_WALKER: str | None = "foothold"
 """Best policy of the walker that needs no training and reads the standard sensors; residuals are
 compared with it.
 """

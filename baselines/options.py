@@ -9,9 +9,12 @@ from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
 from baselines.walking.controller import WalkingGains
 from baselines.walking.foot_balance import FootBalanceGains
+from baselines.walking.foot_tare import FootTareGains
+from baselines.walking.foothold import FootholdGains
 from baselines.walking.hip_torque import HipTorqueGains
 from baselines.walking.posture import PostureGains
 from baselines.walking.stance_roll import StanceRollGains
+from baselines.walking.standing_estimate import StandingGains
 from baselines.walking.zmp_offset import ZmpOffsetGains
 from elastic_env.core.config import Model, quantity
 from elastic_env.motion.trajectory import STAND_S
@@ -35,16 +38,23 @@ class PolicyOptions(Model):
     """Walker: whether the controller feeds the center of mass back."""
     gains: WalkingGains | None = None
     """Walker: gains of the controller, over those that the policy's name stands for."""
-    base: str = "input_output"
-    """Walker: the compensated policy that `adaptive`, `posture` and `adaptive_posture` build on."""
+    base: str | None = None
+    """Walker: the compensated policy that a feedback builds on; None for `input_output`, and for
+    `dynamic` where `foothold` walks with steps of less than 2 s."""
     adaptation: AdaptationGains = AdaptationGains()
     """How fast the stiffness is adapted."""
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
     zmp_offset: ZmpOffsetGains | None = None
     """Walker: how the planned ZMP is shifted against the mean error of the measured one; None
-    for not at all.
+    for not at all, and for `foothold` with its own time constant.
     """
+    foothold: FootholdGains = FootholdGains()
+    """Walker: how `foothold` corrects where the feet land."""
+    standing: StandingGains = StandingGains()
+    """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
+    foot_tare: FootTareGains = FootTareGains()
+    """Walker: how `foothold` sets the foot sensors to zero."""
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()

@@ -2,19 +2,23 @@
 
 Every trial is a servo of known parameters that plays three motions: two sweeps at two gains, and
 a lift whose torque is taken off. The truth is played at a hundredth of the fit's step, and read by
-an encoder of 4096 counts a turn with noise.
+an encoder of 4096 counts a turn with noise. Writes docs/results/servo_coverage.csv; some minutes.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import tyro
 
 from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_load import Load
 from baselines.identification.servo_log import ServoLog
 from baselines.identification.servo_replay import NAMES, Replay
 from elastic_env.core.signals import Array
+from train.runs.escaping import write_records
 
 SOUGHT = (
     "position_gain",
@@ -25,14 +29,19 @@ SOUGHT = (
     "viscous_friction",
     "zero_offset",
     "delay",
+    "switch_lead",
 )
 """Parameters that every trial has and that the logs tell."""
 COUNT_RAD = 2.0 * np.pi / 4096
 NOISE_RAD = 1e-3
+STEP_S = 5e-3
+"""Time between rows, within which the torque is switched [s]."""
+SMALLEST = 1e-3
+"""Value that a half-width is relative to at least, in the unit of the parameter."""
 
 
 def draw_servo(rng: np.random.Generator) -> Array:
-    """Parameters of a small servo, as in `NAMES`, (12,)."""
+    """Parameters of a small servo, as in `NAMES`, (13,)."""
     values: dict[str, float] = dict.fromkeys(NAMES, 0.0)
     values |= {
         "position_gain": rng.uniform(1.5e-3, 4e-3),
@@ -45,11 +54,12 @@ def draw_servo(rng: np.random.Generator) -> Array:
         "stribeck_speed": 0.3,
         "zero_offset": rng.uniform(-0.02, 0.02),
         "delay": rng.uniform(0.002, 0.02),
+        "switch_lead": rng.uniform(0.0, STEP_S),
     }
     return np.array([values[name] for name in NAMES])
 
 
-def make_logs(truth: Array, rng: np.random.Generator, step_s: float = 5e-3) -> list[ServoLog]:
+def make_logs(truth: Array, rng: np.random.Generator, step_s: float = STEP_S) -> list[ServoLog]:
     """Logs of three motions of a servo."""
     return [_record(log, truth, rng) for log in _motions(step_s)]
 
@@ -79,10 +89,11 @@ def _record(log: ServoLog, truth: Array, rng: np.random.Generator) -> ServoLog:
         gain=log.gain,
         load=log.load,
     )
-    # the torque goes off at the row that says so
-    at = np.minimum(np.searchsorted(log.time, fine + 1e-12, side="right") - 1, len(log.time) - 1)
+    told = fine + truth[NAMES.index("switch_lead")] + 1e-12
+    at = np.minimum(np.searchsorted(log.time, told, side="right") - 1, len(log.time) - 1)
     dense = replace(dense, enabled=log.enabled[at])
-    q = Replay.of(dense).play(truth)[::100][: len(log.time)]
+    at_once = np.where(np.array(NAMES) == "switch_lead", 0.0, truth)
+    q = Replay.of(dense).play(at_once)[::100][: len(log.time)]
     q = q + NOISE_RAD * rng.normal(size=len(q))
     return replace(log, position=np.round(q / COUNT_RAD) * COUNT_RAD)
 
@@ -95,22 +106,37 @@ def holds(fit: ServoFit, truth: Array) -> dict[str, bool]:
     }
 
 
-def main(trials: int = 100) -> None:
-    """Print how many of the intervals hold the truth, and their median half-width."""
-    counts: dict[str, int] = dict.fromkeys(SOUGHT, 0)
-    widths: dict[str, list[float]] = {name: [] for name in SOUGHT}
+def records(trials: int) -> Iterator[dict[str, Any]]:
+    """Rows of the table, one per parameter."""
+    held: list[dict[str, bool]] = []
+    widths: list[dict[str, float]] = []
     for seed in range(trials):
         rng = np.random.default_rng(seed)
         truth = draw_servo(rng)
         fit = fit_servo(make_logs(truth, rng))
-        for name, held in holds(fit, truth).items():
-            counts[name] += held
-            widths[name].append(fit.half(name) / max(abs(truth[NAMES.index(name)]), 1e-3))
+        held.append(holds(fit, truth))
+        sizes = np.maximum(np.abs(truth), SMALLEST)
+        widths.append({name: fit.half(name) / sizes[NAMES.index(name)] for name in SOUGHT})
         if seed % 10 == 9:
-            print(seed + 1, counts, flush=True)
+            print(f"{seed + 1} servos", flush=True)
     for name in SOUGHT:
-        print(f"{name}: {counts[name]} of {trials}, ± {100 * np.median(widths[name]):.2g} %")
+        yield {
+            "parameter": name,
+            "trials": trials,
+            "holds": sum(own[name] for own in held),
+            "half_width_median": f"{np.median([own[name] for own in widths]):.4g}",
+        }
+
+
+def main(trials: int = 100) -> None:
+    """Write how many of the intervals hold the truth, and their median half-width.
+
+    Args:
+        trials: Servos.
+    """
+    folder = Path(__file__).parents[1] / "docs" / "results"
+    print(f"wrote {write_records(list(records(trials)), folder / 'servo_coverage.csv')}")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -2,6 +2,7 @@
 the truth."""
 
 import csv
+import io
 import json
 import math
 import re
@@ -26,10 +27,12 @@ from scipy.spatial.transform import Rotation
 from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
 from baselines.identification.arm_result import JointStiffness, bounded_compliance, describe_fit
+from baselines.identification.holdout import FITTED, RIGID, HeldOut, Judged, judge, split
 from baselines.identification.log_signs import turn_joint
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
+from baselines.identification.rivals import RIVALS
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -38,6 +41,7 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
+from train.commands.held_out import HoldoutOptions, judge_poses
 from train.commands.identify_arm import result_table
 from train.figures.arm_plots import deflections
 
@@ -425,6 +429,9 @@ def test_command_on_the_example_writes_what_the_compensator_takes(
     fits its arm."""
     run("--log", str(EXAMPLE), "--plan", "5", "--output", "found", "--assume", "1500")
     said = capsys.readouterr().out
+    assert said.startswith("held out: ")
+    found = json.loads(Path("found/identification.json").read_text())
+    assert HeldOut.model_validate(found["held_out"]).is_ahead
     assert "base_yaw; gravity does not load it" in said
     names = {path.name for path in Path("found").iterdir()}
     assert {"identification.json", "joints.yaml", "identification.png", "plan.csv"} <= names
@@ -859,6 +866,47 @@ def test_a_log_that_no_springs_explain_is_refused() -> None:
         )
 
 
+@pytest.mark.parametrize("kind", sorted(NOISE))
+def test_held_out_errors_are_those_of_fits_that_did_not_see_the_poses(kind: Kind) -> None:
+    """Catches a fit that saw what it predicts, and a frame or a unit that is not the log's."""
+    log = log_of(kind, 21, 40, friction=1.0, sides=True)
+    parts = split(40, share=0.3, folds=1, seed=3)
+    held_out = judge(Judged.of_poses(model_of(log)), parts, 3, lambda done: None)
+    errors = {error.name: error.rms for error in held_out.errors}
+    assert list(errors) == [RIGID, *RIVALS, FITTED]
+    assert (held_out.poses, held_out.held_out) == (28, 12)
+    assert held_out.curve[-1].rms == pytest.approx(errors[FITTED])
+    scale = {"N·m": 1.0}.get(held_out.unit, 1e3)
+    noise = scale * NOISE[kind] * {"end_effector": 3.0, "imu": 2.0}.get(kind, 1.0) ** 0.5
+    assert 0.5 * noise < errors[FITTED] < 4.0 * noise
+    if kind != "torques":  # they change little with the deflection
+        assert errors[FITTED] < 0.5 * min(errors[name] for name in errors if name != FITTED)
+
+
+def test_the_rigid_error_is_that_of_the_model_as_given() -> None:
+    """By hand: link encoders less motor encoders; torques less those of the rigid arm."""
+    part = split(40, share=0.3, folds=1, seed=3)
+    for kind in ("link_encoders", "torques"):
+        log = log_of(kind, 22, 40)
+        held_out = judge(Judged.of_poses(model_of(log)), part, 3, lambda done: None)
+        rigid = log.theta if kind == "link_encoders" else model_of(log).arm.torque(log.theta)
+        scale = 1e3 if kind == "link_encoders" else 1.0
+        missed = scale * (log.measured - rigid)[part[0]]
+        assert held_out.errors[0].rms == pytest.approx(np.sqrt(np.mean(missed**2)))
+        assert held_out.errors[0].worst == pytest.approx(np.abs(missed).max())
+
+
+def test_a_log_of_too_few_poses_is_fitted_whole() -> None:
+    """Catches an identification that is refused for the sake of its judgement."""
+    said = io.StringIO()
+    console = Console(file=said, width=200)
+    judged = Judged.of_poses(model_of(log_of("link_encoders", 23, 20)))
+    assert judge_poses(judged, HoldoutOptions(), console, seed=0) is None
+    assert said.getvalue().startswith(
+        "nothing is held out: 20 poses leave 14 to fit and 6 to hold out"
+    )
+
+
 def test_chosen_joints_alone_are_sought() -> None:
     """Catches a pattern that is ignored: all other joints stay rigid."""
     stiff = np.where(np.isin(JOINTS, ["elbow", "wrist_pitch"]), K, 1e12)
@@ -877,3 +925,24 @@ def test_chosen_joints_alone_are_sought() -> None:
     log = PoseLog(JOINTS, theta, "end_effector", ("x", "y", "z"), measured)
     fit = fit_arm(model_of(log, elastic=("elbow", "wrist_pitch")))
     np.testing.assert_allclose(1.0 / fit.estimate("compliance")[0], [900.0, 250.0], rtol=1e-4)
+
+
+def test_help_tells_options_of_testbed_arm_and_servo_apart(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches options of different robots in one list."""
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    said = capsys.readouterr().out
+    groups = re.split(r"(?m)^\W+(\S+) options ", said)
+    by_name = dict(zip(groups[1::2], groups[2::2], strict=True))
+    for group, option in (
+        ("testbed", "--scenario"),
+        ("hardware", "--port"),
+        ("arm", "--robot"),
+        ("arm.judgement", "--holdout"),
+        ("arm.geometry", "--lateral"),
+        ("arm.servo", "--mass-kg"),
+    ):
+        has = [name for name, text in by_name.items() if re.search(rf"(?m)^\W+{option}[ ,]", text)]
+        assert has == [group]

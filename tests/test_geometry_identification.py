@@ -13,16 +13,25 @@ from baselines.identification.geometry_fit import (
     align_tracker,
     fit_geometry,
 )
-from baselines.identification.geometry_model import GeometryModel, Parameters
+from baselines.identification.geometry_model import AxialTorques, GeometryModel, Parameters
 from baselines.identification.geometry_result import correct_model, describe_geometry
-from baselines.identification.holdout import FITTED, HeldOut, HeldOutError, judge, split
+from baselines.identification.holdout import (
+    FITTED,
+    HeldOut,
+    HeldOutError,
+    Judged,
+    judge,
+    split,
+)
 from baselines.identification.pose_log import read_log, write_poses
 from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.links import Tree
+from tests import test_arm_identification
 from train.commands.cli import main
-from train.commands.identify_geometry import verdict
+from train.commands.held_out import verdict
+from train.commands.identify_geometry import GeometryOptions, pose_problem
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base" pos="0 0 0.3">
 <joint name="pan" axis="0 0 1" range="-2 2" limited="true"/>
@@ -72,7 +81,15 @@ def some_parameters(generator: np.random.Generator) -> Parameters:
         length=0.02 * generator.standard_normal((4, 3)),
         angle=0.05 * generator.standard_normal((4, 3)),
         compliance=0.004 * np.abs(generator.standard_normal((4, 3))),
+        friction=2.0 * np.abs(generator.standard_normal(4)),
     )
+
+
+def sides(seed: int, count: int = 6) -> AxialTorques:
+    """Sides of approach, and torques that are known."""
+    generator = np.random.default_rng(seed)
+    size = (count, len(JOINTS))
+    return AxialTorques(generator.choice([-1.0, 0.0, 1.0], size=size), generator.normal(size=size))
 
 
 def test_a_rigid_nominal_arm_is_mujocos(model: mujoco.MjModel, geometry: GeometryModel) -> None:
@@ -90,21 +107,24 @@ def test_a_rigid_nominal_arm_is_mujocos(model: mujoco.MjModel, geometry: Geometr
         np.testing.assert_allclose(moments[i, :, 2], -data.qfrc_bias, atol=1e-12)
 
 
-def test_derivatives_are_difference_quotients(geometry: GeometryModel) -> None:
+@pytest.mark.parametrize("axial", [None, sides(11)], ids=["weight", "friction"])
+def test_derivatives_are_difference_quotients(
+    geometry: GeometryModel, axial: AxialTorques | None
+) -> None:
     """Catches a moment that does not change with a parameter, and a twist about a wrong point."""
     generator, q = draw(1)
     parameters = some_parameters(generator)
-    shown, gradient = geometry.gradient(parameters, q)
-    np.testing.assert_array_equal(shown, geometry.measured(parameters, q))
+    shown, gradient = geometry.gradient(parameters, q, axial)
+    np.testing.assert_array_equal(shown, geometry.measured(parameters, q, axial))
     for kind, values in parameters._asdict().items():
-        step = 1e-8 if kind == "compliance" else 1e-6
+        step = {"compliance": 1e-8, "friction": 1e-4}.get(kind, 1e-6)
         for index in np.ndindex(values.shape):
             more = values.copy()
             less = values.copy()
             more[index] += step
             less[index] -= step
-            change = geometry.measured(parameters._replace(**{kind: more}), q)
-            change = change - geometry.measured(parameters._replace(**{kind: less}), q)
+            change = geometry.measured(parameters._replace(**{kind: more}), q, axial)
+            change = change - geometry.measured(parameters._replace(**{kind: less}), q, axial)
             own = getattr(gradient, kind)[(..., *index)]
             size = np.abs(getattr(gradient, kind)).max()
             np.testing.assert_allclose(own, change / (2.0 * step), atol=1e-7 * size)
@@ -164,7 +184,7 @@ def made_up(
         truth[problem.unknowns.part(kind)] *= 0.1  # what an alignment leaves
     own = problem.unknowns.part("compliance")
     truth[own] = prior[own] * generator.uniform(0.1, 0.6, len(own))
-    shown = arm.measured(problem.parameters(truth), theta)
+    shown = arm.measured(problem.parameters(truth), theta, problem.axial)
     measured = shown + noise_m * generator.standard_normal(blank.shape)
     return GeometryProblem(arm, theta, measured, JOINTS, elastic=JOINTS, **options), truth  # type: ignore[arg-type]
 
@@ -173,6 +193,7 @@ def made_up(
     "options",
     [
         {"geometry": "dh"},
+        {"geometry": "offsets", "axial": sides(12, 30)},
         pytest.param({"geometry": "full", "lateral": True}, marks=pytest.mark.slow),
     ],
 )
@@ -186,6 +207,48 @@ def test_intervals_hold_the_truth(geometry: GeometryModel, options: dict[str, ob
         own = QUANTILE * np.sqrt(np.diag(fit.covariance))
         held.append(np.abs(fit.x - truth) < own)
     assert np.mean(held) > 0.9
+
+
+def arm_with_friction(seed: int) -> GeometryProblem:
+    """Markers of an arm with friction by MuJoCo, which was approached from known sides."""
+    log = test_arm_identification.log_of("end_effector", seed, 40, friction=1.0, sides=True)
+    arm = test_arm_identification.ARM
+    return pose_problem(GeometryOptions(), arm, log, log.joints, "marker")[0]
+
+
+@pytest.mark.slow
+def test_friction_of_known_sides_is_told_apart_from_stiffness() -> None:
+    """Of an arm that MuJoCo bends: catches a K that friction pulls, and a sign of the sides."""
+    truths = {
+        "compliance": 1.0 / test_arm_identification.K,
+        "friction": test_arm_identification.FRICTION,
+    }
+    held = []
+    off = []
+    for seed in range(8):
+        fit = fit_geometry(arm_with_friction(seed))
+        found = {(own.kind, own.name): own for own in fit.estimates}
+        for kind, truth in truths.items():
+            for joint, value in zip(fit.problem.joints, truth, strict=True):
+                own = found[kind, joint]
+                if own.is_told:
+                    held.append(abs(own.value - value) < QUANTILE * own.deviation)
+                    off.append((own.value - value) / own.deviation)
+    assert len(held) > 60
+    assert np.mean(held) > 0.9
+    assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off))
+
+
+def test_sides_of_approach_lower_the_noise() -> None:
+    """Catches sides that are read and not used."""
+    problem = arm_with_friction(3)
+    blind = fit_geometry(replace(problem, axial=None))
+    fit = fit_geometry(problem)
+    assert fit.noise_m < 0.6 * blind.noise_m
+    found = {own.name: own for own in fit.estimates if own.kind == "friction"}
+    for joint, truth in zip(problem.joints, test_arm_identification.FRICTION, strict=True):
+        assert abs(found[joint].value - truth) < 4.0 * found[joint].deviation
+    assert found["elbow"].is_told
 
 
 def test_what_poses_do_not_tell_keeps_its_prior_and_is_named(geometry: GeometryModel) -> None:
@@ -207,7 +270,7 @@ def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
             geometry, weight=scale * geometry.weight, weight_moment=scale * geometry.weight_moment
         )
         own = GeometryProblem(scaled, problem.theta, problem.measured, JOINTS, "dh", JOINTS)
-        errors.append(judge(own, parts, 0, lambda done: None).errors[-1].rms_mm)
+        errors.append(judge(Judged.of_geometry(own), parts, 0, lambda done: None).errors[-1].rms)
     assert np.ptp(errors) < 0.1 * errors[1]
 
 
@@ -239,11 +302,11 @@ def test_a_rival_that_is_ahead_comes_first(own: float, first: str) -> None:
     """Catches a table that hides that regression does better."""
     errors = [("rigid", 18.0), ("kernel regression", 16.0), (FITTED, own)]
     held_out = HeldOut(
+        of="markers",
+        unit="mm",
         poses=10,
         held_out=10,
-        errors=tuple(
-            HeldOutError(name=name, rms_mm=rms, mean_mm=rms, worst_mm=rms) for name, rms in errors
-        ),
+        errors=tuple(HeldOutError(name=name, rms=rms, mean=rms, worst=rms) for name, rms in errors),
         curve=(),
     )
     assert verdict(held_out).startswith(first)
@@ -295,10 +358,23 @@ def test_a_marker_has_three_columns(tmp_path: Path, columns: list[str], message:
         read_log(path, {"pan": (-2.0, 2.0)})
 
 
-def test_too_few_poses_for_a_split_are_said() -> None:
-    """Catches an error of two poses that looks like evidence."""
-    with pytest.raises(ConfigurationError, match=r"12 poses leave 4 .*--holdout 0"):
-        split(12, share=0.3, folds=1, seed=0)
+@pytest.mark.parametrize(
+    ("count", "folds", "said"),
+    [
+        (12, 1, "12 poses leave 8 to fit and 4 to hold out, 10 and 10 are needed; log more poses"),
+        (9, 3, "9 poses leave 6 to fit and 9 to hold out"),
+        (20, 5, ""),
+        (12, 20, ""),
+    ],
+)
+def test_too_few_poses_for_a_split_are_said(
+    geometry: GeometryModel, count: int, folds: int, said: str
+) -> None:
+    """Catches an error of two poses that looks like evidence, and folds judged one by one."""
+    judged = Judged.of_geometry(made_up(geometry, 7, count=count, noise_m=3e-4)[0])
+    parts = split(count, share=0.3, folds=folds, seed=0)
+    assert judged.too_few(parts).startswith(said)
+    assert bool(judged.too_few(parts)) == bool(said)
 
 
 def test_the_tracker_is_aligned_before_the_fit(geometry: GeometryModel) -> None:
@@ -318,7 +394,7 @@ def test_folds_hold_out_each_pose_once(geometry: GeometryModel) -> None:
     problem, _ = made_up(geometry, 8, count=40, noise_m=5e-4)
     parts = split(40, share=0.3, folds=4, seed=0)
     assert sorted(np.concatenate(parts)) == list(range(40))
-    held_out = judge(problem, parts, 0, lambda done: None)
+    held_out = judge(Judged.of_geometry(problem), parts, 0, lambda done: None)
     assert held_out.held_out == 40
     assert held_out.is_ahead
     assert [point.poses for point in held_out.curve] == [15, 30]

@@ -124,3 +124,15 @@ def test_friction_that_takes_all_of_the_load_is_refused() -> None:
     """Catches a command without end."""
     with pytest.raises(ConfigurationError, match=r"load_friction must be .* < 1, got 1\.2"):
         PositionCompensator.from_model(PENDULUM, {"servo": {"stiffness": K, "load_friction": 1.2}})
+
+
+def test_a_payload_that_jumps_is_said_with_the_friction_of_its_load() -> None:
+    """Up, a load takes (1 − c)⁻¹ of its torque: catches a jump by the weight alone."""
+    made = compensator()
+    along(made, np.linspace(0.0, 1.0, 101))
+    before = along(made, np.array([1.0]))[0]
+    added = 0.05 * 9.81 * 0.1 * np.sin(1.0)
+    jump = 1e3 * (1.0 / K + 1.0 / K_P) * added / 0.7
+    with pytest.warns(UserWarning, match=rf"'servo' by {jump:.3g} mrad at once"):
+        made.set_payload(0.05, at=(0.0, 0.0, -0.1))
+    assert 1e3 * (along(made, np.array([1.0]))[0] - before) == pytest.approx(jump, rel=1e-6)

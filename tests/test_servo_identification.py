@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from baselines.identification import servo_fit
-from baselines.identification.servo_fit import ServoFit, duty_per_torque_gain, fit_servo
+from baselines.identification.servo_file import AngleUnit
+from baselines.identification.servo_fit import ServoFit, fit_servo
 from baselines.identification.servo_holdout import (
     PREDICTIONS,
     LogErrors,
@@ -23,16 +24,18 @@ from baselines.identification.servo_holdout import (
     judge_servo,
 )
 from baselines.identification.servo_load import GRAVITY, Load
-from baselines.identification.servo_log import AngleUnit, ServoLog, read_servo_log
+from baselines.identification.servo_log import ServoLog, read_servo_log
+from baselines.identification.servo_problem import drive, duty_per_torque_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
+from docs.pages.recorded import priors
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
-from train.commands.identify_servo import show_result, verdict
-from train.recorded.servos import servo_figures
+from train.commands.identify_servo import fitted_logs, show_result, verdict
+from train.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 
 MASS_KG, LENGTH_M = 0.5, 0.1
 WEIGHT = MASS_KG * GRAVITY * LENGTH_M
@@ -513,7 +516,7 @@ def test_the_start_limits_the_torque_where_the_replay_does() -> None:
     _, logs = short_logs(5)
     log = replace(logs[0], supply=12.0)
     duty = 0.4 * log.gain * float(np.abs(log.goal - log.position).max())
-    torque = 1e-3 * servo_fit._drive(log, duty)
+    torque = 1e-3 * drive(log, duty)
     pull = 1e-3 * log.supply * log.gain * (log.goal - log.position)
     limit = 1e-3 * duty * log.supply
     np.testing.assert_allclose(torque, np.clip(pull, -limit, limit) * log.enabled)
@@ -604,9 +607,9 @@ def quick_fit(logs: Sequence[ServoLog], *rest: object) -> ServoFit:
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--plan", "20"], "--plan"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--joints", "a", "b"], "name one"),
         (["--robot", "arm.xml"], "--joints"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "./log.csv"], "one to fit"),
         (["copy.csv", "--mass-kg", "0.5", "--lever-m", "0.1"], "the same log"),
-        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "the same log"),
+        (["--mass-kg", "0.5", "--lever-m", "0.1", "--unfitted", "copy.csv"], "one to fit"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.002"], "holds out 0"),
         (["--mass-kg", "0.5", "--lever-m", "0.1", "--holdout", "0.9"], "fits 20 rows"),
     ],
@@ -625,6 +628,20 @@ def test_options_that_do_not_go_together_are_refused(
         main(["identify", "--log", str(path), *options])
     assert ended.value.code == 2
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["./b.csv", "copy.csv"])
+def test_a_log_that_is_named_twice_is_left_out_of_the_fit(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a log that is fitted and judged, by another path or as a copy."""
+    monkeypatch.chdir(tmp_path)
+    for file, gain in (("a.csv", 1.0), ("b.csv", 2.0), ("copy.csv", 2.0)):
+        csv_of(tmp_path / file, **good(), gain=np.full(len(good()["time"]), gain))
+    said = StringIO()
+    console = Console(file=said, width=200)
+    assert fitted_logs(["a.csv", "b.csv"], [name], console) == ["a.csv"]
+    assert said.getvalue() == "not fitted, as --unfitted says: b.csv\n"
 
 
 def test_a_log_that_is_not_there_is_named(
@@ -716,6 +733,24 @@ def test_each_gain_is_that_of_its_own_supply() -> None:
     assert "torque_limit at 7.4 V" in shown
 
 
+def test_a_torque_that_is_switched_before_its_row_is_replayed_so() -> None:
+    """A lead of a whole row is the row before; half a row lies between, as a fall has it."""
+    log = log_of(np.full(40, 1.0 + WEIGHT * np.sin(1.0) / 5.0), start=1.0, step_s=0.02)
+    late = replace(log, enabled=np.arange(40) < 20)
+    early = replace(log, enabled=np.arange(40) < 19)
+    own = parameters(position_gain=5.0, rotor_inertia=1e-3, motor_damping=0.05)
+    lead = NAMES.index("switch_lead")
+    played = {}
+    for share in (0.0, 0.5, 1.0):
+        own[lead] = share * 0.02
+        played[share] = Replay.of(late).play(own)
+    own[lead] = 0.0
+    np.testing.assert_allclose(played[1.0], Replay.of(early).play(own), atol=1e-12)
+    fallen = {share: played[share][19] - played[share][20] for share in played}
+    assert fallen[0.0] == pytest.approx(0.0, abs=1e-6)
+    assert fallen[0.5] == pytest.approx(fallen[1.0] / 4.0, rel=0.1)
+
+
 @pytest.mark.slow
 def test_intervals_hold_the_truth() -> None:
     """Few of many; `python -m tests.servo_trials` makes 100."""
@@ -739,6 +774,12 @@ def test_figures_of_recorded_servos_are_made(tmp_path: Path) -> None:
     assert [row["gain"] for row in figures["xl330"]["sag"]] == [100.0, 400.0]
     assert all(row["identified"] < row["the goal itself"] for row in figures["xl330"]["sag"])
     assert (tmp_path / "sts3250.png").exists()
+    rows = servo_rows(figures)
+    measures = [(row["servo"], row["measure"]) for row in rows]
+    assert measures.count(("xl330", "replay from other starts")) == len(FURTHER_SEEDS)
+    assert ("xl330", "replay without priors") in measures
+    texts = [{name: str(value) for name, value in row.items()} for row in rows]
+    assert priors(texts).startswith("* **Priors.**")
 
 
 def _recording(path: Path, motor: str, gain: float, name: str) -> None:

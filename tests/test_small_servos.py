@@ -16,7 +16,9 @@ from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 from elastic_env.robots.robot.environment import configure_robot
 from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.world.physics import SingleWorld
+from elastic_env.world.robot_model import RobotModel
 from tests.test_varying_friction import rigid_spec
 
 SHEETS = {
@@ -124,3 +126,62 @@ def test_the_back_emf_is_part_of_the_damping_that_is_assumed() -> None:
         assert made is not None
         braking.append(made.braking)
     assert braking[1] == pytest.approx(max(braking[0], motor.damping))
+
+
+SWUNG = Pendulum(gravity_torque=1.0, mass=1.0, gyration_radius=0.03)
+
+
+def swung(frequency_hz: float, amplitude: float = 1.2) -> TestbedConfig:
+    """A servo that swings a pendulum."""
+    motion = {"kind": "sine", "amplitude": amplitude, "frequency_hz": frequency_hz}
+    return TestbedConfig(joint=small_servo("STS3215"), pendulum=SWUNG, reference=motion)
+
+
+def test_a_sine_whose_largest_speed_falls_at_no_torque_is_played() -> None:
+    """Catches the largest torque beside what the motor has at the largest speed."""
+    config = swung(0.6)
+    servo = config.joint.servo
+    assert servo is not None
+    extent = config.reference.extent()
+    inertia = SWUNG.inertia + config.joint.rotor_inertia
+    most = SWUNG.gravity_torque * np.sin(1.2) + inertia * extent.q_ddot
+    assert most > servo.largest_torque(extent.q_dot)
+    assert config.plant().name == "testbed"
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "amplitude", "limit"),
+    [(0.9, 1.2, "0"), (2.0, 0.35, r"[\d.]+")],  # beyond the no-load speed; too heavy on the way
+)
+def test_a_sine_that_the_motor_cannot_follow_is_refused(
+    frequency_hz: float, amplitude: float, limit: str
+) -> None:
+    """Catches a check at other moments than those at which the motor is too weak."""
+    with pytest.raises(ConfigurationError, match=rf"servo limited to {limit} N·m"):
+        swung(frequency_hz, amplitude).plant()
+
+
+def test_the_demand_of_a_servo_is_the_closed_form() -> None:
+    """Up, down, and down so gently that the servo still has to drive; friction is on its way."""
+    joint = small_servo("STS3215").replace(viscous_friction=0.02)
+    motor, c, F = joint.servo.motor, joint.load_friction, joint.coulomb_friction
+    robot = RobotModel({"q": joint}, rigid_spec().compile(), 0.004)
+    torque = np.array([[0.5], [-0.8], [-0.01], [0.5]])
+    speed = np.array([[3.0], [3.0], [3.0], [0.0]])
+    left = motor.stall_torque - 3.0 * motor.damping
+    full = joint.servo.largest_torque()
+    viscous = 0.02 * 3.0
+    needed, limits = robot.demand(torque, speed)
+    np.testing.assert_allclose(
+        needed[:, 0],
+        [
+            (0.5 + viscous + F) / (1.0 - c),
+            0.8,
+            (viscous + F - 0.01) / (1.0 - c),
+            (0.5 + F) / (1 - c),
+        ],
+    )
+    np.testing.assert_allclose(limits[:, 0], [left, full, left, full])
+    turned, same = robot.demand(-torque, -speed)
+    np.testing.assert_allclose(turned, needed)
+    np.testing.assert_allclose(same, limits)

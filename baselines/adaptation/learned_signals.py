@@ -20,12 +20,12 @@ from typing_extensions import override
 
 from baselines.adaptation.iterative_learning import ChannelGains
 from baselines.compensation.measured import LINK_ENCODER
+from baselines.walking.flat_feet import FlatFeet
 from baselines.walking.posture import hip_offsets
 from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 LINK_IMU = "link_angle_imu"
@@ -92,23 +92,15 @@ class WalkSignals(LearnedSignals):
         self.gains = (gains.attitude, gains.attitude, gains.zmp_x, gains.zmp_y)
         table = model.observation_table
         self._model = model
-        self._sensors = FootSensors.of_biped(model.biped)
+        self._feet = FlatFeet(model, _LEAST_LOAD)
         self._attitude = table.group("imu_attitude")
-        self._wrench = table.group("wrench")
         self._zmp = table.group("zmp_reference")
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
         """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
-        missing = asked[:, self._zmp] - self.measured_zmp(seen)
+        missing = asked[:, self._zmp] - self._feet.zmp(seen)
         return np.hstack([seen[:, self._attitude], missing])
-
-    def measured_zmp(self, seen: Array) -> Array:
-        """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
-        biped = self._model.biped
-        least_n = _LEAST_LOAD * biped.weight
-        wrench = seen[:, self._wrench]
-        return self._sensors.zmp_of_flat_feet(wrench, biped.ankles, least_n)
 
     @override
     def offsets(self, table: Array) -> Array:

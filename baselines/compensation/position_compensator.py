@@ -244,7 +244,7 @@ class PositionCompensator:
                 mujoco.mju_rotVecQuat(place, np.array(payload.at), site.quat)
                 place += site.pos
         asked = self._asked
-        before = None if asked is None else self._torque(*asked)
+        before = None if asked is None else self._passed_along(asked)
         if (carrier, *place) != (self._carrier, *self._place):
             self._load = 0.0
             self._carrier = carrier
@@ -255,7 +255,7 @@ class PositionCompensator:
             self._load = payload.mass_kg
         self._links.set_load(self._carrier, self._load, self._place)
         if asked is not None and before is not None:
-            self._warn_of_jump(self._of_command * (self._torque(*asked) - before))
+            self._warn_of_jump(self._of_command * (self._passed_along(asked) - before))
 
     def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
@@ -348,6 +348,14 @@ class PositionCompensator:
             q_dot = (displacement + slack - self._rubbed.slack) / self._period_s
         passed = self._friction.passed(torque + self._viscous * q_dot, q_dot, self._rubbed)
         return self._of_command * passed + self._lag_s * q_dot
+
+    def _passed_along(self, motion: _Motion) -> Array:
+        """Torque that is passed to links at a motion, by the side of the last commands, (n,)."""
+        torque = self._torque(*motion)
+        if self._friction is None:
+            return torque
+        rate = np.zeros_like(torque) if motion[1] is None else motion[1]
+        return self._friction.passed(torque + self._viscous * rate, rate, self._rubbed)
 
     def _most_passed(self, torque: Array) -> Array:
         """Largest torque that is passed to links under loads of either sign, (n,) [N·m]."""

@@ -118,21 +118,22 @@ def fit_arm(model: PoseModel, progress: Callable[[int], None] | None = None) -> 
     """
     require_poses(model)
     require_like_encoders(model.log)
-    finest = _FINEST[model.log.kind]
     if _spread_near(model) > FAR_BEYOND * USUAL_NOISE[model.log.kind]:
         require_signs(model, _spread_near)
-    fit = _described(model, _solution(model, finest, progress), finest)
+    fit = _described(model, solve_unknowns(model, progress), _FINEST[model.log.kind])
     require_deflections_with_load(model, fit.unknowns, fit.estimate("compliance")[1])
     return fit
 
 
-def _solution(model: PoseModel, noise: float, progress: Callable[[int], None] | None) -> Array:
-    """Unknowns that fit, (p,).
+def solve_unknowns(model: PoseModel, progress: Callable[[int], None] | None = None) -> Array:
+    """Unknowns that fit, (p,); no check of the log.
 
     Raises:
         ElasticError: There are no springs that explain the log, or they are not found.
     """
-    problem = _Problem(model, noise, progress)
+    if not model.unknowns.size:
+        return np.zeros(0)
+    problem = _Problem(model, _FINEST[model.log.kind], progress)
     start = model.start_with(_FIRST_DEFLECTION_RAD) / model.scale
     found = _least_squares(problem, start, MOST_EVALUATIONS)
     if not found.success:  # ill-conditioned: steps in units of the derivatives come further
@@ -219,19 +220,23 @@ class _Problem:
         return np.concatenate([rows, np.eye(len(x))])
 
 
+def needed_poses(model: PoseModel) -> int:
+    """Poses that the unknowns need at least."""
+    return -(-model.unknowns.size // model.target.shape[1]) + _FURTHER_POSES
+
+
 def require_poses(model: PoseModel) -> None:
     """Refuse logs with fewer numbers than unknowns, and positions of another unit.
 
     Raises:
         ConfigurationError: Too few poses, or positions that the arm cannot reach.
     """
-    size = model.unknowns.size
-    each = model.target.shape[1]
-    needed = -(-size // each) + _FURTHER_POSES
+    needed = needed_poses(model)
     if len(model.log) < needed:
         raise ConfigurationError(
-            f"{size} unknowns need at least {needed} poses of {each} measured numbers each, the log"
-            f" has {len(model.log)}; log further poses, or seek fewer joints by --joints"
+            f"{model.unknowns.size} unknowns need at least {needed} poses of"
+            f" {model.target.shape[1]} measured numbers each, the log has {len(model.log)}; log"
+            " further poses, or seek fewer joints by --joints"
         )
     if model.log.kind == "end_effector":
         _require_reach(model)

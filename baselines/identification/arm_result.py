@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from baselines.identification.arm_fit import ArmFit
+from baselines.identification.holdout import HeldOut
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import SMALLEST_LOAD
 from elastic_env.core.config import Model
@@ -84,6 +85,8 @@ class ArmIdentification(Model):
     """Hinges of the model that the log does not have: they were held."""
     outlying_poses: tuple[int, ...]
     """Poses of the log, counted from 1, whose residual is far beyond the others'."""
+    held_out: HeldOut | None = None
+    """Errors at poses that another fit did not see; None where there are none."""
 
     def stiffness(self) -> dict[str, dict[str, float]]:
         """A mapping as `PositionCompensator` and the environments take it."""
@@ -108,7 +111,11 @@ class ArmIdentification(Model):
 
 
 def describe_fit(
-    fit: ArmFit, within: float, assumed: float | None, planned: Array | None = None
+    fit: ArmFit,
+    within: float,
+    assumed: float | None,
+    planned: Array | None = None,
+    held_out: HeldOut | None = None,
 ) -> ArmIdentification:
     """The result of a fit.
 
@@ -118,6 +125,7 @@ def describe_fit(
         assumed: K of joints whose interval of 1/K holds zero; None for their own estimate, or
             rigid.
         planned: Information with the proposed poses, (p, p); None without a plan.
+        held_out: Errors at poses that another fit did not see.
 
     Raises:
         ConfigurationError: No joint is identified and no stiffness is assumed.
@@ -148,6 +156,7 @@ def describe_fit(
             joint for joint in hinges_of(fit.model.arm.model) if joint not in log.joints
         ),
         outlying_poses=tuple(int(pose) + 1 for pose in fit.outliers),
+        held_out=held_out,
     )
 
 

@@ -17,7 +17,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from baselines.identification.geometry_model import Geometry, GeometryModel, Parameters
+from baselines.identification.geometry_model import (
+    AxialTorques,
+    Geometry,
+    GeometryModel,
+    Parameters,
+)
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array, IntArray
@@ -62,6 +67,8 @@ class GeometryPriors(Model):
     """Deflection of a joint about its axis under its largest torque [rad]."""
     lateral_rad: float = quantity("rad", 0.02, gt=0, le=1)
     """The same across its axis [rad]."""
+    friction_share: float = quantity("1", 0.3, gt=0, le=10)
+    """Dry friction of a joint over its largest torque, where sides of approach are logged."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +130,7 @@ class GeometryProblem:
         lateral: Whether their lateral compliance is sought too.
         priors: What is known before the poses.
         free: Joints whose frame is wholly unknown.
+        axial: Sides of approach and known torques; None where the log has neither.
     """
 
     model: GeometryModel
@@ -134,10 +142,16 @@ class GeometryProblem:
     lateral: bool = False
     priors: GeometryPriors = field(default_factory=GeometryPriors)
     free: tuple[str, ...] = ()
+    axial: AxialTorques | None = None
 
     def of_poses(self, chosen: IntArray) -> "GeometryProblem":
         """The problem of some of the poses, with the same unknowns and priors."""
-        other = replace(self, theta=self.theta[chosen], measured=self.measured[chosen])
+        other = replace(
+            self,
+            theta=self.theta[chosen],
+            measured=self.measured[chosen],
+            axial=None if self.axial is None else self.axial.of_poses(chosen),
+        )
         other.__dict__["unknowns"] = self.unknowns
         return other
 
@@ -155,9 +169,12 @@ class GeometryProblem:
 
     @cached_property
     def largest_moment(self) -> Array:
-        """Largest moments of gravity in these poses about the axes of each joint, (n, 3) [N·m]."""
+        """Largest moments in these poses about the axes of each joint, (n, 3) [N·m]."""
         rigid = self.model.posture(self.model.nominal_parameters(), self.theta)
-        moments = np.abs(self.model.moments(rigid)).max(axis=0)
+        loads = self.model.moments(rigid)
+        if self.axial is not None:
+            loads[..., 2] += self.axial.known
+        moments = np.abs(loads).max(axis=0)
         return np.maximum(moments, _SMALLEST_MOMENT * max(float(moments.max()), 1e-9))
 
     @cached_property
@@ -196,6 +213,8 @@ class GeometryProblem:
             for i, name in enumerate("xy" if self.lateral else ""):
                 prior = own.lateral_rad / moment[i]
                 seek("compliance", f"{joint}.{name}", 3 * j, np.eye(3)[i], prior)
+            if self.axial is not None and self.axial.direction[:, j].any():
+                seek("friction", joint, j, one, own.friction_share * moment[2])
         kinds, names, columns, priors = zip(*found, strict=True)
         return Unknowns(kinds, names, np.stack(columns, axis=1), np.array(priors))
 
@@ -222,11 +241,12 @@ class GeometryProblem:
 
     def residual(self, x: Array) -> Array:
         """Shown by the model less measured, (N k 3,) [m]."""
-        return (self.model.measured(self.parameters(x), self.theta) - self.measured).ravel()
+        shown = self.model.measured(self.parameters(x), self.theta, self.axial)
+        return (shown - self.measured).ravel()
 
     def linearised(self, x: Array) -> tuple[Array, Array]:
         """The residual, (N k 3,) [m], and its derivatives by x, (N k 3, p)."""
-        shown, gradient = self.model.gradient(self.parameters(x), self.theta)
+        shown, gradient = self.model.gradient(self.parameters(x), self.theta, self.axial)
         rows = shown.size
         flat = np.concatenate([part.reshape(rows, -1) for part in gradient], axis=1)
         return (shown - self.measured).ravel(), flat @ self.unknowns.basis
@@ -272,7 +292,8 @@ class GeometryFit:
 
     def missed(self, problem: GeometryProblem) -> Array:
         """Places of the markers less those that this fit predicts, (N, k, 3) [m]."""
-        return problem.measured - self.problem.model.measured(self.parameters, problem.theta)
+        shown = self.problem.model.measured(self.parameters, problem.theta, problem.axial)
+        return problem.measured - shown
 
     def errors(self, problem: GeometryProblem) -> Array:
         """Distances of the markers from where they were measured, (N, k) [m]."""

@@ -8,6 +8,8 @@ The nominal model has a frame for each hinge, whose z axis is the hinge's axis. 
   its anchor, in the axes F of the joint's housing. c_z = 1/K is the compliance about the joint's
   own axis, so that φ_z = −τ_g/K is what Eq. 10 has. c_x and c_y are lateral compliance:
   bearings and links that bend [Tenhumberg2023];
+* dry friction on the link holds a joint back from the side d = ±1 of its approach, and further
+  torques may be known: m_z has −F d and τ_known besides the weight, as in `pose_model`;
 * a tracker shows R p + t of the places p of markers, which are not exactly known either.
 
 With `dh` each frame has the four parameters of Denavit and Hartenberg: a length and an angle about
@@ -73,6 +75,7 @@ class Parameters(NamedTuple):
         length: v of each joint, in the axes of its nominal frame, (n, 3) [m].
         angle: ω of each joint, likewise, (n, 3) [rad].
         compliance: c about the axes of each housing, (n, 3) [rad/(N·m)]; 1/K is the last one.
+        friction: F of each joint, (n,) [N·m].
     """
 
     translation: Array
@@ -82,6 +85,23 @@ class Parameters(NamedTuple):
     length: Array
     angle: Array
     compliance: Array
+    friction: Array
+
+
+class AxialTorques(NamedTuple):
+    """What acts about the joints' own axes beside the weight, n joints and N poses.
+
+    Attributes:
+        direction: Side of approach, (N, n): +1 from below, −1 from above, 0 unknown [1].
+        known: Known further torque, (N, n) [N·m], positive where it turns the joint forward.
+    """
+
+    direction: Array
+    known: Array
+
+    def of_poses(self, chosen: IntArray) -> "AxialTorques":
+        """Those of some of the poses."""
+        return AxialTorques(self.direction[chosen], self.known[chosen])
 
 
 class Posture(NamedTuple):
@@ -228,18 +248,28 @@ class GeometryModel:
             length=np.zeros((n, 3)),
             angle=np.zeros((n, 3)),
             compliance=np.zeros((n, 3)),
+            friction=np.zeros(n),
         )
 
-    def measured(self, parameters: Parameters, theta: Array) -> Array:
+    def measured(
+        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
+    ) -> Array:
         """Places of the markers as the tracker shows them, (N, k, 3) [m], at motor encoders (N, n).
 
         Raises:
             ElasticError: The load overcomes a joint.
         """
-        return self._shown(parameters, self.posture(parameters, theta).marker)
+        return self._shown(parameters, self.posture(parameters, theta, axial).marker)
 
-    def posture(self, parameters: Parameters, theta: Array) -> Posture:
+    def posture(
+        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
+    ) -> Posture:
         """The joints at rest, by iteration: each deflection from the moments at the last ones.
+
+        Args:
+            parameters: Of the arm.
+            theta: Motor encoders, (N, n) [rad].
+            axial: What acts beside the weight; None for nothing.
 
         Raises:
             ElasticError: The load overcomes a joint.
@@ -250,7 +280,7 @@ class GeometryModel:
         if not parameters.compliance.any():
             return posture
         for _ in range(_MOST_ITERATIONS):
-            settled = parameters.compliance * self.moments(posture)
+            settled = parameters.compliance * self._loads(parameters, posture, axial)
             change = np.abs(settled - turn).max()
             turn = settled
             if not change < _FARTHEST_RAD:
@@ -264,19 +294,29 @@ class GeometryModel:
             f" {parameters.compliance[worst].max():.3g} rad/(N·m): there is no posture at rest"
         )
 
-    def gradient(self, parameters: Parameters, theta: Array) -> tuple[Array, Parameters]:
-        """Places of the markers, and their derivatives.
+    def _loads(self, parameters: Parameters, posture: Posture, axial: AxialTorques | None) -> Array:
+        """Moments that bend the joints, in the axes of the housings, (N, n, 3) [N·m]."""
+        moments = self.moments(posture)
+        if axial is not None:
+            moments[..., 2] += axial.known - parameters.friction * axial.direction
+        return moments
+
+    def gradient(
+        self, parameters: Parameters, theta: Array, axial: AxialTorques | None = None
+    ) -> tuple[Array, Parameters]:
+        """Places of the markers, and their derivatives; arguments as `posture`.
 
         Returns:
             Measured, (N, k, 3) [m], and the derivatives (N, k, 3, ...) by each parameter.
         """
-        posture = self.posture(parameters, theta)
+        posture = self.posture(parameters, theta, axial)
         shown = self._shown(parameters, posture.marker)
         R = self._tracker(parameters)
         count = len(theta)
         n = self.num_joints
         k = len(self.markers)
-        bent = self._bent(parameters, posture)
+        loads = self._loads(parameters, posture, axial)
+        bent = self._bent(parameters, posture, loads)
 
         def by(twists: Twists) -> Array:
             """Derivatives of the measurement by twists, (N, k, 3, P)."""
@@ -286,11 +326,17 @@ class GeometryModel:
             )
             return R @ (direct + np.einsum("nkaq,nqp->nkap", bent.marker, turned))
 
-        moments = self.moments(posture)
+        def by_turns(turns: Array) -> Array:
+            """Derivatives of the measurement by turns of the joints, (N, 3 n, P) [rad]."""
+            turned = np.linalg.solve(bent.matrix, turns)
+            return R @ np.einsum("nkaq,nqp->nkap", bent.marker, turned)
+
         own = np.zeros((count, 3 * n, 3 * n))
-        own[:, np.arange(3 * n), np.arange(3 * n)] = moments.reshape(count, 3 * n)
-        turned = np.linalg.solve(bent.matrix, own)
-        by_compliance = np.einsum("nkaq,nqp->nkap", bent.marker, turned)
+        own[:, np.arange(3 * n), np.arange(3 * n)] = loads.reshape(count, 3 * n)
+        held = np.zeros((count, 3 * n, n))
+        if axial is not None:
+            about_axes = -parameters.compliance[:, 2] * axial.direction
+            held[:, np.arange(2, 3 * n, 3), np.arange(n)] = about_axes
         of_marker = np.zeros((count, k, 3, k, 3))
         for i, marker in enumerate(self.markers):
             of_marker[:, i, :, i] = R @ (
@@ -304,7 +350,8 @@ class GeometryModel:
             offset=-by(self._about_axes(posture)),
             length=by(self._along_frames(posture)).reshape(count, k, 3, n, 3),
             angle=by(self._about_frames(parameters, posture)).reshape(count, k, 3, n, 3),
-            compliance=(R @ by_compliance).reshape(count, k, 3, n, 3),
+            compliance=by_turns(own).reshape(count, k, 3, n, 3),
+            friction=np.zeros((count, k, 3, n)) if axial is None else by_turns(held),
         )
 
     def _tracker(self, parameters: Parameters) -> Array:
@@ -395,11 +442,11 @@ class GeometryModel:
             turns_housing=np.ones(3 * self.num_joints, dtype=np.bool_),
         )
 
-    def _bent(self, parameters: Parameters, posture: Posture) -> "_Bent":
+    def _bent(self, parameters: Parameters, posture: Posture, loads: Array) -> "_Bent":
         """How deflections φ of all joints change markers and moments."""
         count = posture.link.shape[1]
         n = self.num_joints
-        turn = parameters.compliance * self.moments(posture)
+        turn = parameters.compliance * loads
         axes = np.moveaxis(posture.housing, 0, 1) @ _left_jacobian(turn)
         axis = axes.transpose(0, 1, 3, 2).reshape(count, 3 * n, 3)
         twists = Twists(

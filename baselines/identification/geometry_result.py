@@ -24,6 +24,7 @@ UNITS = {
     "length": "m",
     "angle": "rad",
     "compliance": "rad/(N·m)",
+    "friction": "N·m",
 }
 """Units of the kinds of parameters."""
 
@@ -32,7 +33,8 @@ class GeometryEstimate(Model):
     """One parameter and its 95 % interval."""
 
     kind: str
-    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance."""
+    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance,
+    friction."""
     name: str
     """Joint or marker, with the axis of the joint's frame where it has several."""
     value: float

@@ -1,30 +1,39 @@
 """Errors of an identification at poses that it did not see, beside rivals that need no physics."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from baselines.identification.geometry_fit import GeometryFit, GeometryProblem, fit_geometry
+from baselines.identification.arm_fit import needed_poses, solve_unknowns
+from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
+from baselines.identification.pose_log import Kind
+from baselines.identification.pose_model import PoseModel
 from baselines.identification.rivals import RIVALS
 from elastic_env.core.config import Model
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 
 RIGID = "rigid, as given"
 FITTED = "identified"
-_FEWEST_IN_CURVE = 10
+FEWEST_POSES = 10
+"""Poses on either side of a split, at least."""
+Missed = Callable[[IntArray], Array]
+"""Measured less predicted at chosen poses: vectors of k places, (N, k, d), in SI units."""
+ErrorUnit = Literal["mm", "mrad", "N·m"]
 
 
 class HeldOutError(Model):
-    """Distances of markers from their prediction at poses that were held out."""
+    """Distances of a measurement from its prediction at poses that were held out."""
 
     name: str
     """The prediction."""
-    rms_mm: float
-    """Root mean square over poses and markers."""
-    mean_mm: float
-    """Mean over poses and markers."""
-    worst_mm: float
+    rms: float
+    """Root mean square over poses, and over markers or joints."""
+    mean: float
+    """Mean over the same."""
+    worst: float
     """Largest."""
 
 
@@ -32,13 +41,17 @@ class CurvePoint(Model):
     """Held-out error of an identification from fewer poses."""
 
     poses: int
-    rms_mm: float
-    mean_mm: float
+    rms: float
+    mean: float
 
 
 class HeldOut(Model):
     """Held-out errors; a part of `identification.json`."""
 
+    of: str
+    """What was predicted."""
+    unit: ErrorUnit
+    """Unit of all errors."""
     poses: int
     """Poses that were fitted, in each fold."""
     held_out: int
@@ -50,12 +63,100 @@ class HeldOut(Model):
     @property
     def best_rival(self) -> HeldOutError:
         """The best prediction but the identification."""
-        return min(self.errors[:-1], key=lambda error: error.rms_mm)
+        return min(self.errors[:-1], key=lambda error: error.rms)
 
     @property
     def is_ahead(self) -> bool:
         """Whether the identification has less error than every rival."""
-        return self.errors[-1].rms_mm < self.best_rival.rms_mm
+        return self.errors[-1].rms < self.best_rival.rms
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Poses, and two ways to predict them from some of them.
+
+    Attributes:
+        theta: Motor encoders, (N, n) [rad].
+        of: What is predicted.
+        unit: Unit that errors are shown in.
+        fewest: Poses that an identification needs.
+        rigid: Fits the frame of the measurement alone to chosen poses.
+        identified: Fits all that is sought to chosen poses.
+    """
+
+    theta: Array
+    of: str
+    unit: ErrorUnit
+    fewest: int
+    rigid: Callable[[IntArray], Missed]
+    identified: Callable[[IntArray], Missed]
+
+    @classmethod
+    def of_geometry(cls, problem: GeometryProblem) -> "Judged":
+        """Markers of an arm whose geometry is sought too."""
+
+        def fit(inner: GeometryProblem) -> Missed:
+            found = fit_geometry(inner)
+            return lambda poses: found.missed(problem.of_poses(poses))
+
+        return cls(
+            theta=problem.theta,
+            of="markers",
+            unit="mm",
+            fewest=FEWEST_POSES,
+            rigid=lambda poses: fit(problem.of_poses(poses).align().as_rigid()),
+            identified=lambda poses: fit(problem.of_poses(poses).align()),
+        )
+
+    @classmethod
+    def of_poses(cls, model: PoseModel) -> "Judged":
+        """A measurement of an arm whose stiffness is sought."""
+        rigid = replace(model, unknowns=model.unknowns.of_frame())
+
+        def fit(inner: PoseModel) -> Missed:
+            found = solve_unknowns(inner)
+            return lambda poses: inner.at(model.log.part(poses)).missed(found)
+
+        of, unit = _SHOWN[model.log.kind]
+        return cls(
+            theta=model.log.theta,
+            of=of,
+            unit=unit,
+            fewest=max(needed_poses(model), FEWEST_POSES),
+            rigid=lambda poses: fit(replace(rigid, log=model.log.part(poses))),
+            identified=lambda poses: fit(replace(model, log=model.log.part(poses))),
+        )
+
+    def too_few(self, parts: list[IntArray]) -> str:
+        """Why a split leaves too few poses, with a cure; empty where it leaves enough."""
+        count = len(self.theta)
+        fitted = min(count - len(part) for part in parts)
+        held_out = sum(len(part) for part in parts)
+        if fitted >= self.fewest and held_out >= FEWEST_POSES:
+            return ""
+        return (
+            f"{count} poses leave {fitted} to fit and {held_out} to hold out, {self.fewest} and"
+            f" {FEWEST_POSES} are needed; log more poses, or choose --holdout or --folds"
+        )
+
+    def counts(self, parts: list[IntArray]) -> list[int]:
+        """Numbers of poses of the curve: halved down to the fewest, which come first."""
+        counts = []
+        count = len(self.theta) - len(parts[0])
+        while count >= self.fewest:
+            counts.append(count)
+            count //= 2
+        return counts[::-1]
+
+
+_SHOWN: dict[Kind, tuple[str, ErrorUnit]] = {
+    "end_effector": ("the end effector", "mm"),
+    "markers": ("markers", "mm"),
+    "imu": ("the IMU's vertical", "mrad"),
+    "link_encoders": ("link encoders", "mrad"),
+    "torques": ("joint torques", "N·m"),
+}
+"""What errors are of, and their unit."""
 
 
 def split(count: int, share: float, folds: int, seed: int) -> list[IntArray]:
@@ -66,31 +167,20 @@ def split(count: int, share: float, folds: int, seed: int) -> list[IntArray]:
         share: Share that is held out, if there is one fold.
         folds: Folds that hold out each pose once; 1 for a single split.
         seed: Seed of the draw.
-
-    Raises:
-        ConfigurationError: Too few poses are left.
     """
     order = np.random.default_rng(seed).permutation(count)
     if folds > 1:
-        parts = [np.sort(order[k::folds]) for k in range(folds)]
-    else:
-        parts = [np.sort(order[: round(share * count)])]
-    least = min(min(len(part), count - len(part)) for part in parts)
-    if least < _FEWEST_IN_CURVE:
-        raise ConfigurationError(
-            f"{count} poses leave {least} on one side of the split, {_FEWEST_IN_CURVE} are needed:"
-            " log more poses, or turn the split off by --holdout 0"
-        )
-    return parts
+        return [np.sort(order[k::folds]) for k in range(min(folds, count))]
+    return [np.sort(order[: round(share * count)])]
 
 
 def judge(
-    problem: GeometryProblem, parts: list[IntArray], seed: int, progress: Callable[[int], None]
+    judged: Judged, parts: list[IntArray], seed: int, progress: Callable[[int], None]
 ) -> HeldOut:
     """Fit without the poses of each part, and predict them.
 
     Args:
-        problem: All poses.
+        judged: All poses.
         parts: Poses that are held out, fold by fold.
         seed: Seed of the poses of the curve.
         progress: Called with the number of fits so far; `num_fits` says how many there are.
@@ -98,78 +188,76 @@ def judge(
     Raises:
         ElasticError: A fit does not converge.
     """
-    errors: dict[str, list[Array]] = {name: [] for name in (RIGID, *RIVALS, FITTED)}
+    everything = np.arange(len(judged.theta))
+    found: dict[str, list[Array]] = {}
     done = 0
     for part in parts:
-        rest = np.setdiff1d(np.arange(len(problem.theta)), part)
-        inner = problem.of_poses(rest).align()
-        outer = problem.of_poses(part)
-        rigid = fit_geometry(inner.as_rigid())
-        errors[RIGID].append(rigid.errors(outer))
-        for name, left in rival_errors(rigid, inner, outer).items():
-            errors[name].append(left)
-        errors[FITTED].append(fit_geometry(inner).errors(outer))
+        rest = np.setdiff1d(everything, part)
+        rigid = judged.rigid(rest)
+        inner = judged.theta[rest], rigid(rest)
+        errors = {
+            RIGID: _distances(rigid(part)),
+            **rival_errors(*inner, judged.theta[part], rigid(part)),
+            FITTED: _distances(judged.identified(rest)(part)),
+        }
+        for name, own in errors.items():
+            found.setdefault(name, []).append(own)
         done += 1
         progress(done)
-    rest = np.setdiff1d(np.arange(len(problem.theta)), parts[0])
-    outer = problem.of_poses(parts[0])
+    rest = np.setdiff1d(everything, parts[0])
+    order = np.random.default_rng(seed).permutation(rest)
     curve = []
-    for chosen in curve_poses(rest, seed):
-        own = 1e3 * fit_geometry(problem.of_poses(chosen).align()).errors(outer)
-        curve.append(CurvePoint(poses=len(chosen), rms_mm=_rms(own), mean_mm=float(own.mean())))
+    for count in judged.counts(parts):
+        try:
+            missed = judged.identified(np.sort(order[:count]))(parts[0])
+        except ElasticError:
+            continue  # so few poses need not tell springs that hold the arm
+        own = _summary("", [_distances(missed)], judged.unit)
+        curve.append(CurvePoint(poses=count, rms=own.rms, mean=own.mean))
         done += 1
         progress(done)
     return HeldOut(
+        of=judged.of,
+        unit=judged.unit,
         poses=len(rest),
         held_out=sum(len(part) for part in parts),
-        errors=tuple(_summary(name, np.concatenate(found)) for name, found in errors.items()),
+        errors=tuple(_summary(name, own, judged.unit) for name, own in found.items()),
         curve=tuple(curve),
     )
 
 
 def rival_errors(
-    rigid: GeometryFit, inner: GeometryProblem, outer: GeometryProblem
+    angles: Array, missed: Array, others: Array, missed_there: Array
 ) -> dict[str, Array]:
-    """Distances of the markers from what each rival predicts on top of a rigid fit, (N, k) [m].
+    """Distances from what each rival predicts on top of a rigid fit, (M, k), in SI units.
 
     Args:
-        rigid: Fit of the rigid model to the inner poses.
-        inner: Poses that a rival learns from.
-        outer: Poses that it predicts.
+        angles: Poses that a rival learns from, (N, n) [rad].
+        missed: Measured less predicted by the rigid fit at these poses, (N, k, d).
+        others: Poses that it predicts, (M, n) [rad].
+        missed_there: Measured less predicted by the rigid fit at those, (M, k, d).
     """
-    missed = rigid.missed(inner)
     flat = missed.reshape(len(missed), -1)
-    left = {}
-    for name, predict in RIVALS.items():
-        predicted = predict(inner.theta, flat, outer.theta).reshape(-1, *missed.shape[1:])
-        left[name] = np.linalg.norm(rigid.missed(outer) - predicted, axis=-1)
-    return left
+    return {
+        name: _distances(missed_there - predict(angles, flat, others).reshape(missed_there.shape))
+        for name, predict in RIVALS.items()
+    }
 
 
-def num_fits(problem: GeometryProblem, parts: list[IntArray]) -> int:
+def num_fits(judged: Judged, parts: list[IntArray]) -> int:
     """Steps of progress of `judge`."""
-    rest = np.setdiff1d(np.arange(len(problem.theta)), parts[0])
-    return len(parts) + len(list(curve_poses(rest, 0)))
+    return len(parts) + len(judged.counts(parts))
 
 
-def curve_poses(rest: IntArray, seed: int) -> Iterator[IntArray]:
-    """Fewer and fewer of the poses, halved down to some ten, the fewest first."""
-    order = np.random.default_rng(seed).permutation(rest)
-    counts = []
-    count = len(rest)
-    while count >= _FEWEST_IN_CURVE:
-        counts.append(count)
-        count //= 2
-    for count in reversed(counts):
-        yield np.sort(order[:count])
+def _distances(missed: Array) -> Array:
+    return np.linalg.norm(missed, axis=-1)
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _summary(name: str, distances_m: Array) -> HeldOutError:
-    own = 1e3 * distances_m
+def _summary(name: str, distances: list[Array], unit: ErrorUnit) -> HeldOutError:
+    own = np.concatenate(distances) * (1.0 if unit == "N·m" else 1e3)
     return HeldOutError(
-        name=name, rms_mm=_rms(own), mean_mm=float(own.mean()), worst_mm=float(own.max())
+        name=name,
+        rms=float(np.sqrt(np.mean(own**2))),
+        mean=float(own.mean()),
+        worst=float(own.max()),
     )

@@ -14,7 +14,7 @@ import pandas as pd
 
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 
 Kind = Literal["link_encoders", "end_effector", "markers", "imu", "torques"]
 """Measurements of a log besides the motor encoders."""
@@ -70,6 +70,16 @@ class PoseLog:
 
     def __len__(self) -> int:
         return len(self.theta)
+
+    def part(self, poses: IntArray) -> "PoseLog":
+        """Some of its poses."""
+        return replace(
+            self,
+            theta=self.theta[poses],
+            measured=self.measured[poses],
+            direction=None if self.direction is None else self.direction[poses],
+            known=None if self.known is None else self.known[poses],
+        )
 
 
 def read_log(

@@ -14,7 +14,7 @@ sensors the right-hand side. Derivatives follow from
 """  # noqa: E501
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.identification.geometry_model import cross_matrix
 from baselines.identification.pose_log import Kind, PoseLog
-from baselines.identification.static_arm import StaticArm
+from baselines.identification.static_arm import Attitude, StaticArm
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.joint.load_continuation import follow_load
@@ -95,13 +95,18 @@ class Unknowns:
     def of(log: PoseLog, elastic: Sequence[str], frame: Frame, payload: bool) -> "Unknowns":
         """The unknowns that a log needs."""
         return Unknowns(
-            elastic=np.array([log.joints.index(joint) for joint in elastic]),
+            elastic=np.array([log.joints.index(joint) for joint in elastic], dtype=np.int64),
             friction=log.direction is not None,
             payload=payload,
             translation=log.kind == "end_effector" and frame != "known",
             rotation=(log.kind == "end_effector" and frame == "pose")
             or (log.kind == "imu" and frame != "known"),
         )
+
+    def of_frame(self) -> "Unknowns":
+        """Those of the frame alone, which a rigid arm has too."""
+        none = np.empty(0, dtype=np.int64)
+        return replace(self, elastic=none, friction=False, payload=False)
 
 
 @dataclass(frozen=True)
@@ -159,6 +164,12 @@ class PoseModel:
             shown = self.log.measured - self.log.measured.mean(axis=0)
             own = at.position - at.position.mean(axis=0)
         return Rotation.align_vectors(shown, own)[0].as_matrix()
+
+    def at(self, log: PoseLog) -> "PoseModel":
+        """The same unknowns at other poses; rotations are still from the first frame of these."""
+        other = replace(self, log=log)
+        other.__dict__["_aligned"] = self._aligned
+        return other
 
     @property
     def target(self) -> Array:
@@ -258,6 +269,17 @@ class PoseModel:
             return q[:, at], dq[:, at]
         return self._torques(unknowns, q, dq, at)
 
+    def missed(self, unknowns: Array) -> Array:
+        """Measured less predicted, (N, k, d): vectors of k places in the unit of the measurement.
+
+        Places are a point, the end of a unit vertical, or the joints.
+        """
+        if self.log.kind == "imu":
+            seen = self._seen(unknowns, self.arm.attitude(self.link_angles(unknowns)[0]))
+            return (vertical(self.log.measured) - seen)[:, None]
+        missed = self.target - self.predict(unknowns)[0]
+        return missed[:, None] if self.log.kind == "end_effector" else missed[..., None]
+
     def _link_gradient(self, unknowns: Array, q: Array, inverse: Array) -> Array:
         """∂q/∂unknowns, (N, n, p)."""
         own = self.unknowns.slices
@@ -295,15 +317,18 @@ class PoseModel:
         shift = unknowns[own["translation"]]
         return turned + (shift if len(shift) else 0.0), gradient
 
+    def _seen(self, unknowns: Array, at: Attitude) -> Array:
+        """Unit verticals that the IMU should see, (N, 3)."""
+        return self._turned(unknowns) @ at.rotation.transpose(0, 2, 1) @ self.arm.up
+
     def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
         """Tilt between the verticals that the IMU should see and saw, about two axes [rad]."""
         own = self.unknowns.slices
-        R = self._turned(unknowns)
         at = self.arm.attitude(q)
         up = self.arm.up
         across = _across(vertical(self.log.measured))
-        back = R @ at.rotation.transpose(0, 2, 1)
-        seen = back @ up
+        back = self._turned(unknowns) @ at.rotation.transpose(0, 2, 1)
+        seen = self._seen(unknowns, at)
         gradient = back @ cross_matrix(np.broadcast_to(up, seen.shape)) @ at.rotation_gradient @ dq
         if self.unknowns.rotation:
             gradient[..., own["rotation"]] = -cross_matrix(seen)

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from baselines.identification.servo_fit import ServoFit, slow_rows
-from baselines.identification.servo_log import FEWEST_ROWS, ServoLog
+from baselines.identification.servo_fit import ServoFit
+from baselines.identification.servo_log import FEWEST_ROWS, ServoLog, slow_rows
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

@@ -12,8 +12,11 @@ F = F₀ + c |τ_J| + F_s exp(−(ω/ω_s)²). A DC motor under a voltage that t
 
 where V is the supply's voltage, k the position gain for one volt and one unit of the register g, T
 the torque at standstill for one volt, and b = k_t k_e / R the back-EMF's damping. Without torque
-enabled τ_m is zero, and the rotor's inertia stays. At rest friction balances whatever is not above
-F. So a joint at rest tells a band of torques, and motion tells the torque.
+enabled τ_m is zero, and the rotor's inertia stays. A program that switches the torque, then reads
+the angle, logs the switch up to a row late: the torque changes a lead before the row.
+
+At rest friction balances whatever is not above F. So a joint at rest tells a band of torques, and
+motion tells the torque.
 """
 
 from dataclasses import dataclass
@@ -37,6 +40,7 @@ PARAMETERS = {
     "stribeck_speed": "rad/s",
     "zero_offset": "rad",
     "delay": "s",
+    "switch_lead": "s",
 }
 """Parameters of a servo with their units.
 
@@ -83,7 +87,7 @@ class Replay:
         return Replay(log, (angle, speed), middle, known)
 
     def play(self, parameters: Array) -> Array:
-        """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (12,)."""
+        """Angles at the rows of the log, (N,) [rad]; parameters as in `NAMES`, (13,)."""
         log = self.log
         goal = np.interp(self.middle - parameters[11], log.time, log.goal)
         load = log.load
@@ -94,11 +98,22 @@ class Replay:
             goal,
             self.known,
             log.enabled,
+            self._switched(parameters[12]),
             np.array([*self.start, log.gain, log.supply, load.torque, load.rest, inertia]),
             np.ascontiguousarray(parameters, dtype=np.float64),
             out,
         )
         return out
+
+    def _switched(self, lead: float) -> Array:
+        """Share of each step after the torque is switched, (N − 1, s); 0 where it is not.
+
+        It is switched a lead before the first row that says so, at most a row before [s].
+        """
+        step = np.diff(self.log.time)[:, None]
+        count = self.middle.shape[1]
+        share = np.clip(np.arange(1, count + 1) - count * (1.0 - lead / step), 0.0, 1.0)
+        return np.where(np.diff(self.log.enabled)[:, None], share, 0.0)
 
 
 @compiled
@@ -107,6 +122,7 @@ def _play(
     goal: Array,
     known: Array,
     enabled: BoolArray,
+    switched: Array,
     setting: Array,
     p: Array,
     out: Array,
@@ -125,14 +141,19 @@ def _play(
     out[0] = q
     substeps = goal.shape[1]
     for k in range(len(steps)):
-        h = steps[k] / substeps
-        b = p[2] if enabled[k] else 0.0
-        for j in range(substeps):
+        for part in range(2 * substeps):  # each step before and after the torque is switched
+            j = part // 2
+            share = switched[k, j] if part % 2 else 1.0 - switched[k, j]
+            if share == 0.0:
+                continue
+            h = share * (steps[k] / substeps)
+            on = enabled[k + part % 2]
+            b = p[2] if on else 0.0
             left = h
             if w != 0.0:
                 middle = q + 0.5 * h * w
                 pull = 0.0
-                if enabled[k]:
+                if on:
                     pull = min(max(gain * (goal[k, j] - middle), -limit), limit)
                 other = known[k, j] - setting[4] * np.sin(middle - setting[5] - p[10])
                 F = p[5]
@@ -150,7 +171,7 @@ def _play(
                 w = 0.0
                 left = h - stop
             pull = 0.0
-            if enabled[k]:
+            if on:
                 pull = min(max(gain * (goal[k, j] - q), -limit), limit)
             other = known[k, j] - setting[4] * np.sin(q - setting[5] - p[10])
             needed = pull + other

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from baselines.identification.servo_fit import USUAL_LOSS, ServoFit
+from baselines.identification.servo_fit import ServoFit
 from baselines.identification.servo_holdout import ServoHoldout
 from baselines.identification.servo_log import ServoLog
+from baselines.identification.servo_problem import USUAL_LOSS
 from baselines.identification.servo_replay import PARAMETERS
 from elastic_env.core.config import Model
 from elastic_env.core.yaml_text import yaml_line
 
 _TOLD = 0.5
-_TOLD_WITHIN = {"zero_offset": 0.02, "delay": 0.005, "load_friction": 0.1}
+_TOLD_WITHIN = {"zero_offset": 0.02, "delay": 0.005, "switch_lead": 0.005, "load_friction": 0.1}
 """Half-widths at which a parameter counts as told whatever its value is."""
 _FRICTION = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 _SAME_SUPPLY = 0.1

@@ -18,13 +18,10 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
-
-_LEAST_LOAD = 0.05
-"""Share of the weight below which the feet show no ZMP."""
 
 
 class ZmpOffsetGains(Model):
@@ -54,12 +51,7 @@ class ZmpOffset(PolicyAround):
 
     def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
         super().__init__(policy, model)
-        table = model.observation_table
-        self._ankles = model.biped.ankles
-        self._sensors = FootSensors.of_biped(model.biped)
-        self._wrench = table.group("wrench")
-        self._zmp = table.group("zmp_reference")
-        self._least_n = _LEAST_LOAD * model.biped.weight
+        self._feet = FlatFeet(model)
         self._rate = model.control_period_s / gains.time_constant_s
         self._limit = gains.limit_m
 
@@ -70,10 +62,9 @@ class ZmpOffset(PolicyAround):
     @override
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
-        wrench = rows[:, self._wrench]
-        measured = self._sensors.zmp_of_flat_feet(wrench, self._ankles, self._least_n)
-        error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
-        shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
+        error = self._feet.zmp_error(rows)
+        shift = memory.shift - self._rate * error
+        shift = np.minimum(np.maximum(shift, -self._limit), self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, ZmpOffsetMemory(shift, inner)

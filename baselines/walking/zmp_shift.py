@@ -156,18 +156,41 @@ def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -
     for row in range(len(shift)):
         if shift[row, 0] == 0.0 and shift[row, 1] == 0.0:
             continue
-        stance = stances[steps[row]]
         for side in range(2):
-            ankle = stance.ankles[side]
-            hip = leg.hips[side]
-            x = ankle[0] - (stance.pelvis[0] + shift[row, 0]) - hip[0]
-            y = ankle[1] - (stance.pelvis[1] + shift[row, 1]) - hip[1]
-            z = ankle[2] - stance.pelvis[2] - hip[2]
-            pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
-            roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
-            q = (0.0, roll, pitch, knee, -(pitch + knee), -roll)
-            for i in range(6):
-                out[row, 6 * side + i] += q[i] - stance.q[side, i]
+            move_hip(leg, stances[steps[row]], side, shift[row], out[row])
+
+
+@compiled
+def move_feet(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> None:
+    """Add the offsets that move planned feet under a pelvis that stays; as `move_pelvis`.
+
+    Args:
+        legs: Row of `LEGS`, (1,).
+        stances: Rows of `STANCE`, one per control step of the plan.
+        steps: Row of the plan for each of the shifts, (n,).
+        shift: Of the left and the right foot, forward and to the left, (n, 2, 2) [m].
+        out: To be added to, (n, 12) [rad].
+    """
+    for row in range(len(shift)):
+        for side in range(2):
+            own = shift[row, side]
+            if own[0] != 0.0 or own[1] != 0.0:
+                move_hip(legs[0], stances[steps[row]], side, -own, out[row])
+
+
+@compiled
+def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None:
+    """Add the offsets of one leg, (12,) [rad], whose hip moves over its foot, (2,) [m]."""
+    ankle = stance.ankles[side]
+    hip = leg.hips[side]
+    x = ankle[0] - (stance.pelvis[0] + shift[0]) - hip[0]
+    y = ankle[1] - (stance.pelvis[1] + shift[1]) - hip[1]
+    z = ankle[2] - stance.pelvis[2] - hip[2]
+    pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
+    roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
+    q = (0.0, roll, pitch, knee, -(pitch + knee), -roll)
+    for i in range(6):
+        out[6 * side + i] += q[i] - stance.q[side, i]
 
 
 @compiled

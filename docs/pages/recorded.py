@@ -1,5 +1,6 @@
 """Tables of the page of recorded robots, from what `python -m train.recorded` writes."""
 
+import math
 from collections.abc import Mapping
 
 from docs.pages.cells import Rows, page_table
@@ -94,6 +95,47 @@ def slow_motion(rows: Rows) -> str:
     return _servo_table("gain, slow motion, not fitted", own, {})
 
 
+def priors(rows: Rows) -> str:
+    """What priors and starts change of the first motions of the XL330."""
+    own = [row for row in rows if row["servo"] == "xl330"]
+    without = next(row for row in own if row["measure"] == "replay without priors")
+    replays = [row for row in own if row["measure"] == "replay"][:1]
+    starts = [row for row in own if row["measure"] == "replay from other starts"]
+    found = [float(row["replay_mrad"]) for row in (*replays, *starts)]
+    apart = math.ceil(10.0 * (max(found) - min(found))) / 10.0
+    on, all_rows = (f"{float(without[name]):.0f}" for name in ("replay_mrad", "replay_all_mrad"))
+    return (
+        "* **Priors.** Their weight was chosen with the first row of the XL330 in sight. Without"
+        f" priors the replay of that row has {on} mrad, and {all_rows}\n  with the torque off"
+        f" included. Fits from {len(found)} seeds of the starts agree within {apart:g} mrad.\n"
+    )
+
+
+def coverage(rows: Rows) -> str:
+    """How often intervals of made-up servos hold the truth."""
+    lines = [
+        [
+            _PARAMETERS[row["parameter"]],
+            row["holds"],
+            f"{100.0 * float(row['half_width_median']):.2g} %",
+        ]
+        for row in rows
+    ]
+    head = [f"within its 95 % interval, of {rows[0]['trials']}", "half-width, median"]
+    return page_table(["parameter", *head], lines)
+
+
+_PARAMETERS = {
+    "position_gain": "position gain",
+    "motor_damping": "back-EMF damping",
+    "rotor_inertia": "rotor inertia",
+    "coulomb_friction": "Coulomb friction",
+    "load_friction": "load friction",
+    "viscous_friction": "viscous friction",
+    "zero_offset": "zero offset",
+    "delay": "delay",
+    "switch_lead": "lead of a switched torque",
+}
 _ALL_ROWS = "identified, torque off included"
 _PREDICTIONS = {
     "goal itself": "goal_mrad",

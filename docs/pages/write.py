@@ -80,6 +80,7 @@ TABLES = {
         for env in ("walker", "testbed")
     },
     "cluster": "python -m tests.cluster_trials measures it",
+    "servo_coverage": "python -m tests.servo_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
     **dict.fromkeys(("recorded_justin", "recorded_servos"), "python -m train.recorded writes it"),
     "step": "python -m docs.pages.step writes it",
@@ -217,6 +218,8 @@ PARTS: Mapping[str, Part] = {
     "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
     "replays of recorded servos": _of(recorded.replays, "recorded_servos"),
     "recorded servos in slow motion": _of(recorded.slow_motion, "recorded_servos"),
+    "priors of recorded servos": _of(recorded.priors, "recorded_servos"),
+    "coverage of a servo": _of(recorded.coverage, "servo_coverage"),
     "recorded in short": _of(recorded.in_short, "recorded_justin"),
     "link encoders": _of(arms.link_encoders, "link_encoder"),
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),

@@ -336,18 +336,18 @@ def _require_torque(
     """
     _, q_dot, q_ddot = motion
     torque = body.inverse_dynamics(*motion) + robot.rotor_inertia * q_ddot
-    fastest = np.abs(q_dot).max(axis=0)
-    needed = np.abs(torque).max(axis=0) + robot.viscous_friction * fastest
-    needed = robot.largest_passed_torque(needed)
-    limits = robot.largest_torque(fastest)
+    if config.reference.is_random:  # other draws have their largest torque at other speeds
+        torque = np.abs(torque).max(axis=0)
+        q_dot = np.abs(q_dot).max(axis=0)
+    needed, limits = robot.demand(torque, q_dot)
     if not isinstance(config.reference, arm_references.OfArm):
         require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
-        weakest = int(np.argmax(needed - limits))
+        weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
         raise ConfigurationError(
-            f"the reference {config.reference.kind!r} can need {needed[weakest]:.1f} N·m of the"
-            f" servo of joint {robot.joint_names[weakest]!r}, which is limited to"
-            f" {limits[weakest]:.1f} N·m; make its moves slower"
+            f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g} N·m of the"
+            f" servo of joint {robot.joint_names[weakest[-1]]!r}, which is limited to"
+            f" {limits[weakest]:.4g} N·m; make its moves slower"
         )
 
 

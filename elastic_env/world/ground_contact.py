@@ -57,20 +57,6 @@ class FootSensors:
         shape = foot_R.shape[:-1]
         return force.reshape(shape), moment.reshape(shape)
 
-    def zmp_of_flat_feet(self, wrench: Array, ankles: Array, least_n: float) -> Array:
-        """ZMP as if the feet lay flat where they are planned, (n, 2) [m].
-
-        Args:
-            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3)
-                [N], [N·m].
-            ankles: Planned positions of the ankles, (2, 3) [m].
-            least_n: Vertical force below which there is no ZMP, and the result is nan [N].
-        """
-        n = len(wrench)
-        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
-        force, moment = self.ground_wrench(wrench.reshape(n, 2, 2, 3), flat)
-        return zero_moment_point(force, moment, ankles, least_n)
-
 
 def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float) -> Array:
     """ZMP of both feet together on the ground plane z = 0.

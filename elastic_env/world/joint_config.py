@@ -88,17 +88,17 @@ def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
 
     Args:
         reference: It.
-        needed: Largest torque that it can need of each servo, (n,) [N·m].
-        limits: Of the servos, (n,) [N·m].
+        needed: Torque that it can need of each servo, (..., n) [N·m].
+        limits: What the servos have then, (..., n) [N·m].
 
     Raises:
         ConfigurationError: A servo is too weak.
     """
     if np.any(needed > limits):
-        weakest = int(np.argmax(needed - limits))
+        weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
         extent = reference.extent()
         raise ConfigurationError(
-            f"the reference {reference.kind!r} can need {needed[weakest]:.1f} N·m of a servo"
-            f" limited to {limits[weakest]:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to"
+            f"the reference {reference.kind!r} can need {needed[weakest]:.4g} N·m of a servo"
+            f" limited to {limits[weakest]:.4g} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to"
             f" {extent.q_ddot:.2f} rad/s²); lower its amplitude or its rate"
         )

@@ -104,6 +104,32 @@ class RobotModel:
         each = [servo.largest_torque(speed[..., i]) for i, servo in enumerate(self.servos)]
         return np.stack(each, axis=-1)
 
+    def demand(self, torque: Array, speed: Array) -> tuple[Array, Array]:
+        """Torques that servos need along a motion, and those that they have then.
+
+        A servo drives the link against friction, with the torque that its motor has at that speed.
+        Or it holds it back; friction and back-EMF help then, and count as nothing.
+
+        Args:
+            torque: What the links need but for friction, (..., n) [N·m].
+            speed: Of the links, (..., n) [rad/s].
+
+        Returns:
+            Both (..., n) [N·m]; a servo that needs more than it has cannot follow.
+
+        Raises:
+            ConfigurationError: A joint has no servo.
+        """
+        side = np.where(speed == 0.0, np.sign(torque), np.sign(speed))
+        friction = self.coulomb_friction + self.static_friction
+        needed = torque + self.viscous_friction * speed
+        driving = side * passed_torque(needed, side, friction, self.load_friction)
+        holding = -side * torque
+        driven = self.largest_torque(speed)
+        held = self.largest_torque(np.zeros_like(speed))
+        is_driven = driving > 0.0
+        return np.where(is_driven, driving, holding), np.where(is_driven, driven, held)
+
     @property
     def encoder_counts_per_turn(self) -> int | None:
         """Counts of the encoders, which are all alike; None for continuous ones."""

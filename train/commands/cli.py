@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib
+import io
 import math
 import operator
 import os
@@ -20,6 +21,7 @@ import tyro
 from rich.text import Text
 
 import elastic_env
+from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explain
@@ -128,9 +130,20 @@ def _parse(arguments: list[str]) -> Any:
     # without a name of its own, what is wrong with an option is an error of this program, and no
     # box of tyro's
     command.__annotations__["given"] = Annotated[options, tyro.conf.arg(name="")]
-    with name_options():
-        program = f"elastic {name}"
-        return tyro.cli(command, prog=program, args=arguments[1:], config=_STYLE)
+    said = io.StringIO()
+    try:
+        with name_options(), contextlib.redirect_stderr(said):
+            return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
+    except SystemExit as ended:
+        # what is wrong with a group of options ends in a box of tyro's, in the words of Python
+        problem = ended.__context__ and ended.__context__.__context__
+        if isinstance(problem, ModelError):
+            said = io.StringIO()
+            with name_options():
+                raise problem from None
+        raise
+    finally:
+        sys.stderr.write(said.getvalue())
 
 
 _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)

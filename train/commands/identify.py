@@ -30,6 +30,32 @@ from train.runs.folders import run_folder
 from train.runs.progress import plain_progress, show_progress
 
 
+class OfTestbed(Model):
+    """The testbed, which is identified where no log is named."""
+
+    scenario: Title | None = None
+    """Scenario of the simulated testbed, such as nominal (default), ideal, backlash, ideal+soft."""
+    stiffness: float | None = quantity("N·m/rad", None, gt=0)
+    """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
+    second_mass: float | None = quantity("1", None, gt=0)
+    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q
+    from K; such as 0.5.
+    """
+    positions: int = quantity("1", 20, ge=5, le=200)
+    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take
+    five.
+    """
+    repeats: int = quantity("1", 1, ge=1, le=10_000)
+    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
+
+    @model_validator(mode="after")
+    def _masses_differ(self) -> Self:
+        if self.second_mass == 1.0:
+            problem = "second_mass must differ from 1: two equal masses do not separate anything"
+            raise ValueError(problem)
+        return self
+
+
 class Identify(Model):
     """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
 
@@ -48,33 +74,13 @@ class Identify(Model):
     run.csv --mass-kg 0.5 --lever-m 0.1
     """
 
-    scenario: Title | None = None
-    """Scenario of the simulated testbed, such as nominal (default), ideal, backlash, ideal+soft."""
-    stiffness: float | None = quantity("N·m/rad", None, gt=0)
-    """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
-    second_mass: float | None = quantity("1", None, gt=0)
-    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q
-    from K; such as 0.5.
-    """
-    positions: int = quantity("1", 20, ge=5, le=200)
-    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take
-    five.
-    """
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
-    """Seed of the sensor noise."""
-    repeats: int = quantity("1", 1, ge=1, le=10_000)
-    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
+    """Seed of the sensor noise, and of what is held out."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
-    on: OnHardware = OnHardware()
-    arm: Annotated[ArmOptions, tyro.conf.arg(name="")] = ArmOptions()
-
-    @model_validator(mode="after")
-    def _masses_differ(self) -> Self:
-        if self.second_mass == 1.0:
-            problem = "second_mass must differ from 1: two equal masses do not separate anything"
-            raise ValueError(problem)
-        return self
+    testbed: OfTestbed = OfTestbed()
+    on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
+    arm: ArmOptions = ArmOptions()
 
     def run(
         self, console: Console
@@ -96,24 +102,26 @@ class Identify(Model):
         """
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
-        given = {"seed": self.seed, "output": self.output}
-        alone = Identify(**given, arm=self.arm)
-        others = [name for name, value in alone if value != getattr(self, name)]
-        if others:
-            options = [option_name((name,)) for name in others if name != "on"]
-            names = ", ".join([*options, *["--port and the like"] * ("on" in others)])
-            problem = f"options of the testbed: {names}; leave them out beside --robot and --log"
+        others = [name for name, value in OfTestbed() if value != getattr(self.testbed, name)]
+        names = [option_name((name,)) for name in others]
+        if self.on != OnHardware():
+            names.append("--port and the like")
+        if names:
+            problem = (
+                f"options of the testbed: {', '.join(names)}; leave them out beside --robot and"
+                " --log"
+            )
             raise ConfigurationError(problem)
-        return run_arm_identification(self.arm, console, **given)
+        return run_arm_identification(self.arm, console, self.seed, self.output)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
         plots.require_matplotlib()
-        scenario = self.on.scenario(self.scenario)
+        scenario = self.on.scenario(self.testbed.scenario)
         hardware = self.on.arguments
         if hardware:
             self._require_real_joint(hardware)
         envs = identified_environments(self)
-        recorded = self.model_dump(mode="json", exclude={"output", "on", "arm"})
+        recorded = {**self.testbed.model_dump(mode="json"), "seed": self.seed}
         recorded |= {"scenario": scenario, "hardware": hardware}
         with run_folder("identify", recorded, self.seed, self.output) as folder:
             try:
@@ -127,8 +135,8 @@ class Identify(Model):
             models = [env.unwrapped.assumed_model for env in envs]
             draw_identification(results[0], points[0], models, files[1])
             console.print(result_table(results[0]))
-            if self.repeats > 1:
-                seeds = range(self.seed, self.seed + self.repeats)
+            if self.testbed.repeats > 1:
+                seeds = range(self.seed, self.seed + self.testbed.repeats)
                 found = zip(seeds, results, strict=True)
                 rows = [{"seed": seed, **own.model_dump()} for seed, own in found]
                 files.append(write_records(rows, folder / "repeats.csv"))
@@ -143,10 +151,10 @@ class Identify(Model):
         if hardware.get("imu_port") is None:
             needed = "an identification on hardware needs the link's angle"
             raise ConfigurationError(f"{needed}: name the IMU with --imu-port")
-        if self.stiffness is not None or self.repeats > 1:
+        if self.testbed.stiffness is not None or self.testbed.repeats > 1:
             problem = "stiffness and repeats are of a simulated joint; leave them out on hardware"
             raise ConfigurationError(problem)
-        if self.second_mass is not None and not hardware.get("confirm", True):
+        if self.testbed.second_mass is not None and not hardware.get("confirm", True):
             problem = "somebody must change the mass between the runs: a second_mass excludes --yes"
             raise ConfigurationError(problem)
 
@@ -190,19 +198,19 @@ def identified_environments(options: Identify) -> list[Any]:
     arguments = dict(options.on.arguments)
     pendulum = Pendulum(**arguments.pop("pendulum", {}))
     pendulums = [pendulum]
-    if options.second_mass is not None:
-        pendulums.append(pendulum.with_mass_scaled(options.second_mass))
+    if options.testbed.second_mass is not None:
+        pendulums.append(pendulum.with_mass_scaled(options.testbed.second_mass))
     if arguments:
         name = "elastic_env/HardwareTestbed-v0"
         arguments["num_envs"] = 1
     else:
         name = "elastic_env/Testbed-v0"
         arguments = {
-            "num_envs": options.repeats,
-            "scenario": options.on.scenario(options.scenario),
-            "stiffness": options.stiffness,
+            "num_envs": options.testbed.repeats,
+            "scenario": options.on.scenario(options.testbed.scenario),
+            "stiffness": options.testbed.stiffness,
         }
-    arguments["reference"] = {"kind": "hold", "positions": options.positions}
+    arguments["reference"] = {"kind": "hold", "positions": options.testbed.positions}
     arguments["vectorization_mode"] = "vector_entry_point"
     return [gymnasium.make_vec(name, pendulum=own, **arguments) for own in pendulums]
 

@@ -30,6 +30,7 @@ from baselines.identification.arm_result import (
     describe_fit,
 )
 from baselines.identification.geometry_result import GeometryIdentification
+from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
 from baselines.identification.pose_plan import (
@@ -47,6 +48,7 @@ from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.joint.joint_settings import SOFTEST
 from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
+from train.commands.held_out import HoldoutOptions, judge_poses, show_held_out
 from train.commands.identify_geometry import GeometryOptions, identify_geometry
 from train.commands.identify_servo import ServoOptions, are_servo_logs, identify_servo
 from train.commands.options import option_name
@@ -63,12 +65,10 @@ _STIFFEST = 1e9
 
 
 class ArmOptions(Model):
-    """Options of `elastic identify` for an arm of which there is a log of static poses."""
+    """An arm by a log of static poses, or a servo by logs in time, in place of the testbed."""
 
     robot: Locator | None = None
-    """Rigid model of an arm, MJCF or URDF, in place of the testbed; the options from here on are
-    of an arm.
-    """
+    """Rigid model of an arm, MJCF or URDF."""
     log: tuple[Locator, ...] = ()
     """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an
     IMU or joint torques. Or logs in time of one servo with its goal: CSV, JSON or parquet.
@@ -102,8 +102,9 @@ class ArmOptions(Model):
     """Propose so many further poses, within limits and without contacts, that tell the stiffness
     best.
     """
-    markers: Annotated[GeometryOptions, tyro.conf.arg(name="")] = GeometryOptions()
-    servo: Annotated[ServoOptions, tyro.conf.arg(name="")] = ServoOptions()
+    judged: Annotated[HoldoutOptions, tyro.conf.arg(name="judgement")] = HoldoutOptions()
+    markers: Annotated[GeometryOptions, tyro.conf.arg(name="geometry")] = GeometryOptions()
+    servo: ServoOptions = ServoOptions()
 
 
 @dataclass(frozen=True)
@@ -175,6 +176,7 @@ def run_arm_identification(
             setting.elastic,
             setting.arm.end_effector,
             console,
+            held_out=options.judged,
             seed=seed,
             output=output,
         )
@@ -191,12 +193,15 @@ def run_arm_identification(
         if options.plan:
             plan = plan_further(fit, _candidates(setting, console), options.plan)
         information = None if plan is None else plan.information
-        result = describe_fit(fit, options.within, options.assume, information)
+        held_out = judge_poses(Judged.of_poses(model), options.judged, console, seed)
+        result = describe_fit(fit, options.within, options.assume, information, held_out)
         files = result.save(folder)
         picture = folder / "identification.png"
         files.append(draw_arm_identification(fit, result, picture))
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
+    if result.held_out is not None:
+        show_held_out(result.held_out, console)
     console.print(result_table(result))
     written = [f"wrote {path}" for path in files]
     for line in (summed_up(fit), *remarks(result), *written):
@@ -212,14 +217,16 @@ def _identify_servo(
     Raises:
         ConfigurationError: An option is for poses only, or several joints are named.
     """
-    taken = {"log", "robot", "joints", "servo", "markers"}
+    taken = {"log", "robot", "joints", "servo", "markers", "judged"}
     unused = [
         option_name((name,))
         for name in ArmOptions.model_fields
         if name not in taken and getattr(options, name) != getattr(ArmOptions(), name)
     ]
-    if options.markers.replace(holdout=GeometryOptions().holdout) != GeometryOptions():
+    if options.markers != GeometryOptions():
         unused.append("those of --geometry")
+    if options.judged.folds != HoldoutOptions().folds:
+        unused.append("--folds")
     if unused:
         raise ConfigurationError(
             f"{', '.join(unused)}: not for logs in time; leave it out beside {options.log[0]}"
@@ -234,7 +241,7 @@ def _identify_servo(
         console,
         robot=options.robot,
         joint=options.joints[0] if options.joints else None,
-        holdout=options.markers.holdout,
+        holdout=options.judged.holdout,
         seed=seed,
         output=output,
     )

@@ -1,12 +1,10 @@
 """`elastic identify --geometry`: encoders, geometry and stiffness of an arm from markers."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import mujoco
-import tyro
+import numpy as np
 from rich import box
 from rich.console import Console
 
@@ -16,18 +14,19 @@ from baselines.identification.geometry_fit import (
     align_tracker,
     fit_geometry,
 )
-from baselines.identification.geometry_model import Geometry, GeometryModel
+from baselines.identification.geometry_model import AxialTorques, Geometry, GeometryModel
 from baselines.identification.geometry_result import (
     GeometryIdentification,
     correct_model,
     describe_geometry,
 )
-from baselines.identification.holdout import HeldOut, judge, num_fits, split
+from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
 from baselines.identification.static_arm import place_of
-from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.config import Model, Title
 from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.rigid.tree.links import Tree
+from train.commands.held_out import HoldoutOptions, judge_poses, show_held_out
 from train.figures.geometry_plots import draw_geometry
 from train.runs.console import make_table
 from train.runs.folders import run_folder
@@ -35,7 +34,7 @@ from train.runs.progress import show_progress
 
 
 class GeometryOptions(Model):
-    """Options of `elastic identify` for a log of markers, of which the geometry is sought too."""
+    """Poses with markers: what of the geometry is sought together with K."""
 
     geometry: Geometry | None = None
     """Seek encoder offsets, the parameters of Denavit and Hartenberg (dh), or all lengths and
@@ -43,13 +42,9 @@ class GeometryOptions(Model):
     """
     lateral: bool = False
     """Seek the compliance of bearings and links across the axes too."""
-    holdout: float = quantity("1", 0.3, ge=0, lt=1)
-    """Share of the poses that is not fitted, and predicted beside rivals; 0 for none."""
-    folds: int = quantity("1", 1, ge=1, le=20)
-    """Hold each pose out once, in so many folds."""
     free: tuple[Title, ...] = ()
     """Joints whose frame the model only guesses: it may be off by a metre and a radian."""
-    priors: Annotated[GeometryPriors, tyro.conf.arg(name="")] = GeometryPriors()
+    priors: GeometryPriors = GeometryPriors()
 
 
 def identify_geometry(
@@ -59,6 +54,8 @@ def identify_geometry(
     elastic: Sequence[str],
     end_effector: str,
     console: Console,
+    *,
+    held_out: HoldoutOptions,
     seed: int = 0,
     output: Path | None = None,
 ) -> GeometryIdentification:
@@ -71,6 +68,7 @@ def identify_geometry(
         elastic: Joints whose stiffness is sought.
         end_effector: Site or body that is measured, where the log names no markers.
         console: Where progress and tables go.
+        held_out: What is kept back from the fit.
         seed: Seed of the poses that are held out.
         output: Folder for the results; default runs/identify, numbered if taken.
 
@@ -80,18 +78,13 @@ def identify_geometry(
     """
     model = spec.compile()
     problem, tree = pose_problem(options, model, log, elastic, end_effector)
-    parts = []
-    if options.holdout:
-        parts = split(len(log), options.holdout, options.folds, seed)
-    recorded = {**options.model_dump(mode="json"), "seed": seed}
+    recorded = {**options.model_dump(mode="json"), **held_out.model_dump(), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
-        total = 1 + (num_fits(problem, parts) if parts else 0)
-        with show_progress(console, {"fits": total}, transient=True) as show:
-            report = partial(show, 0)
-            held_out = judge(problem, parts, seed, report) if parts else None
+        with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
-            show(0, total)
-        result = describe_geometry(fit, held_out)
+            show(0, 1)
+        judged = judge_poses(Judged.of_geometry(problem), held_out, console, seed)
+        result = describe_geometry(fit, judged)
         files = result.save(folder, correct_model(spec, tree, fit))
         files.append(draw_geometry(result, folder / "identification.png"))
     show_result(result, console)
@@ -133,34 +126,40 @@ def pose_problem(
         lateral=options.lateral,
         priors=options.priors,
         free=options.free,
+        axial=_axial(log),
     )
     return problem, tree
+
+
+def _axial(log: PoseLog) -> AxialTorques | None:
+    """Sides of approach and known torques of a log; None where it has neither."""
+    if log.direction is None and log.known is None:
+        return None
+    nothing = np.zeros_like(log.theta)
+    return AxialTorques(
+        direction=nothing if log.direction is None else log.direction,
+        known=nothing if log.known is None else log.known,
+    )
 
 
 def show_result(result: GeometryIdentification, console: Console) -> None:
     """Print held-out errors, stiffness, and what the poses do not tell."""
     if result.held_out is not None:
-        console.print(verdict(result.held_out), highlight=False)
-        rows = []
-        for error in result.held_out.errors:
-            values = (error.rms_mm, error.mean_mm, error.worst_mm)
-            rows.append([error.name, *(f"{value:.2f}" for value in values)])
-        number = result.held_out.held_out
-        title = f"error of markers at {number} poses that were held out"
-        head = ["prediction", "rms [mm]", "mean", "worst"]
-        console.print(make_table(title, head, rows, box=box.SIMPLE))
-        curve = result.held_out.curve
-        points = [f"{point.poses} poses {point.rms_mm:.1f} mm" for point in curve]
-        console.print(f"by the number of poses: {', '.join(points)}", highlight=False)
+        show_held_out(result.held_out, console)
     rows = []
+    friction = {one.name: one for one in result.parameters if one.kind == "friction"}
     for joint in result.joints:
         stiffness = _number(joint.stiffness_nm_per_rad).replace("inf", "rigid")
         ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
         rows.append([joint.joint, stiffness, *map(_number, ends)])
+        if friction:
+            own = friction.get(joint.joint)
+            rows[-1].append(_number(own.value if own is not None and own.is_told else None))
     noise = f"{result.noise_mm:.2f} mm"
     console.print(f"unexplained: {noise} in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"
-    console.print(make_table(title, ["joint", "K", "from", "to"], rows, box=box.SIMPLE))
+    head = ["joint", "K", "from", "to", *["F [N·m]"] * bool(friction)]
+    console.print(make_table(title, head, rows, box=box.SIMPLE))
     if result.numbers < len(result.parameters):
         console.print(
             f"{result.numbers} measured numbers for {len(result.parameters)} parameters: most rests"
@@ -172,22 +171,6 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
             f" poses do not tell them: {list_names(result.kept)}",
             highlight=False,
         )
-
-
-def verdict(held_out: HeldOut) -> str:
-    """Held-out errors in a sentence; a rival that is ahead comes first."""
-    rigid = held_out.errors[0]
-    own = held_out.errors[-1]
-    rival = held_out.best_rival
-    if held_out.is_ahead:
-        return (
-            f"held out: {rigid.rms_mm:.2f} mm rms as given, {own.rms_mm:.2f} mm identified;"
-            f" the best of the rest, {rival.name}, reaches {rival.rms_mm:.2f} mm"
-        )
-    return (
-        f"{rival.name} is ahead: {rival.rms_mm:.2f} mm rms at held-out poses, where the"
-        f" identification has {own.rms_mm:.2f} mm: use that, or log more poses"
-    )
 
 
 def _number(value: float | None) -> str:

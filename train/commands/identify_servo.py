@@ -8,10 +8,11 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 
+from baselines.identification.servo_file import AngleUnit, is_servo_log
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
-from baselines.identification.servo_log import AngleUnit, ServoLog, is_servo_log, read_servo_log
+from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -24,7 +25,7 @@ from train.runs.progress import show_progress
 
 
 class ServoOptions(Model):
-    """Options of `elastic identify` for logs in time of one servo."""
+    """Logs in time of one servo: its load, and what the logs do not say."""
 
     mass_kg: float | None = quantity("kg", None, gt=0)
     """Mass of a pendulum on the servo, whose logs have time, goal and position [kg]."""
@@ -35,7 +36,7 @@ class ServoOptions(Model):
     angles: AngleUnit | None = None
     """Unit of angles in the logs in time; default what they say, or radians."""
     unfitted: tuple[Locator, ...] = ()
-    """Logs in time to replay without a fit, not in --log; default a share by --holdout."""
+    """Logs in time to replay without a fit; default a share of --log, by --holdout."""
 
 
 def are_servo_logs(paths: Sequence[str]) -> bool:
@@ -72,7 +73,7 @@ def identify_servo(
     """
     plots.require_matplotlib()
     load = known_load(options, robot, joint)
-    _require_each_once(paths, options.unfitted)
+    paths = fitted_logs(paths, options.unfitted, console)
     logs = [_read(options, path, load, joint) for path in paths]
     further = [_read(options, path, load, joint) for path in options.unfitted]
     _require_one_supply([*logs, *further])
@@ -183,27 +184,44 @@ def verdict(held_out: ServoHoldout) -> str:
 _MUCH_WORSE = 1.5
 
 
-def _require_each_once(paths: Sequence[str], unfitted: Sequence[str]) -> None:
-    """Refuse a log that is named twice, by its path or by its content.
+def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console) -> list[str]:
+    """Logs of `--log` that are fitted: those that `--unfitted` names too are left out, and named.
+
+    Logs are the same by their path or by their content.
 
     Raises:
-        ConfigurationError: One is.
+        ConfigurationError: An option names one twice, or nothing is left to fit.
     """
-    seen: dict[Path | str, str] = {}
-    for path in (*paths, *unfitted):
+    logs, further = (_each_once(given) for given in (paths, unfitted))
+    left_out = [path for path, keys in logs.items() if any(keys & own for own in further.values())]
+    if len(left_out) == len(logs):
+        raise ConfigurationError(
+            f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"
+        )
+    if left_out:
+        console.print(f"not fitted, as --unfitted says: {', '.join(left_out)}", highlight=False)
+    return [path for path in paths if path not in left_out]
+
+
+def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
+    """Path and digest of each log.
+
+    Raises:
+        ConfigurationError: One is named twice.
+    """
+    seen: dict[str, set[Path | str]] = {}
+    for path in paths:
         file = Path(path)
-        keys: list[Path | str] = [file.resolve()]
+        keys: set[Path | str] = {file.resolve()}
         with suppress(OSError):  # the reader says why it cannot be read
             if file.is_file():
                 with file.open("rb") as content:
-                    keys.append(hashlib.file_digest(content, "sha256").hexdigest())
-        for key in keys:
-            if key in seen:
-                raise ConfigurationError(
-                    f"{seen[key]} and {path} are the same log; name each once in --log or"
-                    " --unfitted, since a log that was fitted tells nothing of other motions"
-                )
-        seen |= dict.fromkeys(keys, path)
+                    keys.add(hashlib.file_digest(content, "sha256").hexdigest())
+        for other, own in seen.items():
+            if keys & own:
+                raise ConfigurationError(f"{other} and {path} are the same log; name each once")
+        seen[path] = keys
+    return seen
 
 
 def _read(options: ServoOptions, path: str, load: Load | None, joint: str | None) -> ServoLog:

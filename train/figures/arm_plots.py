@@ -9,6 +9,7 @@ from baselines.identification.arm_fit import ArmFit
 from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.pose_model import measurement_unit
 from elastic_env.core.signals import Array
+from train.figures.geometry_plots import draw_curve, draw_errors
 from train.figures.plots import MRAD, label_text, new_figure, save
 
 _COLUMNS = 4
@@ -20,13 +21,14 @@ _LINE = "#888888"
 
 
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
-    """A panel per joint with measured against predicted deflection, and one with the residuals.
+    """Measured against predicted deflection of each joint, residuals, and held-out errors.
 
     Measured is the predicted deflection and the part of the residual that a deflection of this
     joint alone explains.
     """
     count = len(result.joints)
-    rows = -(-(count + 1) // _COLUMNS)
+    further = 1 if result.held_out is None else 3
+    rows = -(-(count + further) // _COLUMNS)
     figure, panels = new_figure(rows, _COLUMNS, (3.1 * _COLUMNS, 2.9 * rows))
     predicted, measured = deflections(fit)
     for number, joint in enumerate(result.joints):
@@ -34,10 +36,15 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
         _draw_joint(axis, predicted[:, number], measured[:, number])
         axis.set_title(f"{joint.joint}\n{_stiffness(joint)}", fontsize=9)
     _draw_residuals(panels[count], fit)
-    for axis in panels[count + 1 :]:
+    if result.held_out is not None:
+        draw_errors(panels[count + 1], result.held_out)
+        draw_curve(panels[count + 2], result.held_out)
+        for axis in panels[count + 1 : count + 3]:
+            axis.title.set_fontsize(9)
+    for axis in panels[count + further :]:
         axis.set_visible(False)
-    figure.supxlabel("predicted deflection θ − q [mrad]", fontsize=10)
-    figure.supylabel("measured deflection [mrad]", fontsize=10)
+    figure.supxlabel("predicted deflection θ − q of each joint [mrad]", fontsize=10)
+    figure.supylabel("measured deflection of each joint [mrad]", fontsize=10)
     return save(figure, path)
 
 

@@ -22,8 +22,8 @@ def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
     height = max(_HEIGHT, _ROW * len(shown) + 1.2)
     figure, axes = new_figure(1, panels, (4.3 * panels, height))
     if result.held_out is not None:
-        _draw_errors(axes[0], result.held_out)
-        _draw_curve(axes[1], result.held_out)
+        draw_errors(axes[0], result.held_out)
+        draw_curve(axes[1], result.held_out)
     axis = axes[-1]
     axis.set_title("K [N·m/rad] with 95 % intervals")
     for row, joint in enumerate(shown):
@@ -39,24 +39,26 @@ def draw_geometry(result: GeometryIdentification, path: Path) -> Path:
     return save(figure, path)
 
 
-def _draw_errors(axis: Any, held_out: HeldOut) -> None:
+def draw_errors(axis: Any, held_out: HeldOut) -> None:
+    """Bars of the held-out errors of all predictions."""
     names = [error.name for error in held_out.errors]
-    values = [error.rms_mm for error in held_out.errors]
+    values = [error.rms for error in held_out.errors]
     colours = [_OTHER] * (len(names) - 1) + [_OWN]
     bars = axis.barh(names, values, color=colours)
-    axis.bar_label(bars, [f"{value:.2f}" for value in values], padding=3, fontsize=9)
+    axis.bar_label(bars, [f"{value:.3g}" for value in values], padding=3, fontsize=9)
     axis.set_xlim(0.0, 1.18 * max(values))
     axis.invert_yaxis()
-    axis.set_title(f"rms [mm] at {held_out.held_out} held-out poses")
+    axis.set_title(f"rms [{held_out.unit}] at {held_out.held_out} held-out poses")
 
 
-def _draw_curve(axis: Any, held_out: HeldOut) -> None:
+def draw_curve(axis: Any, held_out: HeldOut) -> None:
+    """The held-out error of the identification over the number of poses."""
     poses = [point.poses for point in held_out.curve]
-    axis.plot(poses, [point.rms_mm for point in held_out.curve], "o-", color=_OWN)
-    rigid = held_out.errors[0].rms_mm
+    axis.plot(poses, [point.rms for point in held_out.curve], "o-", color=_OWN)
+    rigid = held_out.errors[0].rms
     axis.axhline(rigid, color=_OTHER, lw=1.0, ls="--")
     axis.text(poses[0], rigid, "rigid, as given", fontsize=8, va="bottom")
     axis.set_yscale("log")
     show_numbers(axis.yaxis)
     axis.set_xlabel("poses that were fitted")
-    axis.set_title("identified: rms [mm] over poses")
+    axis.set_title(f"identified: rms [{held_out.unit}] over poses")

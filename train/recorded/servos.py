@@ -24,6 +24,8 @@ XL330_LEFT_OUT = (("sin_time_square", "lift_and_drop"), ("up_and_down",), ("sin_
 """Motions of the XL330 that are left out together; the first are those of the source's figures."""
 STS3250_LEFT_OUT = (("up_and_down",), ("sin_sin",), ("lift_and_drop",), ("sin_time_square",))
 """Motions of the STS3250 that are left out in turn; the last is faster than those that are left."""
+FURTHER_SEEDS = (1, 2, 3)
+"""Seeds of further starts of the first fit of the XL330."""
 _LARGEST_JSON = 20_000_000
 
 
@@ -51,7 +53,8 @@ def servo_figures(
     Returns:
         For `xl330` and `sts3250`: `held_out`, a list with one `ServoHoldout` for each group of
         motions that was left out; `sag`, for each gain the error in slow motion over all groups
-        [mrad]; and `identified`, the parameters from all logs.
+        [mrad]; and `identified`, the parameters from all logs. For `xl330` also `without_priors`
+        and `other_starts`, the first of `held_out` by fits without priors and from other starts.
 
     Raises:
         ConfigurationError: A servo has no log.
@@ -75,6 +78,25 @@ def servo_figures(
         tell(f"{motor}: fit to all")
         all_logs = fit_servo([one.log for one in own])
         figures[motor] = _described(all_logs, groups, held_out)
+        if motor == "xl330":
+            figures[motor] |= _varied(own, tell)
+    return figures
+
+
+def _varied(logs: Sequence[RecordedLog], tell: Callable[[str], None]) -> dict[str, Any]:
+    """The first motions that are left out, by fits without priors and from other starts."""
+    group = XL330_LEFT_OUT[0]
+    outer = [one.log for one in logs if one.trajectory in group]
+    inner = [one.log for one in logs if one.trajectory not in group]
+    tell("xl330: fit without priors")
+    figures: dict[str, Any] = {
+        "without_priors": judge_servo(fit_servo(inner, priors=False), outer).model_dump(mode="json")
+    }
+    figures["other_starts"] = []
+    for seed in FURTHER_SEEDS:
+        tell(f"xl330: fit from other starts, seed {seed}")
+        judged = judge_servo(fit_servo(inner, seed=seed), outer)
+        figures["other_starts"].append(judged.model_dump(mode="json"))
     return figures
 
 
@@ -94,7 +116,7 @@ def read_recordings(files: Sequence[Path]) -> list[RecordedLog]:
 
 def num_fits() -> int:
     """How often `servo_figures` says what is being done."""
-    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2
+    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2 + 1 + len(FURTHER_SEEDS)
 
 
 def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -104,18 +126,29 @@ def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
     `replay_all_mrad` adds the rows with the torque off; slow motion has none.
     """
     rows = []
-    columns = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
     for motor, figure in figures.items():
-        for part in figure["held_out"]:
-            errors = (error["rms_mrad"] for error in part["errors"])
-            own: dict[str, Any] = dict(zip(columns, errors, strict=True))
-            own["replay_all_mrad"] = part["replay_mrad"]
+        replays = [("replay", part) for part in figure["held_out"]]
+        first = {"motions": figure["held_out"][0]["motions"]}
+        if "without_priors" in figure:
+            replays.append(("replay without priors", {**figure["without_priors"], **first}))
+        replays += [
+            ("replay from other starts", {**part, **first})
+            for part in figure.get("other_starts", ())
+        ]
+        for measure, part in replays:
+            errors = dict(
+                zip(_COLUMNS, (error["rms_mrad"] for error in part["errors"]), strict=True)
+            )
             of = ", ".join(part["motions"])
-            rows.append({"servo": motor, "measure": "replay", "of": of, **own})
+            row = {"servo": motor, "measure": measure, "of": of, **errors}
+            rows.append({**row, "replay_all_mrad": part["replay_mrad"]})
         for gain in figure["sag"]:
-            own = dict(zip(columns, (gain[name] for name in PREDICTIONS), strict=True))
-            rows.append({"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}", **own})
+            errors = dict(zip(_COLUMNS, (gain[name] for name in PREDICTIONS), strict=True))
+            rows.append({"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}", **errors})
     return rows
+
+
+_COLUMNS = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
 
 
 def sag_by_gain(held_out: Sequence[ServoHoldout]) -> list[dict[str, float]]:

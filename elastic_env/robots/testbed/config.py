@@ -66,19 +66,26 @@ class TestbedConfig(JointConfig):
         return RobotModel({JOINT: joint}, rigid, self.control_period_s)
 
     def _require_feasible(self, joint: ElasticJoint, pendulum: Pendulum) -> None:
-        extent = self.reference.extent()
         if joint.servo is None:
             raise ConfigurationError(
                 "the testbed's joint needs a servo, got None; see"
                 " elastic_env.joint.elasticity.Servo"
             )
+        robot = self._robot_model(joint, pendulum)
+        if not self.reference.is_random:
+            plan = self.reference.plan(np.random.default_rng(0), self.control_period_s)
+            inertia = pendulum.inertia + joint.rotor_inertia
+            torque = pendulum.torque(plan.q) + inertia * plan.q_ddot
+            demand = robot.demand(torque[:, None], plan.q_dot[:, None])
+            require_torque(self.reference, *demand)
+            return
+        extent = self.reference.extent()
         worst_angle = min(extent.q, np.pi / 2)
         needed = (
             abs(float(pendulum.torque(np.array(worst_angle))))
             + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
             + joint.viscous_friction * extent.q_dot
         )
-        robot = self._robot_model(joint, pendulum)
         passed = robot.largest_passed_torque(np.array([needed]))
         limits = robot.largest_torque(np.array([extent.q_dot]))
         require_torque(self.reference, passed, limits)

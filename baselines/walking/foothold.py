@@ -1,0 +1,179 @@
+r"""Foothold correction: feet land where the plan has them, by the forces that closed legs carry.
+
+A robot on elastic joints puts its foot down beside its foothold: the joints of the standing leg
+give way under the load. Encoders and IMU do not show by how much. Once both feet stand, the legs
+and the ground close a chain, whose springs pull the feet to where the joints are commanded. The
+ground holds the feet apart by friction, so that a landing error e shows as a pair of horizontal
+forces,
+
+.. math:: e = p_l - p_r - (p_l - p_r)_{plan} = C \, \tfrac12 (f_l - f_r) + o_l - o_r
+
+with the forces f of the feet on the legs, the compliance C of the closed legs, and the offsets o of
+the feet that are commanded. It adds up to where the feet are, from landing to landing,
+
+.. math:: P_{landed} = P_{standing} \pm e
+
+A constant error of e does not add up: left and right take turns, and their signs with them. The
+next swing is offset by −P − b, where P is the place of the foot that stands and b the error with
+which this foot landed before. While the foot takes over the load, its offset goes.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from typing_extensions import override
+
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
+from baselines.walking.zmp_shift import Stances, move_feet
+from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.world.robot_model import WalkerModel
+
+
+class FootholdGains(Model):
+    """Gains of the foothold correction."""
+
+    compliance_m_n: float = quantity("m/N", 4.4e-4, gt=0)
+    """Compliance C of the closed legs, forward and sideways [m/N]."""
+    first_gain: float = quantity("1", 0.8, ge=0, le=1)
+    """Share of its first landing error that a foot learns [1]."""
+    gain: float = quantity("1", 0.4, ge=0, le=1)
+    """Share of every further one [1]."""
+    begin: float = quantity("1", 0.1, ge=0, lt=0.5)
+    """Progress of the swing at which the foot begins to be moved; it ends as long before landing
+    [1]."""
+    limit_m: float = quantity("m", 0.04, gt=0, le=0.05)
+    """Largest offset of a foot forward and sideways [m]."""
+
+
+_GAINS = tuple(FootholdGains.model_fields)
+CORRECTION = record_type(period_s=(), **dict.fromkeys(_GAINS, ()))
+"""Gains of the foothold correction, and the control period."""
+
+FOOTHOLDS = record_type(
+    place=(2, 2),  # of the feet against the plan [m]
+    bias=(2, 2),  # error with which they land [m]
+    landings=(2,),
+    target=(2, 2),  # offset with which they land [m]
+    offset=(2, 2),  # commanded now [m]
+    total=(2,),  # of the errors e since the last landing [m]
+    samples=(),
+    swing=(),  # foot in the air, -1 for none
+)
+"""Memory of the foothold correction."""
+
+
+class FootholdMemory(NamedTuple):
+    """Memory of a policy with foothold correction: rows of `FOOTHOLDS`, and that of the policy."""
+
+    footholds: Records
+    inner: Any
+
+
+class FootholdCorrection(PolicyAround):
+    """A policy of a walker whose feet land where they are planned, see the module.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed walker.
+        gains: Gains.
+    """
+
+    def __init__(self, policy: Any, model: WalkerModel, gains: FootholdGains) -> None:
+        super().__init__(policy, model)
+        self._walk_view = WalkView(model.observation_table)
+        self._stances = Stances.of(model)
+        self._gains: Any = np.zeros(1, CORRECTION)
+        self._gains["period_s"] = model.control_period_s
+        for name in _GAINS:
+            self._gains[name] = getattr(gains, name)
+        self._last_row = len(model.plan.q) - 1
+
+    @override
+    def begin(self, rows: Array) -> FootholdMemory:
+        footholds = np.zeros(len(rows), FOOTHOLDS)
+        footholds["swing"] = -1.0
+        return FootholdMemory(footholds, self.policy.begin(rows))
+
+    @override
+    def act(self, rows: Array, memory: FootholdMemory, inputs: PolicyInputs) -> Step:
+        action, inner = self.policy.act(rows, memory.inner, inputs)
+        observed = self._walk_view.fields(rows)
+        now = memory.footholds.copy()
+        coming = np.empty(len(rows), dtype=np.int64)
+        correct_footholds(self._gains, observed, self._last_row, now, coming)
+        total = action.astype(np.float64)
+        move_feet(*self._stances, coming, np.ascontiguousarray(now["offset"]), total)
+        return total.astype(np.float32), FootholdMemory(now, inner)
+
+
+@compiled
+def correct_footholds(gains: Any, observed: Any, last_row: int, memory: Any, coming: Array) -> None:
+    """Offsets of the feet and the memory after a control step.
+
+    Args:
+        gains: Row of `CORRECTION`, (1,).
+        observed: Observations, rows with fields, (n,).
+        last_row: Of the plan.
+        memory: Rows of `FOOTHOLDS`, brought up to date, (n,).
+        coming: Rows of the plan at the end of the control period, to be filled, (n,).
+    """
+    rules = gains[0]
+    for world in range(len(memory)):
+        shown = observed[world]
+        own = memory[world]
+        coming[world] = min(int(np.rint(shown.clock[0] / rules.period_s)), last_row)
+        progress = shown.clock[1]
+        in_air = 0.0 < progress < 1.0
+        if in_air and own.swing < 0.0:
+            lift(rules, own, 1 - int(shown.clock[2]))
+        elif not in_air:
+            own.swing = -1.0
+            feel_landing(rules, shown, own)
+        for foot in range(2):
+            load = shown.load_share if foot == 1 else 1.0 - shown.load_share
+            share = 1.0 - load
+            if in_air and own.swing == foot:
+                share = blend((progress - rules.begin) / (1.0 - 2.0 * rules.begin))
+            for i in range(2):
+                own.offset[foot, i] = share * own.target[foot, i]
+
+
+@compiled
+def feel_landing(rules: Any, shown: Any, own: Any) -> None:
+    """Add the present error of the feet's distance, where both carry the robot."""
+    if 0.25 < shown.load_share < 0.75:
+        for i in range(2):
+            shear = 0.5 * (shown.wrench[0, 0, i] - shown.wrench[1, 0, i])
+            commanded = own.offset[0, i] - own.offset[1, i]
+            own.total[i] += rules.compliance_m_n * shear + commanded
+        own.samples += 1.0
+
+
+@compiled
+def lift(rules: Any, own: Any, foot: int) -> None:
+    """Take the landing of the standing foot into account, and aim the one that lifts off."""
+    standing = 1 - foot
+    sign = 1.0 if standing == 0 else -1.0
+    own.swing = foot
+    if own.samples > 0.0 and own.landings[0] + own.landings[1] > 0.0:
+        gain = rules.gain if own.landings[standing] > 1.0 else rules.first_gain
+        for i in range(2):
+            error = sign * own.total[i] / own.samples
+            own.place[standing, i] = own.place[foot, i] + error
+            missed = error - own.target[standing, i] - own.bias[standing, i]
+            own.bias[standing, i] += gain * missed
+    own.landings[foot] += 1.0
+    own.samples = 0.0
+    for i in range(2):
+        own.total[i] = 0.0
+        aim = -own.place[standing, i] - own.bias[foot, i]
+        own.target[foot, i] = min(max(aim, -rules.limit_m), rules.limit_m)
+
+
+@compiled
+def blend(s: float) -> float:
+    """Minimum-jerk blend from 0 to 1, s clipped to [0, 1]."""
+    s = min(max(s, 0.0), 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
