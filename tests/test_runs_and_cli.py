@@ -990,16 +990,17 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     """Catches a demonstration that breaks on the way; with short references, so that it takes
     seconds."""
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
-    references = [HOLD, SINE, *[short_walk] * 3]
+    settling_walk = {**short_walk, "num_steps": 2}
+    references = [HOLD, SINE, short_walk, short_walk, settling_walk]
     parts = zip(train.commands.demo._PARTS, references, strict=True)
     short = [part.replace(references=[reference]) for part, reference in parts]
     monkeypatch.setattr(train.commands.demo, "_PARTS", short)
     main(["demo"])
     printed = capsys.readouterr().out
     walks = {
-        f"{name}_0.3+0.5+0.3_s_num_steps=1_{scenario}.png"
+        f"{name}_0.3+0.5+0.3_s_num_steps={steps}_{scenario}.png"
         for name in ("pelvis", "zmp")
-        for scenario in ("nominal", "soft")
+        for steps, scenario in ((1, "nominal"), (2, "soft"))
     }
     names = {
         "fig5_identification.png",

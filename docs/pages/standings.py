@@ -42,14 +42,17 @@ def read_leaderboard(path: Path) -> list[Standing]:
 def _standing(row: Mapping[str, str]) -> Standing:
     fields = {}
     for name in Standing.__dataclass_fields__:
+        if name == "interval_over" and name not in row:
+            continue  # of a leaderboard that was written before there was one
         cells = [row[column] for column in COLUMNS.get(name, (name,))]
         fields[name] = _FIELDS[len(cells)](*cells)
     return _STANDING.validate_python(fields)
 
 
 def _estimate(value: str, low: str, high: str) -> Estimate:
-    ends = (float(low), float(high)) if low else ()
-    return Estimate(float(value), *ends)
+    if not low:
+        return Estimate(float(value))
+    return Estimate(float(value), float(low), float(high))
 
 
 def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:

@@ -421,9 +421,9 @@ class Compare(Model):
     seed, versions and commit.
 
     A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all
-    training seeds of a residual, compared with their base on the same episodes, with intervals over
-    training seeds. The base is added if it is not among the policies. residual:walker_3s/seed_* and
-    the like are the trained ones of the package.
+    training seeds of a residual, compared with their base on the same episodes. The base is added
+    if it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of
+    the package. Intervals are over training seeds, and over the robots of scenarios that draw them.
 
     Example, one joint: elastic compare configs/testbed.yaml
 

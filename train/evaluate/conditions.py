@@ -216,6 +216,13 @@ class Condition(Model):
         return vary_scenario(scenario, fields)
 
     @property
+    def draws_robots(self) -> bool:
+        """True if episodes differ in their robots; on hardware there is one."""
+        known = self.environment
+        scenario = make_scenario(self.scenario_played, known.walks)
+        return not known.is_real and scenario.draws_robots
+
+    @property
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy with the swept one."""
         swept = self.swept.items()

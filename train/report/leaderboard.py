@@ -163,7 +163,9 @@ def legend(found: Sequence[Standing]) -> str:
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
     episodes = f"episodes of a scenario, per training seed: {span}"
-    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}"
+    over = dict.fromkeys(s.interval_over for s in found if s.interval_over)
+    intervals = f" Intervals are 95 % over {', or '.join(over)}." if over else ""
+    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}"
 
 
 def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
