@@ -35,6 +35,7 @@ from baselines.walking.foot_balance import FootBalance
 from baselines.walking.foot_tare import FootTare
 from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.hip_torque import HipTorque
+from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback
 from baselines.walking.stance_roll import StanceRoll
 from baselines.walking.standing_estimate import StandingEstimate
@@ -184,6 +185,12 @@ def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     return FootTare(policy, model, options.foot_tare)
 
 
+def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """`foothold` with what its robots have in common fed forward."""
+    table = load_phase_table(model.plan.gait.step_period_s, options.phase_table)
+    return PhaseFeedforward(_foothold(env, model, options), model, table)
+
+
 _BASE = "input_output"
 _FAST_STEP_S = 2.0
 """Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
@@ -291,6 +298,9 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(_adaptive_posture, (*_ADAPTIVE, *_POSTURE)),
     "foothold": NamedPolicy(_foothold, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD)),
+    "phase_table": NamedPolicy(
+        _phase_table, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD, "phase_table"), Track.TRAINING
+    ),
     "torque_sensor": _measured(TORQUE_SENSOR, (*_COMPENSATED, "adaptation")),
     "hip_sensor": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation"), ("hip",)),
     "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation")),

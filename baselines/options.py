@@ -1,5 +1,6 @@
 """Options of the named policies."""
 
+from pathlib import Path
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import ObserverGains
@@ -55,6 +56,8 @@ class PolicyOptions(Model):
     """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
     foot_tare: FootTareGains = FootTareGains()
     """Walker: how `foothold` sets the foot sensors to zero."""
+    phase_table: Path | None = None
+    """Walker: file of the table of `phase_table`; None for the package's own of the gait."""
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()

@@ -86,6 +86,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | – | both: the strongest with the standard sensors |
+    | `phase_table` | – | `foothold`, what robots have in common led by the phase of the step |
     | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
     | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
     | `hip_sensor` | – | the same at the hips alone |
