@@ -31,6 +31,7 @@ from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
+from baselines.walking.dcm_observer import DcmObserver
 from baselines.walking.foot_balance import FootBalance
 from baselines.walking.foot_tare import FootTare
 from baselines.walking.foothold import FootholdCorrection
@@ -173,14 +174,28 @@ def _with_posture(build: Builder) -> Builder:
 _adaptive_posture = _weighing(_with_posture(_adaptive))
 
 
+def _for_the_gait(model: WalkerModel, options: PolicyOptions) -> PolicyOptions:
+    """With the better base for the step period, where none is named."""
+    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
+        return options.replace(base="dynamic", output=options.output or "taylor")
+    return options
+
+
 def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """`adaptive_posture` whose feet land as planned, whose ZMP has no mean error."""
-    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
-        options = options.replace(base="dynamic", output=options.output or "taylor")
+    options = _for_the_gait(model, options)
     if options.zmp_offset is None:
         options = options.replace(zmp_offset=ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S))
     policy: Any = _adaptive_posture(env, model, options)
     policy = StandingEstimate(policy, model, options.standing)
+    policy = FootholdCorrection(policy, model, options.foothold)
+    return FootTare(policy, model, options.foot_tare)
+
+
+def _dcm_observer(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """`foothold` with an observer in the place of standing estimate and ZMP offset."""
+    policy: Any = _adaptive_posture(env, model, _for_the_gait(model, options))
+    policy = DcmObserver(policy, model, options.dcm_observer, options.ramp_s)
     policy = FootholdCorrection(policy, model, options.foothold)
     return FootTare(policy, model, options.foot_tare)
 
@@ -298,6 +313,9 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(_adaptive_posture, (*_ADAPTIVE, *_POSTURE)),
     "foothold": NamedPolicy(_foothold, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD)),
+    "disturbance_observer": NamedPolicy(
+        _dcm_observer, (*_ADAPTIVE, "posture", "foothold", "foot_tare", "dcm_observer")
+    ),
     "phase_table": NamedPolicy(
         _phase_table, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD, "phase_table"), Track.TRAINING
     ),
