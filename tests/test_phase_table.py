@@ -24,7 +24,7 @@ from baselines.walking.phase_table import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
-from train.learn.phase_table import Harmonics, Search, corrected, probe
+from train.learn.phase_table import Harmonics, Search, Walks, corrected, find, probe
 
 PERIOD_S = 1.1
 PAIRS = np.random.default_rng(0).uniform(-0.01, 0.01, (4, 3, 2)).round(5)
@@ -179,3 +179,16 @@ def test_the_table_lowers_the_zmp_deviation_of_robots_that_it_was_not_found_on()
             deviations.append(info["zmp_deviation"])
         left[name] = float(np.sqrt(np.nanmean(np.square(deviations[250:]))))
     assert left["phase_table"] < 0.95 * left["foothold"]
+
+
+@pytest.mark.slow
+def test_a_search_lowers_the_error_of_its_robot() -> None:
+    """Catches errors that are read in another phase, or of another step, than they are met in."""
+    search = Search(step_period=PERIOD_S, scenario="soft", robots=1, strides=1, plays=2)
+    walks = Walks(search)
+    none = Harmonics(np.zeros((2, 4, 2), dtype=np.complex128))
+    left = [walks.errors(table)[1] for table in (none.table(search), find(search))]
+    walks.env.close()
+    assert left[0]["fell"] == left[1]["fell"] == 0.0
+    for name in ("zmp_x", "zmp_y"):
+        assert left[1][name] < 0.8 * left[0][name]
