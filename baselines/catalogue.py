@@ -31,10 +31,12 @@ from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
+from baselines.walking.dcm_observer import DcmObserver
 from baselines.walking.foot_balance import FootBalance
 from baselines.walking.foot_tare import FootTare
 from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.hip_torque import HipTorque
+from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
 from baselines.walking.stance_roll import StanceRoll
 from baselines.walking.standing_estimate import StandingEstimate
@@ -178,14 +180,33 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     return TrueSensors(env, _with_footholds(policy, model, options))
 
 
+def _for_foothold(model: WalkerModel, options: PolicyOptions) -> PolicyOptions:
+    """Options of `adaptive_posture` inside `foothold`, with the better base for the step period."""
+    options = _quick_posture(options).replace(zmp_offset=None)
+    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
+        return options.replace(base="dynamic", output=options.output or "taylor")
+    return options
+
+
 def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """`adaptive_posture` whose feet land as planned, whose ZMP has no mean error."""
-    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
-        options = options.replace(base="dynamic", output=options.output or "taylor")
-    inside = _quick_posture(options).replace(zmp_offset=None)
-    policy = _adaptive_posture(env, model, inside)
+    policy = _adaptive_posture(env, model, _for_foothold(model, options))
     policy = _with_footholds(policy, model, options)
     return FootTare(policy, model, options.foot_tare)
+
+
+def _dcm_observer(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """`foothold` with an observer in the place of standing estimate and ZMP offset."""
+    policy: Any = _adaptive_posture(env, model, _for_foothold(model, options))
+    policy = DcmObserver(policy, model, options.dcm_observer, options.ramp_s)
+    policy = FootholdCorrection(policy, model, options.foothold)
+    return FootTare(policy, model, options.foot_tare)
+
+
+def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """`foothold` with what its robots have in common fed forward."""
+    table = load_phase_table(model.plan.gait.step_period_s, options.phase_table)
+    return PhaseFeedforward(_foothold(env, model, options), model, table)
 
 
 def _quick_posture(options: PolicyOptions) -> PolicyOptions:
@@ -312,6 +333,12 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(_adaptive_posture, (*_ADAPTIVE, *_POSTURE)),
     "foothold": NamedPolicy(_foothold, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD)),
+    "disturbance_observer": NamedPolicy(
+        _dcm_observer, (*_ADAPTIVE, "posture", "foothold", "foot_tare", "dcm_observer")
+    ),
+    "phase_table": NamedPolicy(
+        _phase_table, (*_ADAPTIVE, *_POSTURE, *_FOOTHOLD, "phase_table"), Track.TRAINING
+    ),
     "torque_sensor": _measured(TORQUE_SENSOR, (*_COMPENSATED, "adaptation")),
     "hip_sensor": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation"), ("hip",)),
     "link_encoder": _measured(LINK_ENCODER, (*_COMPENSATED, "adaptation")),

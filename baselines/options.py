@@ -1,5 +1,6 @@
 """Options of the named policies."""
 
+from pathlib import Path
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import ObserverGains
@@ -8,6 +9,7 @@ from baselines.adaptation.online_stiffness import AdaptationGains
 from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
 from baselines.walking.controller import WalkingGains
+from baselines.walking.dcm_observer import DcmObserverGains
 from baselines.walking.foot_balance import FootBalanceGains
 from baselines.walking.foot_tare import FootTareGains
 from baselines.walking.foothold import FootholdGains
@@ -55,6 +57,10 @@ class PolicyOptions(Model):
     """Walker: how `foothold` estimates the mean ZMP error of a walk from its standing."""
     foot_tare: FootTareGains = FootTareGains()
     """Walker: how `foothold` sets the foot sensors to zero."""
+    dcm_observer: DcmObserverGains = DcmObserverGains()
+    """Walker: filters and bound of `disturbance_observer`."""
+    phase_table: Path | None = None
+    """Walker: file of the table of `phase_table`; None for the package's own of the gait."""
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()

@@ -64,9 +64,9 @@ def best_analytic(is_walker: bool = True) -> str | None:
     return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 
-def sensors_needed(name: str) -> tuple[str, ...]:
+def sensors_needed(name: str, is_walker: bool = True) -> tuple[str, ...]:
     """Sensors beyond the standard set that a policy reads, for the argument `sensors`."""
-    known = named_policy(name, is_walker=True) or named_policy(name, is_walker=False)
+    known = named_policy(name, is_walker)
     return () if known is None else known.sensors
 
 
@@ -82,11 +82,12 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_wrench` | – | the estimate takes the measured foot wrenches, not the planned share |
     | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
     | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
-    | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | – |
+    | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | `foothold`, mean ZMP error by a DCM observer |
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | – | both |
     | `foothold` | – | and feet that land as planned: the strongest with the standard sensors |
+    | `phase_table` | – | `foothold`, what robots have in common led by the phase of the step |
     | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
     | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
     | `hip_sensor` | – | the same at the hips alone |

@@ -100,7 +100,7 @@ _IDS = {"testbed": "elastic_env/Testbed-v0", "walker": "elastic_env/WalkInPlace-
 
 def _made(case: Case) -> Any:
     arguments = {"scenario": case.scenario, **json.loads(case.arguments)}
-    if sensors := sensors_needed(case.policy):
+    if sensors := sensors_needed(case.policy, case.env == "walker"):
         arguments["sensors"] = sensors
     if case.worlds == 1:
         return gymnasium.make(_IDS[case.env], disable_env_checker=True, **arguments)

@@ -238,9 +238,9 @@ def test_the_link_imu_is_a_sensor() -> None:
 
 def test_tracks_and_sensors_are_said() -> None:
     """Catches a policy on the track of the standard sensors that reads others."""
-    assert (track("friction", False), sensors_needed("friction")) == (Track.STANDARD, ())
+    assert (track("friction", False), sensors_needed("friction", False)) == (Track.STANDARD, ())
     assert track("disturbance_observer", False) == Track.LINK_ENCODERS
-    assert sensors_needed("disturbance_observer") == ("link_imu",)
+    assert sensors_needed("disturbance_observer", False) == ("link_imu",)
     with pytest.raises(ConfigurationError, match=r"make it with sensors=\['link_imu'\]"):
         baselines.make("disturbance_observer", made(sensors=[]))
 

@@ -24,11 +24,12 @@ class Evaluate(Model):
     """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own.
     Baselines (see Policies in the docs) are
     zero, uncompensated, input, dynamic, link_encoder,
-    iterative, oracle; on a fixed base also friction,
-    disturbance_observer; on the walker also
+    disturbance_observer, iterative, oracle; on a fixed
+    base also friction; on the walker also
     uncompensated_open, input_open, input_output,
     input_wrench, adaptive, posture, adaptive_posture,
-    foothold, torque_sensor, hip_sensor, thormang, talos."""
+    foothold, phase_table, torque_sensor, hip_sensor,
+    thormang, talos."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks),
     robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a

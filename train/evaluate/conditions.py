@@ -199,7 +199,7 @@ class Condition(Model):
         options = {**self.env_options, **self.policy.env_options, **motion}
         found = {"scenario": self.scenario_played, **options}
         given = found.get("sensors", [])
-        needed = sensors_needed(self.policy.name)
+        needed = sensors_needed(self.policy.name, self.environment.walks)
         # else the environment says what they are
         if needed and isinstance(given, list | tuple):
             found["sensors"] = [*given, *(name for name in needed if name not in given)]
