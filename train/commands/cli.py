@@ -37,6 +37,7 @@ COMMANDS = (
     "export",
     "bench",
     "speed",
+    "margins",
     "play",
     "view",
     "robot",
