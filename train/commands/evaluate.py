@@ -27,7 +27,7 @@ class Evaluate(Model):
     iterative, oracle; on a fixed base also friction,
     disturbance_observer; on the walker also
     uncompensated_open, input_open, input_output,
-    input_wrench, adaptive, posture, adaptive_posture,
+    input_wrench, adaptive, posture, adaptive_posture, foothold,
     torque_sensor, hip_sensor, thormang, talos."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in
