@@ -31,7 +31,13 @@ def episode_rows(episodes: Sequence[dict[str, Any]]) -> pd.DataFrame:
     """Episodes of one cell as rows of the table of episodes."""
     frame = pd.DataFrame(episodes)
     failed = frame["termination"] != ""
-    return frame.assign(member="", cell=0, failed=failed, **{METRIC: frame[METRIC].where(~failed)})
+    return frame.assign(
+        member="",
+        cell=0,
+        robot=frame["seed"],
+        failed=failed,
+        **{METRIC: frame[METRIC].where(~failed)},
+    )
 
 
 def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:

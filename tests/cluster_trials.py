@@ -139,7 +139,7 @@ def dask_cluster(
         started = [subprocess.Popen(command, env=known, **QUIET) for command in commands]  # type: ignore[call-overload]
         try:
             _wait_for_port(port)
-            yield Executors(f"dask://{at}"), started[1:]
+            yield Executors(on=f"dask://{at}"), started[1:]
         finally:
             for process in reversed(started):
                 process.terminate()
@@ -150,7 +150,7 @@ def seconds_of(
     function: Callable[..., Any], given: list[tuple[Any, ...]], executors: Executors
 ) -> float:
     """How long calls take, once a first one has had the worker load what it needs."""
-    with tempfile.TemporaryDirectory() as own, executors.open(len(given), Path(own)) as pool:
+    with tempfile.TemporaryDirectory() as own, executors.open_pool(len(given), Path(own)) as pool:
         run_calls(empty, [(0,)], pool, Watch())
         begin = time.monotonic()
         outcomes = run_calls(function, given, pool, Watch())

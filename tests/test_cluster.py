@@ -70,7 +70,7 @@ def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone
     expected = [evaluate(condition, num_threads=1) for condition in CONDITIONS]
     found = run_conditions(CONDITIONS, Console(quiet=True), dask)
     assert [e.episodes for e in found] == [e.episodes for e in expected]
-    with dask.open(3, tmp_path) as pool:
+    with dask.open_pool(3, tmp_path) as pool:
         outcomes = run_calls(killed_once, [("",), (str(tmp_path / "mark"),), ("",)], pool, Watch())
     assert [outcome is not None and outcome.error is None for outcome in outcomes] == [True] * 3
     assert (tmp_path / "mark").exists()
@@ -80,7 +80,7 @@ def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone
 def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> None:
     """Catches calls that are tried for ever, and others that go with it."""
     moved: list[int] = []
-    with Executors(jobs=2).open(3, tmp_path) as pool:
+    with Executors(jobs=2).open_pool(3, tmp_path) as pool:
         outcomes = run_calls(
             always_killed, [(False,), (True,), (False,)], pool, Watch(moved=moved.append)
         )
@@ -107,7 +107,7 @@ def unreadable(report: Callable[[int], None]) -> Unreadable:
 def test_an_outcome_that_cannot_be_read_fails_alone_and_ends_its_process(tmp_path: Path) -> None:
     """Catches a call that waits for ever for the end of a process that lives."""
     before = processes_of(os.getpid())
-    with Executors(jobs=2).open(4, tmp_path) as pool:
+    with Executors(jobs=2).open_pool(4, tmp_path) as pool:
         outcomes = run_calls(unreadable, [()] * 4, pool, Watch())
         assert len(processes_of(os.getpid()) - before) <= 2
     said = [str(outcome.error) for outcome in outcomes if outcome is not None]
@@ -142,7 +142,7 @@ def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path:
     known = processes_of(os.getpid())
     reports = list[Any]()
     watch = Watch(reported=lambda number, value: reports.append((number, value)))
-    with Executors(jobs=1).open(2, tmp_path) as pool:
+    with Executors(jobs=1).open_pool(2, tmp_path) as pool:
         outcomes = run_calls(helpers_killed, [(known,)] * 2, pool, watch)
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine"] * 2
     assert reports == [(0, 0), (0, 1), (1, 0), (1, 1)]
@@ -229,8 +229,10 @@ def test_other_versions_are_refused_with_both() -> None:
 
 @pytest.mark.parametrize("on", ["dask://nowhere", "ssh://host:1", "slurmy", ""])
 def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
-    with pytest.raises(ConfigurationError, match="on must be local, dask://HOST:PORT"):
-        Executors(on)
+    with pytest.raises(
+        ConfigurationError, match="on must be as follows: Executors: local, dask://HOST:PORT"
+    ):
+        Executors(on=on)
 
 
 @pytest.mark.parametrize(
@@ -241,7 +243,7 @@ def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
         (Executors(), 20, 1),
         (Executors(jobs=2), 20, 4),
         (Executors(jobs=12), 20, 1),
-        (Executors("dask://host:1"), 1, 1),
+        (Executors(on="dask://host:1"), 1, 1),
     ],
 )
 def test_calls_share_the_cores_of_this_machine(
@@ -259,7 +261,7 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(
     port = free_port()
     with (
         pytest.raises(SystemFailedError, match=f"no dask scheduler answers at 127.0.0.1:{port}"),
-        Executors(f"dask://127.0.0.1:{port}").open(1, tmp_path),
+        Executors(on=f"dask://127.0.0.1:{port}").open_pool(1, tmp_path),
     ):
         pass
 
@@ -281,7 +283,7 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
             VersionsDifferError,
             match=r"on tcp://.*: numpy 1\.0\.7 there, .* here; install the same commit",
         ),
-        executors.open(1, tmp_path),
+        executors.open_pool(1, tmp_path),
     ):
         pass
 

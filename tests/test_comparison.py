@@ -103,7 +103,7 @@ def test_one_training_seed_has_no_interval() -> None:
     assert over_seeds([0.5]) == Estimate(0.5)
     assert not over_seeds([0.5, float("nan")]).has_interval
     assert np.isnan(over_seeds([]).value)
-    assert not improvement(np.array([[2.0]]), np.array([[3]])).has_interval
+    assert not improvement([np.array([[2.0]])], [np.array([[3]])]).has_interval
 
 
 # Pairs.
@@ -164,7 +164,7 @@ def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> No
     """Catches a share of seeds, larger taken for better, and ties that count as wins."""
     seeds = [([1.0, 3.0], [2.0, 2.0]), ([1.0, 2.0], [2.0, 2.0]), ([1.0], [2.0]), ([], [])]
     won = np.array([[beats(np.array(mine), np.array(base)).sum()] for mine, base in seeds])
-    found = improvement(won, np.array([[len(mine)] for mine, _ in seeds]))
+    found = improvement([won], [np.array([[len(mine)] for mine, _ in seeds])])
     assert found.value == pytest.approx((1 + 1.5 + 1) / 5)
     assert found.low is not None
     assert found.low == pytest.approx(0.5)
@@ -288,11 +288,11 @@ def test_a_residual_that_is_called_like_its_base_is_not_taken_for_it() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scenarios": ["nominal", "soft", "nominal"]}, "the scenario 'nominal' stands twice"),
+        ({"scenarios": ["nominal", "soft", "nominal"]}, "scenarios: 'nominal' stands twice"),
         ({"references": [3, 1.6, {"step_period": 3.0}]}, "the reference '3 s' stands twice"),
         (
             {"sweep": {"option": "stiffness_scale", "values": [1, 1]}},
-            "the value of the sweep 1.0 stands twice",
+            "sweep.values: 1.0 stands twice",
         ),
         (
             {
@@ -661,6 +661,7 @@ def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
         "Residuals against their base",
         "Baselines against one another",
         "By phase, rms",
+        "First and last four steps, rms",
         "Curves over time",
         "Sweeps",
         "Learning curves",
@@ -837,7 +838,9 @@ def test_compare_plays_every_training_seed_its_base_and_the_rival(
     assert float(found["change"]) == pytest.approx(np.mean(expected))
     assert (found["base"], found["training_seeds"], found["pairs"]) == ("input", "2", "4")
     assert found["marks"] == "held out reference"
-    assert "interquartile mean and 95 % interval over 2 training seeds" in " ".join(printed.split())
+    assert "interquartile mean with interval, 95 % over 2 training seeds" in " ".join(
+        printed.split()
+    )
     for name in ("report.html", "report.md", "statistics.csv"):
         assert f"runs/two/{name}" in printed
     assert load_yaml(folder / "config.yaml", CompareConfig).policies[1].name.endswith("seed_[01]")

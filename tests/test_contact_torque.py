@@ -217,7 +217,7 @@ def test_unloaded_legs_weigh_what_pinocchio_says() -> None:
     q = np.random.default_rng(4).uniform(-0.6, 0.6, (10, 12))
     zero = np.zeros_like(q)
     body = FloatingBody(model().biped.rigid, LEG_JOINTS)
-    _, expected = body.inverse_dynamics(q, np.zeros((10, 3)), zero, np.zeros((10, 3)), zero)
+    _, expected = body.inverse_dynamics(q, np.zeros((10, 4)), zero, np.zeros((10, 4)), zero)
     gravity = make_gravity(model(), "com")
     for side in (0, 1):  # the weight on the other foot
         torque = gravity.at(rows(10, load_share=1 - side)).gravity_torque(q)

@@ -30,7 +30,6 @@ from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.escaping import (
     chart_text,
     csv_row,
-    markdown_table,
     markdown_text,
     script_json,
     visible,
@@ -140,7 +139,7 @@ def test_progress_and_warnings_obey_no_text() -> None:
 def test_files_obey_no_text(tmp_path: Path) -> None:
     """Catches a file that runs commands where somebody looks at it with cat."""
     path = write_records([{f"x{HOSTILE}": HOSTILE, "y": f"\x1b={HOSTILE}"}], tmp_path / "x.csv")
-    text = markdown_table([HOSTILE], ["---"], [[HOSTILE]])
+    text = to_markdown(ReportTable.plain([HOSTILE], [[HOSTILE]]))
     page = page_of(HOSTILE)
     data = script_json({"name": [HOSTILE]})
     for written in (path.read_text(encoding="utf-8"), text, page, data, chart_text(HOSTILE)):
@@ -237,7 +236,7 @@ def test_nothing_after_a_chart_is_swallowed(label: str) -> None:
 def test_a_markdown_table_keeps_its_cells(first: str, second: str) -> None:
     """Catches a newline or a bar that makes another row or cell, and HTML that a viewer would
     take for such."""
-    lines = markdown_table(["a", "b"], ["---", "---:"], [[first, second]]).split("\n")
+    lines = to_markdown(ReportTable.plain(["a", "b"], [[first, second]])).split("\n")
     assert len(lines) == 3
     assert lines[2].replace("\\|", "").count("|") == 3
     assert "<" not in lines[2]
@@ -325,6 +324,6 @@ def test_a_table_is_escaped_in_every_format(tmp_path: Path) -> None:
     page.add("table", table)
     path = write_records([{"a|<b>\x1b": "=1+a|<b>\x1b"}], tmp_path / "table.csv")
     assert to_markdown(table) == "| a\\|&lt;b&gt;� |\n| --- |\n| =1+a\\|&lt;b&gt;� |"
-    assert to_markdown(table) in page.markdown()
+    assert to_markdown(table) in page.as_markdown()
     assert '<td class="words">=1+a|&lt;b&gt;�</td>' in page.html(plotly_js="")
     assert path.read_bytes().decode() == "a|<b>�\r\n'=1+a|<b>�\r\n"

@@ -8,10 +8,9 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.packets import Packet, Parser
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import Faults, damage
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.launch import EmulatorConfig
-from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, damage
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.world.scenario import make_scenario
@@ -23,12 +22,12 @@ def make_servo(number: int = 54024, servo_id: int = 1) -> EmulatedServo:
 
 def write(servo: EmulatedServo, name: str, value: int) -> int:
     register = servo.model.table[name]
-    return servo.write(register.address, register.encode(value))
+    return servo.write_memory(register.address, register.encode(value))
 
 
 def read(servo: EmulatedServo, name: str) -> int:
     register = servo.model.table[name]
-    error, data = servo.read(register.address, register.size)
+    error, data = servo.read_memory(register.address, register.size)
     assert error & ~packets.ALERT == 0
     return register.decode(data)
 
@@ -39,8 +38,8 @@ def test_registers_keep_their_rights() -> None:
     assert write(servo, "present_position", 5) == packets.ACCESS_ERROR
     assert write(servo, "goal_position", 300_000) == packets.LIMIT_ERROR
     assert write(servo, "torque_enable", 2) == packets.RANGE_ERROR
-    assert servo.write(596, b"\x01\x02") == packets.LENGTH_ERROR
-    assert servo.write(597, b"\x01\x02\x03\x04") == packets.ACCESS_ERROR
+    assert servo.write_memory(596, b"\x01\x02") == packets.LENGTH_ERROR
+    assert servo.write_memory(597, b"\x01\x02\x03\x04") == packets.ACCESS_ERROR
     assert write(servo, "goal_position", -131_073) == 0
     assert read(servo, "goal_position") == -131_073
 
@@ -57,7 +56,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
 def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
     """Catches an emulator that forgives a program which switches torque on before it has set the
     goal."""
-    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=Motor(position=0.25))
+    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motion=lambda: (0.25, 0.0, 0.0))
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
     assert read(servo, "goal_position") == 1000
@@ -70,7 +69,7 @@ def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
     write(servo, "torque_enable", 1)
     servo.overload(True)
     assert not servo.is_on
-    error, data = servo.read(611, 4)
+    error, data = servo.read_memory(611, 4)
     assert error == packets.ALERT
     assert len(data) == 4
     assert write(servo, "torque_enable", 1) == packets.ALERT | packets.RESULT_FAIL
@@ -103,8 +102,8 @@ def test_watchdog_stops_models_that_have_one() -> None:
 
 
 def answers(bus: EmulatedBus, wire: bytes) -> list[Packet]:
-    (instruction,) = Parser().feed(wire)
-    return [reply for sent in bus.answer(instruction, 0.0) for reply in Parser().feed(sent)]
+    (instruction,) = Parser().parse(wire)
+    return [reply for sent in bus.answer(instruction, 0.0) for reply in Parser().parse(sent)]
 
 
 def test_sync_instructions_reach_their_servos_in_order() -> None:
@@ -166,12 +165,12 @@ def test_emulated_joint_is_the_testbeds_own() -> None:
     torque = config.true_pendulum.torque(joints.q)
     assert config.true_joint.stiffness * deflection[0] == pytest.approx(torque[0], rel=2e-3)
     assert torque[0] > 25.0
-    assert joints.motors[0].position == joints.theta[0]
-    assert joints.motors[0].torque == pytest.approx(torque[0], rel=0.1)
+    assert joints.motion(0)[0] == joints.theta[0]
+    assert joints.motion(0)[2] == pytest.approx(torque[0], rel=0.1)
     assert joints.q[1] == 0.0
     joints.set_torque(0, is_on=False)
     joints.advance(4.9)
-    assert joints.motors[0].torque == 0.0
+    assert joints.motion(0)[2] == 0.0
 
 
 def test_emulator_that_cannot_be_is_refused() -> None:

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import RunningEmulator
+from elastic_env.hardware.emulator.launch import Faults, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.live import plant
 from elastic_env.hardware.safety import supervised_bus
@@ -220,7 +219,7 @@ def test_the_lower_limit_on_the_temperature_holds_in_motion_and_before(limit: st
     for degrees, words in ((60, ""), (61, "too hot: servo 2 at one: 61.*at most 60 °C")):
         line = attached("one", 1, 2)
         if limit == "servo":
-            line.write(2, "temperature_limit", 60)
+            line.write_register(2, "temperature_limit", 60)
         line.servos[2]["present_temperature"] = degrees
         (answer,) = served([line], enable)
         assert ("message" in answer) == bool(words)

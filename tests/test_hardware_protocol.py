@@ -48,7 +48,7 @@ def test_packets_are_those_of_the_makers_examples(
 ) -> None:
     """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
     assert packets.packet(*content) == bytes.fromhex(wire)
-    found = packets.Parser().feed(bytes.fromhex(wire))
+    found = packets.Parser().parse(bytes.fromhex(wire))
     assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [
         (*content, True)
     ]
@@ -86,7 +86,7 @@ def test_parser_finds_packets_in_pieces_behind_noise(
     at = 0
     for number in range(len(stream)):
         step = pieces[number % len(pieces)]
-        found += parser.feed(stream[at : at + step])
+        found += parser.parse(stream[at : at + step])
         at += step
     assert [packet.parameters[1:] for packet in found] == bodies
 
@@ -97,9 +97,9 @@ def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
     good = packets.status(1, 0, b"\x01\x02\x03\x04")
     flipped = bytearray(good)
     flipped[10] ^= 1
-    assert [p.is_intact for p in packets.Parser().feed(bytes(flipped) + good)] == [False, True]
+    assert [p.is_intact for p in packets.Parser().parse(bytes(flipped) + good)] == [False, True]
     for end in range(4, len(good)):
-        found = [p.parameters for p in packets.Parser().feed(good[:end] + good) if p.is_intact]
+        found = [p.parameters for p in packets.Parser().parse(good[:end] + good) if p.is_intact]
         assert found == [b"\x00\x01\x02\x03\x04"]
 
 
@@ -110,7 +110,7 @@ def test_a_checksum_that_completes_a_header_is_no_header() -> None:
     wire = packets.packet(packets.BROADCAST, packets.SYNC_WRITE, goal)
     assert wire.endswith(packets.HEADER)
     parser = packets.Parser()
-    found = [packet for byte in wire + wire for packet in parser.feed(bytes([byte]))]
+    found = [packet for byte in wire + wire for packet in parser.parse(bytes([byte]))]
     assert [(p.parameters, p.is_intact) for p in found] == [(goal, True)] * 2
 
 

@@ -192,11 +192,11 @@ def test_registers_and_positions_that_look_like_a_header_pass_both_ways(
         ]
         bus.attach([1, 2])
         for value in (-131_073, -131_072, -3, 250_961):
-            bus.write(1, "goal_position", value)
+            bus.write_register(1, "goal_position", value)
             bus.write_all("goal_position", {2: value})
-            assert [bus.read(i, "goal_position") for i in (1, 2)] == [value, value]
+            assert [bus.read_register(i, "goal_position") for i in (1, 2)] == [value, value]
         with pytest.raises(ReplyError, match=r"servo 1 .*EEPROM"):
-            bus.write(1, "present_position", 0)
+            bus.write_register(1, "present_position", 0)
         with pytest.raises(ReplyError, match=r"servo 9 at .* does not answer"):
             bus.attach([9])
 
@@ -307,7 +307,7 @@ def test_second_program_is_told_which_port_is_taken(
     ):
         with pytest.raises(PortError, match=emulator.port):
             intrude()
-    assert supervised.read().is_fresh.all()
+    assert supervised.read_states().is_fresh.all()
 
 
 def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
@@ -471,7 +471,7 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
             assert bus.models == [[2020], [54024, 54024]]
             bus.enable(PATIENT)
             cycle(bus, [0.0, 0.0, 0.0], 5)
-            assert len(bus.read().position) == 3
+            assert len(bus.read_states().position) == 3
             other.faults(unplugged=True)
             emulator.events()
             with pytest.raises(BusGoneError, match=r"gone .*power"):

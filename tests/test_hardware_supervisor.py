@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import Packet, Parser
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.errors import BusGoneError, ReplyError
 from elastic_env.hardware.safety import supervised_bus, supervisor
 from elastic_env.hardware.safety.processes import Channel, is_ending
@@ -55,10 +56,12 @@ class Line(DynamixelBus):
         self, name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024
     ) -> None:
         super().__init__(name)
-        self.motors = {servo_id: Motor() for servo_id in ids}
+        self.motions = dict.fromkeys(ids, (0.0, 0.0, 0.0))
         self.servos = {
-            i: EmulatedServo(i, servo_model(number), self._note, None, motor)
-            for i, motor in self.motors.items()
+            i: EmulatedServo(
+                i, servo_model(number), self._note, None, partial(self.motions.__getitem__, i)
+            )
+            for i in ids
         }
         self.sent: list[tuple[int, int]] = []
         self.log = [] if log is None else log
@@ -79,9 +82,7 @@ class Line(DynamixelBus):
     def _note(self, servo_id: int, name: str, value: int) -> None:
         self.events.append((servo_id, name, value))
         if (name, value) == ("torque_enable", 1):
-            self.goals_at_torque_on.append(
-                self.servos[servo_id].goal - self.motors[servo_id].position
-            )
+            self.goals_at_torque_on.append(self.servos[servo_id].goal - self.motions[servo_id][0])
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
         self._is_gone |= instruction == self.gone_at
@@ -98,7 +99,7 @@ class Line(DynamixelBus):
             packet = Packet(servo_id, instruction, parameters, number not in self.damaged)
             wire = b"".join(self._line.answer(packet, 0.0))
             self._coming += [
-                reply for reply in Parser().feed(wire) if reply.servo_id not in self.silent
+                reply for reply in Parser().parse(wire) if reply.servo_id not in self.silent
             ]
 
     def _receive(self) -> tuple[int, int, bytes] | None:
@@ -200,8 +201,7 @@ def test_no_lost_instruction_lets_a_servo_jump() -> None:
     keeps an old one."""
     for lost in itertools.count():
         line = attached("one", 1, 2)
-        for motor in line.motors.values():
-            motor.position = 0.3
+        line.motions |= dict.fromkeys((1, 2), (0.3, 0.0, 0.0))
         line.lost = {lost}
         (answer,) = served([line], ENABLE)
         assert "error" not in answer
@@ -214,8 +214,8 @@ def test_no_lost_instruction_lets_a_servo_jump() -> None:
 def test_a_goal_that_is_refused_keeps_torque_off() -> None:
     """Catches torque that is switched on at whatever goal the servo has."""
     line = attached("one", 1)
-    line.motors[1].position = 0.3
-    line.write(1, "max_position_limit", 1000)
+    line.motions[1] = (0.3, 0.0, 0.0)
+    line.write_register(1, "max_position_limit", 1000)
     (answer,) = served([line], ENABLE)
     assert "beyond the servo's limit" in answer["message"]
     assert (1, "torque_enable", 1) not in line.events
@@ -224,12 +224,12 @@ def test_a_goal_that_is_refused_keeps_torque_off() -> None:
 def test_torque_goes_on_at_rest_only() -> None:
     """Catches a pendulum that still swings after a fault and is stopped with a jerk."""
     line = attached("one", 1, 2)
-    line.motors[2].velocity = -0.5
+    line.motions[2] = (0.0, -0.5, 0.0)
     (answer,) = served([line], ENABLE)
     assert answer["error"] == "FaultError"
     assert "servo 2 at one moves at 0.50 rad/s" in answer["message"]
     assert (1, "torque_enable", 1) not in line.events
-    line.motors[2].velocity = 0.1
+    line.motions[2] = (0.0, 0.1, 0.0)
     (answer,) = served([line], ENABLE)
     assert "error" not in answer
 
@@ -314,7 +314,7 @@ def test_an_error_number_that_nobody_knows_is_no_success() -> None:
     line = Strange("one", 1)
     line.attach_known({1: 54024})
     with pytest.raises(ReplyError, match="refuses: error 9"):
-        line.write(1, "torque_enable", 0)
+        line.write_register(1, "torque_enable", 0)
 
 
 def test_a_program_that_was_killed_and_still_has_its_channel_loses_torque_at_once() -> None:

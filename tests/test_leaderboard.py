@@ -16,6 +16,7 @@ from rich.console import Console
 import train.commands.compare
 import train.speed.step_times
 from baselines.catalogue import Track
+from docs.pages.standings import read_leaderboard
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
@@ -31,7 +32,6 @@ from train.report.leaderboard import (
     claims_table,
     leaderboard_markdown,
     print_leaderboard,
-    read_leaderboard,
     scenarios_board,
     three_digits,
     write_leaderboard,
@@ -320,8 +320,8 @@ def test_a_reference_is_played_in_its_own_scenarios() -> None:
             "unknown reference with scenarios of its own '1.6'; choose one of: 3 s, 1.6 s",
         ),
         ({"1.6 s": ["slope"]}, "unknown scenario of '1.6 s' 'slope'"),
-        ({"1.6 s": []}, "reference_scenarios of '1.6 s' must have a scenario"),
-        ({"1.6 s": ["soft", "soft"]}, "the scenario of '1.6 s' 'soft' stands twice"),
+        ({"1.6 s": []}, "reference_scenarios.1.6 s must have at least 1 entry"),
+        ({"1.6 s": ["soft", "soft"]}, "reference_scenarios.1.6 s: 'soft' stands twice"),
     ):
         with pytest.raises(ConfigurationError, match=re.escape(message)):
             CompareConfig(**values, reference_scenarios=wrong)
@@ -338,15 +338,16 @@ def test_the_leaderboard_of_the_project_has_its_columns() -> None:
     config = load_yaml(ROOT / "configs" / "leaderboard.yaml", CompareConfig)
     conditions = config.conditions()
     cells = {(c.reference_name, c.scenario) for c in conditions}
-    assert {
-        r: sum(reference == r for reference, _ in cells) for r in ("3 s", "24 s", "1.6 s", "1.1 s")
-    } == {
-        "3 s": 15,
+    references = {reference for reference, _ in cells}
+    assert {r: sum(reference == r for reference, _ in cells) for r in references} == {
+        "3 s": 16,
+        "3 s num_steps=20": 3,
         "24 s": 1,
         "1.6 s": 5,
         "1.1 s": 5,
     }
     assert {len(scenarios) for scenarios in config.groups.values()} == {5, 3, 6}
+    assert {c.episodes for c in conditions if c.scenario == "drawn"} == {64}
     assert {c.track for c in conditions} >= set(Track)
 
 

@@ -176,7 +176,7 @@ def test_holding_torque_is_that_of_pinocchio() -> None:
     """Catches a slip that MuJoCo's conventions would share: gravity torques of the other engine,
     pelvis level."""
     q = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 12))
-    still = np.zeros((20, 3))
+    still = np.zeros((20, 4))
     rest = np.zeros((20, 12))
     _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(
         q, still, rest, still, rest

@@ -125,7 +125,7 @@ def test_an_axis_of_the_motion_gives_the_references() -> None:
         ),
         ({"what": LOAD, "values": [0, "heavy"]}, "values of map.y must be numbers, got 'heavy'"),
         ({"what": LOAD, "values": [0, True]}, "values of map.y must be numbers, got True"),
-        ({"what": LOAD, "values": [5, 5]}, "the value 5 of map.y stands twice"),
+        ({"what": LOAD, "values": [5, 5]}, "map.y.values: 5 stands twice"),
         ({"what": K, "values": [1, 2]}, f"must vary two things, both vary '{K}'"),
         ({"what": LOAD, "values": [5]}, "map.y.values must have at least 2 entries|at least 2"),
     ],

@@ -27,7 +27,7 @@ from train.evaluate.environments import environment
 from train.evaluate.residual_seeds import expand
 from train.evaluate.rollout import make_policy
 from train.learn.train_config import TrainConfig, training_worlds
-from train.runs.kinds import TELLING
+from train.runs.user_code import TELLING
 
 ROOT = Path(__file__).parents[1]
 LONGEST_S = 300

@@ -8,6 +8,7 @@ import pytest
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_kinematics import rotation_z
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 
@@ -258,26 +259,33 @@ def floating_tree(seed: int) -> tuple[mujoco.MjModel, list[str], Array]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_inverse_dynamics_on_a_level_base_is_mujocos(seed: int) -> None:
-    """Catches base and hinges that are mixed up, the base's acceleration without its mass, and a
-    moment elsewhere."""
+    """Catches base and hinges that are mixed up, the base's acceleration without its mass, a
+    moment elsewhere, and a base that turns without Coriolis forces."""
     model, names, columns = floating_tree(seed)
+    model.opt.gravity[:2] = 0.0
     generator = np.random.default_rng(seed)
     q, q_dot, q_ddot = generator.uniform(-2.0, 2.0, (3, 4, len(names)))
-    base, base_dot, base_ddot = generator.uniform(-2.0, 2.0, (3, 4, 3))
+    base, base_dot, base_ddot = generator.uniform(-2.0, 2.0, (3, 4, 4))
     wrench, torque = FloatingBody(model, names).inverse_dynamics(
         q, base_dot, q_dot, base_ddot, q_ddot
     )
     for row in range(4):
         data = mujoco.MjData(model)
-        data.qpos[:3] = base[row]
-        data.qpos[3:7] = [1.0, 0.0, 0.0, 0.0]
+        heading = base[row, 3]
+        R = rotation_z(heading)
+        data.qpos[:3] = base[row, :3]
+        data.qpos[3:7] = [np.cos(heading / 2.0), 0.0, 0.0, np.sin(heading / 2.0)]
         data.qpos[columns + 1] = q[row]
-        data.qvel[:3] = base_dot[row]
+        data.qvel[:3] = R @ base_dot[row, :3]
+        data.qvel[5] = base_dot[row, 3]
         data.qvel[columns] = q_dot[row]
-        data.qacc[:3] = base_ddot[row]
+        data.qacc[:3] = R @ base_ddot[row, :3]
+        data.qacc[5] = base_ddot[row, 3]
         data.qacc[columns] = q_ddot[row]
         mujoco.mj_inverse(model, data)
-        np.testing.assert_allclose(wrench[row], data.qfrc_inverse[:6], rtol=0.0, atol=1e-9)
+        needed = data.qfrc_inverse
+        np.testing.assert_allclose(wrench[row, :3], R.T @ needed[:3], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(wrench[row, 3:], needed[3:6], rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(torque[row], data.qfrc_inverse[columns], rtol=0.0, atol=1e-9)
     assert np.abs(wrench).min(axis=0).max() > 1.0
 

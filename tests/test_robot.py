@@ -151,7 +151,7 @@ NO_MESH = (
             {"joints": {"*": {"damping": 3.0}}},
             r"'base' needs its stiffness K.*elastic identify --robot",
         ),
-        ({"joints": {"*": 0.0}}, r"joint 'base':.*stiffness.*> 0"),
+        ({"joints": {"*": 0.0}}, r"joint 'base':.*stiffness.*>= 1e-09"),
         ({"joints": {"*": "stiff"}}, r"joint 'base':.*stiffness.*number"),
         (
             {"joints": {"*": 800.0, "ellbow": 300.0}},

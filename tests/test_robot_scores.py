@@ -24,7 +24,7 @@ from train.evaluate.episodes import evaluate
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
-from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, worst_share_mean
+from train.evaluate.statistics import interquartile_mean, worst_share_mean
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, robots_table, write_robots
@@ -76,17 +76,18 @@ def test_a_robot_that_falls_is_worse_off_than_any_other() -> None:
     """Catches falls that are left out, which would flatter who falls on the difficult robots."""
     mine = episode_rows(records([1.0, None, 3.0, None, 2.0]))
     base = episode_rows(records([2.0, 2.0, None, None, 2.0]))
-    assert share_better(mine, base, METRIC) == pytest.approx((1.0 + 0.0 + 1.0 + 0.5 + 0.5) / 5.0)
-    assert share_better(base, mine, METRIC) == pytest.approx(1.0 - share_better(mine, base, METRIC))
-    assert share_better(mine[::-1], base, METRIC).item() == share_better(mine, base, METRIC)
-    assert np.isnan(share_better(mine, episode_rows(records([1.0], first=50)), METRIC))
+    found = share_better(mine, base, METRIC)
+    assert found.value == pytest.approx((1.0 + 0.0 + 1.0 + 0.5 + 0.5) / 5.0)
+    assert share_better(base, mine, METRIC).value == pytest.approx(1.0 - found.value)
+    assert share_better(mine[::-1], base, METRIC) == found
+    assert not share_better(mine, episode_rows(records([1.0], first=50)), METRIC).is_known
     without = [{**record, METRIC: float("nan")} for record in records([1.0])]
     assert (
         share_better(
             episode_rows(without + records([1.0], first=1)),
             episode_rows(records([2.0, 2.0])),
             METRIC,
-        )
+        ).value
         == 1.0
     )
 
@@ -105,16 +106,15 @@ def test_rows_are_of_cells_that_draw_robots_against_base_and_first() -> None:
         next(r for r in rows if r.policy == p and r.column.metric == METRIC)
         for p in ("learned", "base")
     )
-    assert (theirs.mean, theirs.middle, theirs.worst) == (
-        Estimate(4.8),
-        Estimate(4.0),
-        Estimate(8.0),
-    )
+    assert [found.value for found in theirs.scores] == pytest.approx([4.8, 4.0, 8.0])
+    assert {found.over for found in theirs.scores} == {"6 robots"}
     assert (theirs.failed, theirs.episodes, theirs.better) == (1, 6, {})
     each = [np.array([1.0, 5.0, 3.0, 3.0, 9.0, 1.0]), np.ones(5)]
-    assert ours.middle == over_seeds([float(interquartile_mean(values)) for values in each])
-    assert ours.worst == over_seeds([9.0, 1.0])
-    assert ours.better == {"base": over_seeds([4.0 / 6.0, 5.5 / 6.0])}
+    middle = np.mean([interquartile_mean(values) for values in each])
+    better = np.mean([4.0 / 6.0, 5.5 / 6.0])
+    found = [ours.middle, ours.worst, ours.better["base"]]
+    assert [own.value for own in found] == pytest.approx([middle, 5.0, better])
+    assert {own.over for own in found} == {"2 training seeds and 6 robots"}
     assert (ours.failed, ours.episodes) == (1, 12)
     assert robot_scores([cell("base", {"all": [1.0] * 3}, "spread")]) == []
 
@@ -144,12 +144,10 @@ def test_file_and_tables_say_what_was_found(tmp_path: Path) -> None:
     assert better == ["1.0"]
     table = robots_table(rows)
     shown = {head.title: cell for head, cell in zip(table.heads, table.rows[0].cells, strict=True)}
-    assert [shown[name] for name in ("mean", "interquartile mean", "worst tenth", "falls")] == [
-        "5.00",
-        "4.00",
-        "14.00",
-        "0/10",
-    ]
+    assert shown["mean"].startswith("5.00 [4.00, ")
+    assert shown["interquartile mean"].startswith("4.00 [4.00, ")
+    assert shown["worst tenth"] == "14.00 [4.00, 14.00]"
+    assert (shown["falls"], shown["95 % over"]) == ("0/10", "10 robots")
     console = Console(width=100, record=True)
     print_robots(rows, console)
     text = console.export_text()

@@ -993,32 +993,18 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
 ) -> None:
     """Catches a demonstration that breaks on the way; with short references, so that it takes
     seconds."""
-    monkeypatch.setattr(
-        train.commands.demo, "_STATIC", train.commands.demo._STATIC.replace(references=[HOLD])
-    )
-    monkeypatch.setattr(
-        train.commands.demo, "_MOTION", train.commands.demo._MOTION.replace(references=[SINE])
-    )
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
-    monkeypatch.setattr(
-        train.commands.demo,
-        "_SLOW_WALK",
-        train.commands.demo._SLOW_WALK.replace(references=[short_walk]),
-    )
-    monkeypatch.setattr(
-        train.commands.demo, "_WALK", train.commands.demo._WALK.replace(references=[short_walk])
-    )
-    monkeypatch.setattr(
-        train.commands.demo,
-        "_SOFT_WALK",
-        train.commands.demo._SOFT_WALK.replace(references=[short_walk]),
-    )
+    settling_walk = {**short_walk, "num_steps": 2}
+    references = [HOLD, SINE, short_walk, short_walk, settling_walk]
+    parts = zip(train.commands.demo._PARTS, references, strict=True)
+    short = [part.replace(references=[reference]) for part, reference in parts]
+    monkeypatch.setattr(train.commands.demo, "_PARTS", short)
     main(["demo"])
     printed = capsys.readouterr().out
     walks = {
-        f"{name}_0.3+0.5+0.3_s_num_steps=1_{scenario}.png"
+        f"{name}_0.3+0.5+0.3_s_num_steps={steps}_{scenario}.png"
         for name in ("pelvis", "zmp")
-        for scenario in ("nominal", "soft")
+        for steps, scenario in ((1, "nominal"), (2, "soft"))
     }
     names = {
         "fig5_identification.png",

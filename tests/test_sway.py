@@ -91,6 +91,15 @@ def test_frequencies_are_those_of_mujoco_linearised_about_the_stance(stiffness: 
     assert expected[0] < 7.0 < 50.0 < expected[-1]
 
 
+def test_a_stance_elsewhere_sways_alike() -> None:
+    """Catches feet that stay under the hips while the pelvis moves on."""
+    pelvis = balanced(BIPED)
+    stiffness = np.full(12, 1001.0)
+    moved = np.array([0.3, -0.2, 0.0])
+    there = sway_frequencies(BIPED, pelvis + moved, stiffness, BIPED.ankles + moved)
+    np.testing.assert_allclose(there, sway_frequencies(BIPED, pelvis, stiffness), rtol=1e-6)
+
+
 def test_a_direction_in_which_gravity_wins_has_no_frequency() -> None:
     """Catches the root of a magnitude in place of nan, and an unstable direction that hides the
     stable ones."""

@@ -28,8 +28,8 @@ from elastic_env.rendering.side_by_side import (
     enlarged_pose,
 )
 from tests.three_joints import ARM
-from train.commands.view import Page, Playback, record, show
-from train.commands.view_proxy import Access, Head, RefusedError, listen
+from train.commands.view import Page, Playback, View, record, show
+from train.commands.view_proxy import Access, Head, RefusedError, open_listener
 from train.evaluate.conditions import Condition, PolicySpec
 
 
@@ -289,14 +289,14 @@ def test_another_model_does_not_end_the_page(page: Page, tmp_path: Path) -> None
 
 def test_a_page_that_cannot_listen_says_so() -> None:
     """Catches a traceback for a port that is taken, or a host that is none."""
-    with listen() as taken, pytest.raises(SystemFailedError, match="name another --port"):
-        listen(port=taken.getsockname()[1])
+    with open_listener() as taken, pytest.raises(SystemFailedError, match="name another --port"):
+        open_listener(port=taken.getsockname()[1])
     for host in ("no.such.host.invalid", "a" * 300):
         with pytest.raises(ConfigurationError, match="--host must be an address"):
-            listen(host)
+            open_listener(host)
     for port in (-1, 65536):
-        with pytest.raises(ConfigurationError, match="from 0 to 65535"):
-            listen(port=port)
+        with pytest.raises(ConfigurationError, match=r"port must be .* >= 0 and <= 65535, got"):
+            View(port=port)
 
 
 @pytest.mark.parametrize(

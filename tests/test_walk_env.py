@@ -84,6 +84,8 @@ INFO_KEYS = {
     "swing",
     "single_support",
     "support",
+    "position_error",
+    "heading_error",
     "early_touchdown",
     "clipped",
     "reward_terms",
@@ -1113,6 +1115,7 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
     error = plan.q[1:] - q
     offsets = HARD_ACTIONS[:, 1].astype(np.float64)
     zmp = np.stack([hard_walk.info("zmp_x"), hard_walk.info("zmp_y")], axis=1)
+    pelvis_R = hard_walk.truth("pelvis_R")[1:]
 
     def rms(values: Array) -> Array:
         return np.sqrt(np.mean(values**2, axis=1))
@@ -1139,6 +1142,10 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
         "single_support": plan.timing.single[1:],
         "support": plan.timing.support[1:],
         "clipped": np.zeros(NUM_STEPS),
+        "position_error": np.linalg.norm(
+            (hard_walk.truth("ankles")[1:, :, :2] - plan.ankles[1:, :, :2]).mean(axis=1), axis=1
+        ),
+        "heading_error": np.arctan2(pelvis_R[:, 1, 0], pelvis_R[:, 0, 0]) - plan.heading[1:],
     }
     for name, values in expected.items():
         np.testing.assert_allclose(hard_walk.info(name), values, rtol=0.0, atol=1e-8, err_msg=name)
@@ -1220,6 +1227,7 @@ def test_episode_metrics_are_those_of_the_recorded_signals(hard_walk: Recording)
         **{f"{block}_steps": walking for block in ("first", "last")},
         **{f"{block}_steps_loaded": walking & loaded for block in ("first", "last")},
         "touchdown": end,
+        "end": np.arange(1, NUM_STEPS + 1) == NUM_STEPS,
     }
     metrics = dict(hard_walk.results[-1][4]["episode_metrics"])
     assert (metrics.pop("fell"), metrics.pop("diverged")) == (False, False)
@@ -1640,8 +1648,8 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         (
             {"gait": 3.0},
             (
-                r"gait must be a mapping of lift_m, hip_height_m, transfer, settling_steps, got 3\.0; see also"
-                r" step_period"
+                r"gait must be a mapping of settling_steps, step_length_m, step_width_m, turn_rad,"
+                r" lift_m, hip_height_m, transfer, got 3\.0; see also step_period"
             ),
         ),
         (

@@ -340,15 +340,16 @@ def test_tables_say_median_worst_and_falls() -> None:
     """Catches a fall averaged in, a worst episode that fell, and phases that are left out."""
     cell = made_up(walk("input", episodes=4), ("", 0.002), ("fell", 9.0), ("", 0.004), ("", 0.003))
     text = write_summary([cell], Path("summary.md")).read_text()
-    first, second = (
+    first, second, third = (
         line
         for line in text.splitlines()
         if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
     )
     assert first.count("3.00 (4.00)") == 5  # roll, pitch and IMU
     assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
-    assert first.endswith("| 1/4 |")
-    assert second.endswith("| 1/4 |")
+    assert third.count("(4.00)") == 2  # pelvis error of both blocks of steps
+    for line in (first, second, third):
+        assert line.endswith("| 1/4 |")
     assert "9000" not in text
     for word in (
         "pelvis",

@@ -92,15 +92,15 @@ class WalkSignals(LearnedSignals):
         self.gains = (gains.attitude, gains.attitude, gains.zmp_x, gains.zmp_y)
         table = model.observation_table
         self._model = model
-        self._feet = FlatFeet(model, _LEAST_LOAD)
+        self._feet = FlatFeet(model, _LEAST_LOAD * model.biped.weight)
         self._attitude = table.group("imu_attitude")
-        self._zmp = table.group("zmp_reference")
+        self._wrench = table.group("wrench")
 
     @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
         """Tilt, and error of the ZMP of feet that are flat where planned, (num_worlds, 4)."""
-        missing = asked[:, self._zmp] - self._feet.zmp(seen)
-        return np.hstack([seen[:, self._attitude], missing])
+        error = self._feet.zmp_error(asked, seen[:, self._wrench])
+        return np.hstack([seen[:, self._attitude], -error])
 
     @override
     def offsets(self, table: Array) -> Array:

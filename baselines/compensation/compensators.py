@@ -12,7 +12,12 @@ from typing import Any, Literal, NamedTuple, Protocol, Self, TypeVar, get_args
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.contact_torque import LegTorque, WrenchTorque, shift_plan
+from baselines.compensation.contact_torque import (
+    LegTorque,
+    WrenchTorque,
+    planned_feet,
+    shift_plan,
+)
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
 from baselines.compensation.gravity_torque import (
     FixedTorque,
@@ -489,9 +494,9 @@ class Compensated(PolicyAround):
         self._theta = model.observation_table.group("encoder_angle")
         self._corrects_policy = corrects_policy
         self._ramp = Ramp(model, ramp_s).table
-        self._plan: tuple[WalkView, float] | None = None
+        self._plan: tuple[WalkView, Any] | None = None
         if isinstance(model, WalkerModel):
-            self._plan = WalkView(model.observation_table), model.biped.foot_spacing
+            self._plan = WalkView(model.observation_table), planned_feet(model.plan)
 
     @override
     def begin(self, rows: Array) -> CompensatedMemory:
@@ -509,9 +514,10 @@ class Compensated(PolicyAround):
         correction = inputs.deflection
         own = memory.compensator
         if self._plan is not None and (shift := inputs.zmp_shift) is not None:
-            view, foot_spacing = self._plan
+            view, feet = self._plan
             rows = rows.copy()
-            shift_plan(view.fields(rows), np.ascontiguousarray(shift), foot_spacing)
+            shift = np.ascontiguousarray(shift)
+            shift_plan(view.fields(rows), shift, feet, self.compensator.model.control_period_s)
             own = self._begin_shifted(rows, memory)
         compensator = self.compensator.at(rows)
         theta = rows[:, self._theta]

@@ -21,6 +21,7 @@ from baselines.compensation.policy import WalkView
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import solve_stiffness
+from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rigid.leg_chains import LegChains
 from elastic_env.rigid.tree.kernels import Vector, loads_type
 from elastic_env.world.robot_model import WalkerModel
@@ -30,11 +31,35 @@ ContactMethod = Literal["com", "ankle", "lumped"]
 CONTACT = record_type(
     gravity=(),  # [m/s²]
     mass=(),  # of the robot [kg]
-    footholds=(2, 2),  # middles of the soles [m]
     ankle_height=(),  # [m]
+    period_s=(),  # of the control
     is_at_zmp=bool,  # or at the ankle axes
 )
 """How the ground carries the robot."""
+
+FEET = record_type(
+    share=(),  # load share of the right foot [1]
+    soles=(2, 2),  # their middles in the plan's world frame [m]
+    yaw=(2, 2),  # cosine and sine of their headings [1]
+    heading=(2,),  # cosine and sine of the heading of the pelvis [1]
+    across=(2,),  # from the right sole to the left one, a unit vector in the local frame [1]
+    spacing=(),  # distance of the soles [m]
+)
+"""The feet where the plan has them, one row per control step."""
+
+
+def planned_feet(plan: WalkPlan) -> Any:
+    """Rows of `FEET` of a plan; the local frame is that of `elastic_env.motion.walk_plan`."""
+    rows = np.zeros(len(plan.q), FEET)
+    between = plan.local.ankles[:, 0, :2] - plan.local.ankles[:, 1, :2]
+    spacing = np.hypot(between[:, 0], between[:, 1])
+    rows["share"] = plan.share
+    rows["soles"] = plan.ankles[..., :2]
+    rows["yaw"] = np.stack([np.cos(plan.foot_yaw), np.sin(plan.foot_yaw)], axis=-1)
+    rows["heading"] = np.stack([np.cos(plan.heading), np.sin(plan.heading)], axis=-1)
+    rows["across"] = between / spacing[:, None]
+    rows["spacing"] = spacing
+    return rows
 
 
 class LegTorque(NamedTuple):
@@ -94,8 +119,10 @@ class ContactGravity:
         biped = model.biped
         self._view = WalkView(model.observation_table)
         self._chains = biped.weightless_chains if method == "lumped" else biped.chains
-        robot = (biped.gravity, biped.chains.mass, biped.footholds, biped.ankle_height)
-        self._contact: Any = np.array([(*robot, method == "com")], CONTACT)
+        robot = (biped.gravity, biped.chains.mass, biped.ankle_height)
+        contact = (*robot, model.control_period_s, method == "com")
+        self._contact: Any = np.array([contact], CONTACT)
+        self._feet = planned_feet(model.plan)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
@@ -110,7 +137,7 @@ class ContactGravity:
         """The gravity torques of `at` for a level pelvis, and for one tilted as the IMU says."""
         level = np.empty(len(rows), LOADS)
         tilted = np.empty(len(rows), LOADS)
-        planned_loads(self._view.fields(rows), self._contact, level, tilted)
+        planned_loads(self._view.fields(rows), self._contact, self._feet, level, tilted)
         return LegTorque(self._chains, level), LegTorque(self._chains, tilted)
 
 
@@ -176,12 +203,13 @@ class BoundPlannedTorque(NamedTuple):
 
 
 @compiled
-def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
+def planned_loads(observed: Any, contact: Any, feet: Any, level: Any, tilted: Any) -> None:
     """Loads under the planned load share.
 
     Args:
         observed: Observations, rows with fields.
         contact: Row of `CONTACT`, (1,).
+        feet: Rows of `FEET`, one per control step.
         level: Loads of a pelvis that is level, to be filled, rows of `LOADS`.
         tilted: The same of one that is tilted as the IMU says.
     """
@@ -189,8 +217,11 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
     for world in range(len(level)):
         load = level[world]
         plan = observed[world]
+        stance = feet[row_of_plan(plan, ground.period_s, 0.0, len(feet))]
         fill_gravity(plan, ground.gravity, True, load)
         share = plan.load_share
+        x = from_middle(plan, stance, share, 0)
+        y = from_middle(plan, stance, share, 1)
         for foot in range(2):
             weight = share if foot == 1 else 1.0 - share
             # what the ground carries is a negative mass where it does
@@ -198,13 +229,28 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
             load.point[foot] = 0.0
             load.wrench[foot] = 0.0
             if ground.is_at_zmp:
-                for i in range(2):
-                    left = (1.0 - share) * ground.footholds[0, i]
-                    middle = left + share * ground.footholds[1, i]
-                    load.point[foot, i] = plan.zmp_reference[i] - middle
+                cosine = stance.yaw[foot, 0]
+                sine = stance.yaw[foot, 1]
+                load.point[foot, 0] = cosine * x + sine * y
+                load.point[foot, 1] = cosine * y - sine * x
                 load.point[foot, 2] = -ground.ankle_height
         tilted[world] = load
         fill_gravity(plan, ground.gravity, False, tilted[world])
+
+
+@compiled
+def from_middle(plan: Any, stance: Any, share: float, axis: int) -> float:
+    """The planned ZMP from the soles' middle weighted by their loads, in the world [m]."""
+    left = (1.0 - share) * stance.soles[0, axis]
+    middle = left + share * stance.soles[1, axis]
+    return plan.zmp_reference[axis] - middle
+
+
+@compiled
+def row_of_plan(observed: Any, period_s: float, periods_ago: float, rows: int) -> int:
+    """Row of the plan at the end of the coming control period, or some periods before it."""
+    periods = np.rint(observed.clock[0] / period_s)
+    return int(min(max(periods - periods_ago, 0.0), rows - 1.0))
 
 
 @compiled
@@ -249,44 +295,52 @@ def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> Vector:
 
 
 @compiled
-def shift_plan(observed: Any, shift: Array, spacing: float) -> None:
+def shift_plan(observed: Any, shift: Array, feet: Any, period_s: float) -> None:
     """Shift the plan's ZMP in observations, in place, and its load share with it.
 
     Args:
         observed: Observations, rows with fields, (n,).
-        shift: Of the ZMP, x forward and y left, (n, 2) [m].
-        spacing: Distance of the feet [m].
+        shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
+        feet: Rows of `FEET`, one per control step.
+        period_s: Control period [s].
     """
     for world in range(len(observed)):
         shown = observed[world]
-        for i in range(2):
-            shown.zmp_reference[i] += shift[world, i]
-        shown.load_share = shifted_share(shown.load_share, shift[world, 1], spacing)
+        stance = feet[row_of_plan(shown, period_s, 0.0, len(feet))]
+        cosine = stance.heading[0]
+        sine = stance.heading[1]
+        shown.zmp_reference[0] += cosine * shift[world, 0] - sine * shift[world, 1]
+        shown.zmp_reference[1] += sine * shift[world, 0] + cosine * shift[world, 1]
+        across = shift_across(shift[world], stance)
+        shown.load_share = shifted_share(shown.load_share, across, stance.spacing)
 
 
 @compiled
-def shifted_shares(
-    observed: Any, shift: Array, planned: Array, dt: float, spacing: float, found: Array
-) -> None:
+def shifted_shares(observed: Any, shift: Array, feet: Any, period_s: float, found: Array) -> None:
     """Load shares of the right foot after the last control period, under a shifted ZMP.
 
     Args:
         observed: Observations, rows with fields, (n,).
-        shift: Of the ZMP, x forward and y left, (n, 2) [m].
-        planned: Shares of the plan, one per control step.
-        dt: Control period [s].
-        spacing: Distance of the feet [m].
+        shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
+        feet: Rows of `FEET`, one per control step.
+        period_s: Control period [s].
         found: To be filled, (n,).
     """
     for world in range(len(found)):
-        periods = np.rint(observed[world].clock[0] / dt)
-        row = int(min(max(periods - 1.0, 0.0), len(planned) - 1.0))
-        found[world] = shifted_share(planned[row], shift[world, 1], spacing)
+        stance = feet[row_of_plan(observed[world], period_s, 1.0, len(feet))]
+        across = shift_across(shift[world], stance)
+        found[world] = shifted_share(stance.share, across, stance.spacing)
 
 
 @compiled
-def shifted_share(share: float, shift_y: float, spacing: float) -> float:
-    """Load share of the right foot under a ZMP that is shifted to the left.
+def shift_across(shift: Array, stance: Any) -> float:
+    """The part of a shift in the local frame from the right foot towards the left one [m]."""
+    return shift[0] * stance.across[0] + shift[1] * stance.across[1]
+
+
+@compiled
+def shifted_share(share: float, shift: float, spacing: float) -> float:
+    """Load share of the right foot under a ZMP that is shifted towards the left one.
 
     On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot
     that stands takes over, whose ankle carries the shift, so that the change fades with 4 μ (1 −
@@ -294,10 +348,10 @@ def shifted_share(share: float, shift_y: float, spacing: float) -> float:
 
     Args:
         share: Planned share μ.
-        shift_y: Shift p [m].
+        shift: p [m].
         spacing: Distance w of the feet [m].
     """
-    shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing
+    shifted = share - 4.0 * share * (1.0 - share) * shift / spacing
     if shifted > 1.0:
         return 1.0
     return 0.0 if shifted < 0.0 else shifted

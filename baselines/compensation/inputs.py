@@ -5,7 +5,8 @@ base to the last bit. An input acts on the quantity that the base itself plans o
 that its feedback does not work against it: a policy that is told to shift its center of mass also
 expects it there.
 
-Columns per joint are in the order of the robot's joints. Axes: x forward, y to the left.
+Columns per joint are in the order of the robot's joints. Axes: x forward, y to the left, on the
+walker in the plan's local frame (`elastic_env.motion.walk_plan`).
 """
 
 from collections.abc import Mapping

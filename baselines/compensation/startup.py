@@ -36,7 +36,7 @@ class Ramp:
         self._delay = 0.0
         if isinstance(model, WalkerModel):
             held = _held_stiffness(model)
-            sway = sway_frequencies(model.biped, model.plan.pelvis[0], held)
+            sway = sway_frequencies(model.biped, model.plan.pelvis[0], held, model.plan.ankles[0])
             half_period = np.pi / sway[0]
             if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
                 self._delay = float(half_period)

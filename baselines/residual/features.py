@@ -22,9 +22,9 @@ from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
+from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal, rename_group
-from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
@@ -212,24 +212,17 @@ class _ContactError:
     _LEAST_N = 50.0
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
-        table = model.observation_table
-        biped = model.biped
         self._level = GroundLevel(model, period_s)
-        planned = ("zmp_reference.x", "zmp_reference.y", "load_share")
-        self._planned = table.columns(*planned)
-        self._sensors = FootSensors.of_biped(biped)
-        self._ankles = biped.ankles
+        self._share = model.observation_table.group("load_share")
+        self._feet = FlatFeet(model, self._LEAST_N)
 
     def begin(self, num_worlds: int) -> GroundMemory:
         return self._level.begin(num_worlds)
 
     def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         _, wrenches, memory = self._level.upright(rows, memory)
-        wrench = wrenches.reshape(-1, 2, 2, 3)
-        flat = np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3))
-        force, moment = self._sensors.ground_wrench(wrench, flat)
-        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N)
+        force, zmp = self._feet.ground(rows, wrenches)
         vertical = force[:, :, 2].sum(axis=1)
         share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan)
-        error = np.column_stack([zmp, share]) - rows[:, self._planned]
+        error = np.column_stack([zmp, share[:, None] - rows[:, self._share]])
         return np.nan_to_num(error, nan=0.0), memory

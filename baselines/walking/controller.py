@@ -15,9 +15,9 @@ All are offsets of the joints around the planned walk. Where a joint is, it take
 columns of the observation, so that an output compensator around it (`baselines.Compensated`) shows
 it links instead of motors.
 
-Local frame: at the sole of the step's support foot, level, its place in the plan's world that of
-the planned foothold, re-taken at every support change. The center of mass in it follows from joint
-angles and the attitude of the IMU.
+Local frame: at the sole of the step's support foot, level, with the heading of the pelvis, re-taken
+at every support change. The center of mass in it follows from joint angles and the attitude of the
+IMU. The sole stands where the plan has it in its local frame (`elastic_env.motion.walk_plan`).
 
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum
 Tracking", IROS.
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.contact_torque import shifted_shares
+from baselines.compensation.contact_torque import planned_feet, shifted_shares
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
@@ -107,7 +107,6 @@ CONTROLLER = record_type(
     is_com_fed_back=bool,
     thigh=(),  # [m]
     shank=(),  # [m]
-    footholds=(2, 2),  # [m]
     weight=(),  # of the robot [N]
     weight_of_feet=(),  # below the sensors [N]
     omega=(),  # of the pendulum [rad/s]
@@ -122,8 +121,14 @@ CONTROLLER = record_type(
 )
 """Assumptions of the controller, and its gains."""
 
-PLAN = record_type(share=(), com=(2,), com_dot=(2,))
-"""Load share of the right foot, and center of mass of the plan, one row per control step."""
+PLAN = record_type(
+    share=(),  # load share of the right foot [1]
+    com=(2,),  # center of mass [m]
+    com_dot=(2,),  # against the feet that stand [m/s]
+    soles=(2, 2),  # middles of the soles [m]
+    foot_yaw=(2, 2),  # cosine and sine of the headings of the feet [1]
+)
+"""The plan in its local frame, one row per control step."""
 
 MEMORY = record_type(
     steps=(),
@@ -179,10 +184,15 @@ class WalkingController(BatchPolicy):
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
         self._constants = _constants(model, com_feedback, gains or WalkingGains())
         plan = model.plan
+        local = plan.local
         self._plan: Any = np.zeros(plan.num_steps + 1, PLAN)
-        for name in PLAN.names or ():
-            self._plan[name] = getattr(plan, name)
-        self._planned_shares = np.ascontiguousarray(plan.share)
+        self._plan["share"] = plan.share
+        self._plan["com"] = local.com
+        self._plan["com_dot"] = local.com_dot
+        self._plan["soles"] = local.ankles[..., :2]
+        turned = (np.cos(local.foot_yaw), np.sin(local.foot_yaw))
+        self._plan["foot_yaw"] = np.stack(turned, axis=-1)
+        self._feet = planned_feet(plan)
         self._period_s = model.control_period_s
         self._stances = Stances.of(model)
         self._sole = _sole(self._biped)
@@ -232,8 +242,7 @@ class WalkingController(BatchPolicy):
             return _NO_SHARES
         shares = np.empty(len(observed))
         shift = np.ascontiguousarray(shift)
-        constants = (self._planned_shares, self._period_s, self._biped.foot_spacing)
-        shifted_shares(observed, shift, *constants, shares)
+        shifted_shares(observed, shift, self._feet, self._period_s, shares)
         return shares
 
 
@@ -252,7 +261,6 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
     constants["is_com_fed_back"] = com_feedback
     constants["thigh"] = biped.leg.thigh
     constants["shank"] = biped.leg.shank
-    constants["footholds"] = biped.footholds
     constants["weight"] = biped.weight
     above_feet = biped.chains_above_feet.mass * biped.gravity
     constants["weight_of_feet"] = biped.weight - above_feet
@@ -340,7 +348,7 @@ def control(
                 own.com[foot, i] = com[world, i] - soles[world, foot, i]
         follow_com(constants, shown, planned, given.balance_gain, last, own)
         for leg in range(2):
-            offset_leg(constants, shown, given, own, leg, ramped, action[world])
+            offset_leg(constants, shown, planned, given, own, leg, ramped, action[world])
     return is_shifted
 
 
@@ -395,7 +403,7 @@ def follow_com(
             now = own.com[support, i] - own.planned[i]
             com = last.com[support, i] if last.steps > 0.0 else own.com[support, i]
             before = com - last.planned[i]
-            deviation = now + controller.footholds[support, i] - planned.com[i]
+            deviation = now + planned.soles[support, i] - planned.com[i]
             deviating = (now - before) / controller.period_s - planned.com_dot[i]
             further = deviating - last.velocity[i]
             own.velocity[i] = last.velocity[i] + controller.velocity_share * further
@@ -408,7 +416,14 @@ def follow_com(
 
 @compiled
 def offset_leg(
-    controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, out: Array
+    controller: Any,
+    shown: Any,
+    planned: Any,
+    given: Any,
+    own: Any,
+    leg: int,
+    ramp: float,
+    out: Array,
 ) -> None:
     """Offsets of a leg's joints [rad].
 
@@ -421,8 +436,12 @@ def offset_leg(
     hip, knee, ankle = lengthening(controller, bent, difference, sign)
     share = shown.load_share if leg == 1 else 1.0 - shown.load_share
     carried = share * controller.weight
-    pitch = carried * own.shift[0] / controller.ankle_stiffness[leg, 0]
-    roll = -carried * own.shift[1] / controller.ankle_stiffness[leg, 1]
+    cosine = planned.foot_yaw[leg, 0]
+    sine = planned.foot_yaw[leg, 1]
+    ahead = cosine * own.shift[0] + sine * own.shift[1]  # in the frame of the foot
+    aside = cosine * own.shift[1] - sine * own.shift[0]
+    pitch = carried * ahead / controller.ankle_stiffness[leg, 0]
+    roll = -carried * aside / controller.ankle_stiffness[leg, 1]
     for i in range(6):
         wound = 1.0 + given.deflection[leg, i]
         moved = 0.0

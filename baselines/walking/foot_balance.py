@@ -13,7 +13,8 @@ middle of the feet: they turn as one each foot gives :math:`k_f (f - f_{ref})` a
 ==============  =======================================================================================
 
 f and m are force and moment of the foot on its leg: a foot that carries too much rises. The force
-that is wanted has the planned load share, and m a of the planned center of mass. Every measurement
+that is wanted has the planned load share, and m a of the planned center of mass. All of that is in the
+frame of the pelvis, to which the wrenches are turned by the planned headings. Every measurement
 passes a first-order low-pass, α = 2πfT/(1 + 2πfT). An adjustment is bounded. The center of mass is
 not fed back, and motors are taken for links.
 
@@ -42,7 +43,7 @@ from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import derivatives
 from elastic_env.rigid.contact_force import shares
-from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt, turn
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -108,6 +109,8 @@ class FootBalance(BatchPolicy):
         self._clock = table.group("clock")
         acceleration, _ = derivatives(self._plan.com_dot, self._dt)
         upright = np.ones((len(acceleration), 1))
+        self._local = self._plan.local
+        acceleration = turn(acceleration, -self._plan.heading)
         wanted = np.hstack([acceleration / self._biped.gravity, upright])
         of_feet = self._biped.weight * shares(self._plan.share)
         self._wanted = of_feet[..., None] * wanted[:, None]  # (T, 2, 3)
@@ -137,25 +140,26 @@ class FootBalance(BatchPolicy):
         gains = self._gains
         periods = np.round(rows[:, self._clock][:, 0] / self._dt)
         row = np.clip(periods.astype(np.int64) - 1, 0, self._plan.num_steps)
-        force, moment = np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0)
+        yaw = self._local.foot_yaw[row]
+        force, moment = (turn(part, yaw) for part in np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0))
         together = gains.attitude * imu[:, :2] + gains.gyro_s * imu[:, 2:]
         horizontal = gains.force_horizontal
         gain = np.array([horizontal, horizontal, gains.force_vertical])
         shift = gain * (force - self._wanted[row])
-        ankles = self._plan.ankles[row, :, :2]
+        ankles = self._local.ankles[row, :, :2]
         from_middle = ankles - ankles.mean(axis=1, keepdims=True)
         lifts = rotation_of_tilt(together)[:, 2, :2]
         shift[..., 2] += np.einsum("wi,wfi->wf", lifts, from_middle)
-        turn = together[:, None] + gains.moment * moment[..., :2]
+        tilt = together[:, None] + gains.moment * moment[..., :2]
         shift = np.clip(shift, -gains.shift_limit_m, gains.shift_limit_m)
-        return shift, np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad)
+        return shift, np.clip(tilt, -gains.turn_limit_rad, gains.turn_limit_rad)
 
-    def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
+    def _move_feet(self, q: Array, shift: Array, tilt: Array) -> Array:
         """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12)."""
         leg = self._biped.leg
         up = self._biped.ankle_height
         position, R = foot_pose(leg, q.reshape(-1, 2, 6))
-        turned = rotation_of_tilt(turn) @ R
+        turned = rotation_of_tilt(tilt) @ R
         ankle = position + shift + up * (turned[..., 2] - R[..., 2])
         return leg_angles(leg, within_reach(leg, ankle), turned).reshape(q.shape)
 

@@ -9,7 +9,8 @@ forces,
 .. math:: e = p_l - p_r - (p_l - p_r)_{plan} = C \, \tfrac12 (f_l - f_r) + o_l - o_r
 
 with the forces f of the feet on the legs, the compliance C of the closed legs, and the offsets o of
-the feet that are commanded. It adds up to where the feet are, from landing to landing,
+the feet that are commanded, all in the plan's local frame. It adds up to where the feet are in the
+plan's world frame, from landing to landing,
 
 .. math:: P_{landed} = P_{standing} \pm e
 
@@ -18,6 +19,7 @@ next swing is offset by −P − b, where P is the place of the foot that stands
 which this foot landed before. While the foot takes over the load, its offset goes.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +29,7 @@ from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, S
 from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -51,8 +53,11 @@ _GAINS = tuple(FootholdGains.model_fields)
 CORRECTION = record_type(period_s=(), **dict.fromkeys(_GAINS, ()))
 """Gains of the foothold correction, and the control period."""
 
+PLANNED = record_type(heading=(), foot_yaw=(2,))
+"""Heading of the pelvis and of the feet by plan, one row per control step [rad]."""
+
 FOOTHOLDS = record_type(
-    place=(2, 2),  # of the feet against the plan [m]
+    place=(2, 2),  # of the feet against the plan, in the world [m]
     bias=(2, 2),  # error with which they land [m]
     landings=(2,),
     target=(2, 2),  # offset with which they land [m]
@@ -88,7 +93,9 @@ class FootholdCorrection(PolicyAround):
         self._gains["period_s"] = model.control_period_s
         for name in _GAINS:
             self._gains[name] = getattr(gains, name)
-        self._last_row = len(model.plan.q) - 1
+        self._plan: Any = np.zeros(len(model.plan.q), PLANNED)
+        self._plan["heading"] = model.plan.heading
+        self._plan["foot_yaw"] = model.plan.foot_yaw
 
     @override
     def begin(self, rows: Array) -> FootholdMemory:
@@ -101,21 +108,21 @@ class FootholdCorrection(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs)
         observed = self._walk_view.fields(rows)
         now = memory.footholds.copy()
-        coming = np.empty(len(rows), dtype=np.int64)
-        correct_footholds(self._gains, observed, self._last_row, now, coming)
+        coming: IntArray = np.empty(len(rows), dtype=np.int64)
+        correct_footholds(self._gains, self._plan, observed, now, coming)
         total = action.astype(np.float64)
         move_feet(*self._stances, coming, np.ascontiguousarray(now["offset"]), total)
         return total.astype(np.float32), FootholdMemory(now, inner)
 
 
 @compiled
-def correct_footholds(gains: Any, observed: Any, last_row: int, memory: Any, coming: Array) -> None:
+def correct_footholds(gains: Any, plan: Any, observed: Any, memory: Any, coming: IntArray) -> None:
     """Offsets of the feet and the memory after a control step.
 
     Args:
         gains: Row of `CORRECTION`, (1,).
+        plan: Rows of `PLANNED`, one per control step.
         observed: Observations, rows with fields, (n,).
-        last_row: Of the plan.
         memory: Rows of `FOOTHOLDS`, brought up to date, (n,).
         coming: Rows of the plan at the end of the control period, to be filled, (n,).
     """
@@ -123,14 +130,18 @@ def correct_footholds(gains: Any, observed: Any, last_row: int, memory: Any, com
     for world in range(len(memory)):
         shown = observed[world]
         own = memory[world]
-        coming[world] = min(int(np.rint(shown.clock[0] / rules.period_s)), last_row)
+        row = min(int(np.rint(shown.clock[0] / rules.period_s)), len(plan) - 1)
+        planned = plan[row]
+        coming[world] = row
         progress = shown.clock[1]
         in_air = 0.0 < progress < 1.0
         if in_air and own.swing < 0.0:
-            lift(rules, own, 1 - int(shown.clock[2]))
-        elif not in_air:
+            lift(rules, planned, own, 1 - int(shown.clock[2]))
+        if in_air:
+            aim(rules, planned, own, 1 - int(shown.clock[2]))
+        else:
             own.swing = -1.0
-            feel_landing(rules, shown, own)
+            feel_landing(rules, planned, shown, own)
         for foot in range(2):
             load = shown.load_share if foot == 1 else 1.0 - shown.load_share
             share = 1.0 - load
@@ -141,35 +152,57 @@ def correct_footholds(gains: Any, observed: Any, last_row: int, memory: Any, com
 
 
 @compiled
-def feel_landing(rules: Any, shown: Any, own: Any) -> None:
+def feel_landing(rules: Any, planned: Any, shown: Any, own: Any) -> None:
     """Add the present error of the feet's distance, where both carry the robot."""
     if 0.25 < shown.load_share < 0.75:
+        left = shown.wrench[0, 0]
+        right = shown.wrench[1, 0]
+        left_x, left_y = turned(left[0], left[1], planned.foot_yaw[0] - planned.heading)
+        right_x, right_y = turned(right[0], right[1], planned.foot_yaw[1] - planned.heading)
+        shear = (0.5 * (left_x - right_x), 0.5 * (left_y - right_y))
         for i in range(2):
-            shear = 0.5 * (shown.wrench[0, 0, i] - shown.wrench[1, 0, i])
             commanded = own.offset[0, i] - own.offset[1, i]
-            own.total[i] += rules.compliance_m_n * shear + commanded
+            own.total[i] += rules.compliance_m_n * shear[i] + commanded
         own.samples += 1.0
 
 
 @compiled
-def lift(rules: Any, own: Any, foot: int) -> None:
-    """Take the landing of the standing foot into account, and aim the one that lifts off."""
+def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
+    """Take the landing of the standing foot into account, as the other one lifts off."""
     standing = 1 - foot
     sign = 1.0 if standing == 0 else -1.0
     own.swing = foot
     if own.samples > 0.0 and own.landings[0] + own.landings[1] > 0.0:
         gain = rules.gain if own.landings[standing] > 1.0 else rules.first_gain
-        for i in range(2):
-            error = sign * own.total[i] / own.samples
-            own.place[standing, i] = own.place[foot, i] + error
+        error_x = sign * own.total[0] / own.samples
+        error_y = sign * own.total[1] / own.samples
+        moved = turned(error_x, error_y, planned.heading)
+        for i, error in enumerate((error_x, error_y)):
+            own.place[standing, i] = own.place[foot, i] + moved[i]
             missed = error - own.target[standing, i] - own.bias[standing, i]
             own.bias[standing, i] += gain * missed
     own.landings[foot] += 1.0
     own.samples = 0.0
     for i in range(2):
         own.total[i] = 0.0
-        aim = -own.place[standing, i] - own.bias[foot, i]
-        own.target[foot, i] = min(max(aim, -rules.limit_m), rules.limit_m)
+
+
+@compiled
+def aim(rules: Any, planned: Any, own: Any, foot: int) -> None:
+    """Offset with which the foot in the air is to land."""
+    standing = own.place[1 - foot]
+    back = turned(-standing[0], -standing[1], -planned.heading)
+    for i in range(2):
+        wanted = back[i] - own.bias[foot, i]
+        own.target[foot, i] = min(max(wanted, -rules.limit_m), rules.limit_m)
+
+
+@compiled
+def turned(x: float, y: float, angle: float) -> tuple[float, float]:
+    """A vector turned about the vertical, to the left [rad]."""
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
+    return cosine * x - sine * y, sine * x + cosine * y
 
 
 @compiled

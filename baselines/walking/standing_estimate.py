@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.zmp_offset import LEAST_LOAD
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
@@ -68,7 +69,7 @@ class StandingEstimate(PolicyAround):
     def __init__(self, policy: Any, model: WalkerModel, gains: StandingGains) -> None:
         super().__init__(policy, model)
         table = model.observation_table
-        self._feet = FlatFeet(model)
+        self._feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
         self._pitch = table.group("imu_attitude").start + 1
         self._samples = max(round(gains.duration_s / model.control_period_s), 1)
         steps = round(STAND_S / model.control_period_s) - self._samples
@@ -91,7 +92,8 @@ class StandingEstimate(PolicyAround):
         steps = memory.steps + 1
         rests = steps <= self._samples
         if np.count_nonzero(rests) > 0:
-            shown = np.column_stack([self._feet.zmp_error(rows), rows[:, self._pitch]])
+            zmp = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0)
+            shown = np.column_stack([zmp, rows[:, self._pitch]])
             total = total + rests[:, None] * shown
         error = total @ self._per_total + self._constant
         shift = np.minimum(np.maximum(-error, -self._limit), self._limit)

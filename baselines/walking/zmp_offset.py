@@ -7,9 +7,9 @@ foot sensors show it, and an integral takes it off:
 .. math:: \dot s = -\frac{1}{T} (p - p_{ref}), \quad |s_x|, |s_y| \le s_{max}
 
 s is the shift of the planned ZMP (input `zmp` of the policy inside), p the ZMP by the foot sensors
-as if the feet lay flat on their footholds. T is several steps long: within a step the ZMP is the
-controller's matter. The sensors show the ZMP against the feet, so feet that have drifted from their
-footholds are not seen.
+as if the feet lay flat on their footholds (`baselines.walking.flat_feet`), all in the plan's local
+frame. T is several steps long: within a step the ZMP is the controller's matter. The sensors show
+the ZMP against the feet, so feet that have drifted from their footholds are not seen.
 """
 
 from typing import Any, NamedTuple
@@ -22,6 +22,9 @@ from baselines.walking.flat_feet import FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
+
+LEAST_LOAD = 0.05
+"""Share of the weight below which the feet show no ZMP."""
 
 
 class ZmpOffsetGains(Model):
@@ -51,7 +54,7 @@ class ZmpOffset(PolicyAround):
 
     def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains) -> None:
         super().__init__(policy, model)
-        self._feet = FlatFeet(model)
+        self._feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
         self._rate = model.control_period_s / gains.time_constant_s
         self._limit = gains.limit_m
 
@@ -63,7 +66,7 @@ class ZmpOffset(PolicyAround):
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
         error = self._feet.zmp_error(rows)
-        shift = memory.shift - self._rate * error
+        shift = memory.shift - self._rate * np.where(np.isnan(error), 0.0, error)
         shift = np.minimum(np.maximum(shift, -self._limit), self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))

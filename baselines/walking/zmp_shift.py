@@ -30,7 +30,7 @@ from scipy import linalg
 
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
-from elastic_env.rigid.leg_kinematics import LegGeometry
+from elastic_env.rigid.leg_kinematics import LegGeometry, turn
 from elastic_env.world.robot_model import WalkerModel
 
 _PROBE_M = 0.005
@@ -91,9 +91,10 @@ LEGS = record_type(
 STANCE = record_type(
     pelvis=(3,),  # [m]
     ankles=(2, 3),  # [m]
+    foot_yaw=(2, 2),  # cosine and sine of the headings of the feet [1]
     q=(2, 6),  # [rad]
 )
-"""Pelvis, ankles and joint angles of the plan, one row per control step."""
+"""Pelvis, feet and joint angles of the plan in its local frame, one row per control step."""
 
 
 class Stances(NamedTuple):
@@ -110,8 +111,11 @@ class Stances(NamedTuple):
         row = (leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)
         legs = np.array([row], LEGS)
         rows = np.zeros(len(plan.q), STANCE)
-        rows["pelvis"] = plan.pelvis
-        rows["ankles"] = plan.ankles
+        local = plan.local
+        rows["pelvis"] = local.pelvis
+        rows["ankles"] = local.ankles
+        turned = (np.cos(local.foot_yaw), np.sin(local.foot_yaw))
+        rows["foot_yaw"] = np.stack(turned, axis=-1)
         rows["q"] = plan.q.reshape(-1, 2, 6)
         return cls(legs, rows)
 
@@ -127,14 +131,17 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
 
     Args:
         model: Assumed walker.
-        zmp: Shift at every row of the plan, x forward and y left, (T, 2) [m].
+        zmp: Shift at every row of the plan in its local frame, x forward and y left, (T, 2) [m].
 
     Returns:
         (T, 12) [rad].
     """
     stances = Stances.of(model)
     offsets = np.zeros((len(zmp), len(model.joint_names)))
-    shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
+    plan = model.plan
+    in_world = turn(zmp, plan.heading)
+    moved = center_of_mass_shift(in_world, plan.omega, model.control_period_s)
+    shift = turn(moved, -plan.heading)
     move_pelvis(*stances, np.arange(len(zmp)), shift, offsets)
     return offsets
 
@@ -149,7 +156,7 @@ def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -
         legs: Row of `LEGS`, (1,).
         stances: Rows of `STANCE`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
-        shift: Forward and to the left, (n, 2) [m].
+        shift: Forward and to the left in the plan's local frame, (n, 2) [m].
         out: To be added to, (n, 12) [rad].
     """
     leg = legs[0]
@@ -168,7 +175,7 @@ def move_feet(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> 
         legs: Row of `LEGS`, (1,).
         stances: Rows of `STANCE`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
-        shift: Of the left and the right foot, forward and to the left, (n, 2, 2) [m].
+        shift: Of the left and the right foot in the plan's local frame, (n, 2, 2) [m].
         out: To be added to, (n, 12) [rad].
     """
     for row in range(len(shift)):
@@ -186,9 +193,13 @@ def move_hip(leg: Any, stance: Any, side: int, shift: Array, out: Array) -> None
     x = ankle[0] - (stance.pelvis[0] + shift[0]) - hip[0]
     y = ankle[1] - (stance.pelvis[1] + shift[1]) - hip[1]
     z = ankle[2] - stance.pelvis[2] - hip[2]
+    cosine = stance.foot_yaw[side, 0]
+    sine = stance.foot_yaw[side, 1]
+    # the hip yaw stays that of the plan: in the frame of the sole the leg is level
+    x, y = cosine * x + sine * y, cosine * y - sine * x
     pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
     roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
-    q = (0.0, roll, pitch, knee, -(pitch + knee), -roll)
+    q = (stance.q[side, 0], roll, pitch, knee, -(pitch + knee), -roll)
     for i in range(6):
         out[6 * side + i] += q[i] - stance.q[side, i]
 

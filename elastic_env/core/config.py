@@ -142,6 +142,17 @@ Title = Annotated[_Text, Field(max_length=100)]
 Locator = Annotated[_Text, Field(max_length=1000)]
 """Text that may hold a path."""
 MOST_ENTRIES = 1000
+
+
+def _each_once(values: list[Any]) -> list[Any]:
+    for value in values:
+        if values.count(value) > 1:
+            raise ValueError(f"{quote(value)} stands twice; leave out one of them")
+    return values
+
+
+Once = AfterValidator(_each_once)
+"""For a list in which nothing stands twice."""
 """Entries of a list in a configuration."""
 _Entry = TypeVar("_Entry")
 Entries = Annotated[list[_Entry], Field(min_length=1, max_length=MOST_ENTRIES)]
@@ -209,9 +220,8 @@ def load_json(
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(
-            f"{shorten(path)} describes no {what}: {error.describe()}"
-        ) from None
+        problem = f"{shorten(path)} describes no {what}: {error.describe()}"
+        raise ConfigurationError(problem) from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
+_Values = Mapping[str, Any]
 """Keys and numbers of entries that lead to a value."""
 
 
@@ -71,13 +72,13 @@ class ModelError(ConfigurationError):
     """
 
     def __init__(self, model: str, problems: Sequence[Problem]) -> None:
-        super().__init__(model, problems)
         self.model = model
         self.problems = tuple(problems)
+        super().__init__(self.describe(model))
 
-    def __str__(self) -> str:
-        """All problems, one per line, in the words of who made the model in Python."""
-        return self.describe(self.model)
+    def __reduce__(self) -> Any:
+        """What makes it anew in another process."""
+        return type(self), (self.model, self.problems)
 
     def describe(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = join_path) -> str:
         """All problems, one per line, for who wrote a file or options.
@@ -95,9 +96,7 @@ class ModelError(ConfigurationError):
         return "\n".join(said)
 
 
-def problems_of(
-    model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]
-) -> list[Problem]:
+def problems_of(model: type[BaseModel], error: ValidationError, values: _Values) -> list[Problem]:
     """Problems that a validation found, those of models within the model among them.
 
     Args:
@@ -105,24 +104,18 @@ def problems_of(
         error: What Pydantic says.
         values: What was given.
     """
-    return [
-        found
-        for problem in error.errors(include_url=False)
-        for found in _problems(model, problem, values)
-    ]
+    found: list[Problem] = []
+    for problem in error.errors(include_url=False):
+        path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
+        cause = problem.get("ctx", {}).get("error")
+        if isinstance(cause, ModelError):  # of a model within this one
+            found += [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
+        else:
+            found.append(_problem(model, path, problem))
+    return found
 
 
-def _problems(
-    model: type[BaseModel], problem: Mapping[str, Any], values: Mapping[str, Any]
-) -> list[Problem]:
-    path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
-    cause = problem.get("ctx", {}).get("error")
-    if isinstance(cause, ModelError):  # of a model within this one
-        return [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
-    return [_problem(model, path, problem)]
-
-
-def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
+def _problem(model: type[BaseModel], path: ParameterPath, problem: Any) -> Problem:
     given = quote(problem["input"])
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     match problem["type"]:
@@ -155,6 +148,10 @@ _REQUIREMENTS = {
     "list_type": "be a list",
     "tuple_type": "be a list",
     "string_type": "be text",
+    "greater_than": "be > {gt:.6g}",
+    "greater_than_equal": "be >= {ge:.6g}",
+    "less_than": "be < {lt:.6g}",
+    "less_than_equal": "be <= {le:.6g}",
     "bool_type": "be true or false",
     "bool_parsing": "be true or false",
     "too_short": "have at least {min_length} {entries}",
@@ -164,7 +161,7 @@ _REQUIREMENTS = {
 """Requirements in the words of a configuration, where Pydantic's are those of Python."""
 
 
-def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
+def _path(location: ParameterPath, values: Any, is_missing: bool) -> ParameterPath:
     """A location without what Pydantic adds to it: the member of a union."""
     path: list[str | int] = []
     for number, part in enumerate(location):

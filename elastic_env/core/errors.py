@@ -143,11 +143,8 @@ def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> 
 def choices_listed(name: object, choices: Iterable[str]) -> str:
     """The names that exist, and the one that is closest to what was given."""
     known = list(choices)
-    close = (
-        difflib.get_close_matches(name[:_LONGEST_SHOWN], known, n=1)
-        if isinstance(name, str)
-        else []
-    )
+    text = name[:_LONGEST_SHOWN] if isinstance(name, str) else ""
+    close = difflib.get_close_matches(text, known, n=1)
     hint = f" Did you mean {quote(close[0])}?" if close else ""
     return f"choose one of: {list_names(known)}.{hint}"
 

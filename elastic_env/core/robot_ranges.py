@@ -214,8 +214,7 @@ def draw_robot(
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:
     """Points in the unit cube, (number, columns), one of each column in each of equal intervals."""
     strata = generator.permuted(np.tile(np.arange(number), (columns, 1)), axis=1)
-    points: Array = (strata + generator.random((columns, number))).T / number
-    return points
+    return (strata + generator.random((columns, number))).T / number
 
 
 _LOAD = ("load_kg", "load_x_m", "load_y_m", "load_z_m")

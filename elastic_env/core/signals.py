@@ -129,9 +129,8 @@ class SignalTable:
             groups = dict.fromkeys(own.split(".")[0] for own in self.names)
             raise unknown_name("signal", name, groups)
         if found != list(range(found[0], found[-1] + 1)):
-            raise ConfigurationError(
-                f"the columns of {name!r} must be neighbours, they are {found}"
-            )
+            problem = f"the columns of {name!r} must be neighbours, they are {found}"
+            raise ConfigurationError(problem)
         return slice(found[0], found[-1] + 1)
 
     def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:

@@ -15,7 +15,7 @@ _WAIT_MS = 20
 _STALE_AT_FIRST_S = 0.1
 
 
-def read(shared: SharedSample, port: str, baudrate: int) -> None:
+def read_attitudes(shared: SharedSample, port: str, baudrate: int) -> None:
     """Put every valid attitude into shared memory until the input is closed.
 
     What lay in the port's buffer before has no known age and is passed over. Damaged packets the
@@ -50,7 +50,7 @@ def _attitude(packet: Any) -> Attitude | None:
 
 if __name__ == "__main__":
     try:
-        read(SharedSample(int(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
+        read_attitudes(SharedSample(int(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
     except Exception as error:
         print(error, file=sys.stderr)
         sys.stderr.flush()

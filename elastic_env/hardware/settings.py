@@ -87,15 +87,11 @@ class HardwareSettings(Model):
     limits: SafetyLimits = SafetyLimits()
 
     @model_validator(mode="after")
-    def _ports_differ(self) -> Self:
+    def _wiring_is_possible(self) -> Self:
         named = (self.port, self.imu_port)
         ports = [os.path.realpath(port) for port in named if port is not None]
         if len(set(ports)) < len(ports):
             raise ValueError(f"servo and IMU need a port of their own, got {self.port} twice")
-        return self
-
-    @model_validator(mode="after")
-    def _limits_are_a_turn(self) -> Self:
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:
             lowest = self.limits.lowest_rad

@@ -10,15 +10,12 @@ at rest τ_J equals the gravity torque τ_g up to the friction on the link. All 
 Control 109(4). Eq. n: the paper that this project reproduces (see the README).
 """
 
-from typing import Self
-
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.joint.friction import require_fading
+from elastic_env.joint.friction import FrictionTerms
 from elastic_env.joint.load_continuation import TorqueFunction, follow_load
 from elastic_env.joint.motor import Motor
 
@@ -90,7 +87,7 @@ class Servo(Model):
         return np.minimum(limit, left.clip(min=0.0))
 
 
-class ElasticJoint(Model):
+class ElasticJoint(FrictionTerms):
     """One elastic joint: transmission, rotor, friction, servo and motor encoder.
 
     A rigid joint has no `ElasticJoint`; compare with one by the `rigid` form of
@@ -103,35 +100,16 @@ class ElasticJoint(Model):
     """D, damping of the transmission [N·m·s/rad]."""
     rotor_inertia: float = quantity("kg·m²", gt=0)
     """B, rotor inertia reflected to the output [kg·m²]."""
-    backlash: float = quantity("rad", 0.0, ge=0)
+    backlash: float = quantity("rad", 0.0, ge=0, lt=np.pi)
     """Width of the dead band of the deflection [rad]."""
     coulomb_friction: float = quantity("N·m", 0.0, ge=0)
     """Dry friction on the link side of the spring [N·m]."""
     viscous_friction: float = quantity("N·m·s/rad", 0.0, ge=0)
     """Viscous friction on the link side [N·m·s/rad]."""
-    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
-    """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
-    static_friction: float = quantity("N·m", 0.0, ge=0)
-    """F_s, what dry friction has more at rest than in motion [N·m]."""
-    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
-    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
     """Motor encoder, counts per turn of the output; None for continuous [1]."""
     servo: Servo | None = quantity("1", None)
     """Position servo on the rotor; None to add no actuator [1]."""
-
-    @model_validator(mode="after")
-    def _backlash_is_small(self) -> Self:
-        if self.backlash >= np.pi:
-            raise ValueError(
-                f"backlash must be below half a turn, {np.pi:.4f} rad, got {self.backlash}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _static_friction_fades(self) -> Self:
-        require_fading(self.static_friction, self.stribeck_speed)
-        return self
 
 
 def joint_torque(

@@ -10,8 +10,12 @@ C. Canudas de Wit, "A survey of models, analysis tools and compensation methods 
 machines with friction", Automatica 30(7).
 """
 
-import numpy as np
+from typing import Self
 
+import numpy as np
+from pydantic import model_validator
+
+from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, Parameter
 
 
@@ -77,14 +81,21 @@ def passed_torque(
     return needed / (1.0 - direction * load_ratio * np.sign(needed))
 
 
-def require_fading(static_friction: float, stribeck_speed: float) -> None:
-    """Refuse friction at rest without the speed by which it falls [N·m], [rad/s].
+class FrictionTerms(Model):
+    """Terms of `dry_friction` that change with load and speed."""
 
-    Raises:
-        ValueError: It is such.
-    """
-    if static_friction > 0.0 and stribeck_speed == 0.0:
-        raise ValueError(
-            f"static_friction = {static_friction:g} N·m needs a stribeck_speed above 0 [rad/s], by"
-            " which it falls to 37 %; 0.05 rad/s is usual for gears"
-        )
+    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
+    """c, share of the torque passed that is lost to dry friction, see `dry_friction` [1]."""
+    static_friction: float = quantity("N·m", 0.0, ge=0)
+    """F_s, what dry friction has more at rest than in motion [N·m]."""
+    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
+    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
+
+    @model_validator(mode="after")
+    def _static_friction_fades(self) -> Self:
+        if self.static_friction > 0.0 and self.stribeck_speed == 0.0:
+            raise ValueError(
+                f"static_friction = {self.static_friction:g} N·m needs a stribeck_speed above 0"
+                " [rad/s], by which it falls to 37 %; 0.05 rad/s is usual for gears"
+            )
+        return self

@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjsBody, MjSpec
 
 from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import compiled_spec
@@ -13,7 +14,7 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
-def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.MjSpec:
+def hold_other_joints(spec: MjSpec, joints: Collection[str]) -> MjSpec:
     """A copy in which all joints but the named hinges are held at the first keyframe.
 
     Held joints are taken out and their bodies put in place. Actuators, sensors, tendons and
@@ -38,7 +39,7 @@ def hold_other_joints(spec: mujoco.MjSpec, joints: Collection[str]) -> mujoco.Mj
     return held
 
 
-def copy_without_keys(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def copy_without_keys(spec: MjSpec) -> MjSpec:
     """A copy without keyframes, whose vectors would not fit."""
     copied = spec.copy()
     for key in list(copied.keys):
@@ -47,7 +48,7 @@ def copy_without_keys(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def _put_bodies_in_place(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, joints: Collection[str], home: Array
+    spec: MjSpec, model: MjModel, joints: Collection[str], home: Array
 ) -> None:
     """Move every body by its held joints, and take these out."""
     bodies = sorted(spec.bodies, key=lambda body: body.id)
@@ -74,7 +75,7 @@ def _put_bodies_in_place(
         _place(bodies[b], R, p)
 
 
-def _place(body: mujoco.MjsBody, R: Array, p: Array) -> None:
+def _place(body: MjsBody, R: Array, p: Array) -> None:
     """Give a body a pose in its parent, whatever frames it was written in."""
     body.set_frame(body.parent.add_frame())
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -84,7 +85,7 @@ def _place(body: mujoco.MjsBody, R: Array, p: Array) -> None:
     body.quat = quaternion
 
 
-def _displacement(model: mujoco.MjModel, joint: int, home: Array) -> tuple[Array, Array]:
+def _displacement(model: MjModel, joint: int, home: Array) -> tuple[Array, Array]:
     """Rotation and translation by which a joint moves its body from where the model is drawn."""
     at = model.jnt_qposadr[joint]
     way = home[at] - model.qpos0[at]

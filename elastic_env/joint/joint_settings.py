@@ -7,15 +7,13 @@ take what it returns, so that a file means the same to both.
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.joint.elasticity import ElasticJoint
-from elastic_env.joint.friction import require_fading
+from elastic_env.joint.friction import FrictionTerms
 from elastic_env.joint.motor import Motor
 from elastic_env.joint.small_servos import SMALL_SERVOS, small_servo
 
@@ -46,7 +44,7 @@ class ServoSettings(Model):
     which neither is said, and that the model has not either, holds its angle.
     """
 
-    position_gain: float | None = quantity("N·m/rad", None, gt=0)
+    position_gain: float | None = quantity("N·m/rad", None, ge=SOFTEST)
     """k_p; default that of the model's position actuator, else 50 K [N·m/rad]."""
     velocity_gain: float | None = quantity("N·m·s/rad", None, ge=0)
     """k_v; default what damps the model's actuator, else critical damping [N·m·s/rad]."""
@@ -63,14 +61,6 @@ class ServoSettings(Model):
     motor: Motor | None = quantity("1", None)
     """DC motor, with which the torque falls with the speed; default none [1]."""
 
-    @model_validator(mode="after")
-    def _pushes(self) -> Self:
-        if self.position_gain is not None and self.position_gain < SOFTEST:
-            raise ValueError(
-                f"position_gain must be at least {SOFTEST:g} [N·m/rad], got {self.position_gain:g}"
-            )
-        return self
-
     @property
     def braking(self) -> float:
         """k_v and what the back-EMF adds to it, as far as they are known [N·m·s/rad]."""
@@ -83,15 +73,8 @@ class ServoSettings(Model):
         but the limit is left.
         """
         if self.position_gain is not None:
-            return self.replace(
-                integral_gain=0.0 if self.integral_gain is None else self.integral_gain
-            )
-        said = {
-            name: value
-            for name in type(self).model_fields
-            if (value := getattr(self, name)) is not None
-        }
-        return found.replace(**said)
+            return self.replace(integral_gain=self.integral_gain or 0.0)
+        return found.replace(**self.model_dump(exclude_none=True))
 
     def sagging_gain(self, joint: str) -> float:
         """k_p of a servo that gives way under a load; infinite for one that holds [N·m/rad].
@@ -102,9 +85,8 @@ class ServoSettings(Model):
         Raises:
             ConfigurationError: It has no integrator, and its position gain is not known.
         """
-        if self.integral_gain is None and self.position_gain is None:
-            return float("inf")
-        if self.integral_gain:
+        holds = self.integral_gain is None and self.position_gain is None
+        if holds or self.integral_gain:
             return float("inf")
         if self.position_gain is None:
             raise ConfigurationError(
@@ -114,10 +96,10 @@ class ServoSettings(Model):
         return self.position_gain
 
 
-class JointSettings(Model):
+class JointSettings(FrictionTerms):
     """Known values of a joint; all but K has a default."""
 
-    stiffness: float = quantity("N·m/rad", gt=0, allow_inf_nan=True)
+    stiffness: float = quantity("N·m/rad", ge=SOFTEST, allow_inf_nan=True)
     """K, stiffness of the transmission, without a default; infinite for a rigid joint [N·m/rad]."""
     damping: float | None = quantity("N·m·s/rad", None, ge=0)
     """D; default a damping ratio of 0.17, or what brings the links to rest [N·m·s/rad]."""
@@ -129,26 +111,11 @@ class JointSettings(Model):
     """Viscous friction on the link; default the joint's damping, unless it damps the servo
     [N·m·s/rad].
     """
-    load_friction: float = quantity("1", 0.0, ge=0, lt=1)
-    """c, share of the torque passed that is lost to dry friction; default none [1]."""
-    static_friction: float = quantity("N·m", 0.0, ge=0)
-    """F_s, what dry friction has more at rest; default none [N·m]."""
-    stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
-    """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
-    backlash: float = quantity("rad", 0.0, ge=0)
+    backlash: float = quantity("rad", 0.0, ge=0, lt=np.pi)
     """Dead band; default none, as the scenario has one [rad]."""
     encoder_counts_per_turn: int | None = quantity("1", None, gt=0)
     """Motor encoder, counts per turn of the output; default continuous [1]."""
     servo: ServoSettings = ServoSettings()
-
-    @model_validator(mode="after")
-    def _is_stiff(self) -> Self:
-        if not self.stiffness >= SOFTEST:
-            raise ValueError(
-                f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}"
-            )
-        require_fading(self.static_friction, self.stribeck_speed)
-        return self
 
     @property
     def is_rigid(self) -> bool:
@@ -218,7 +185,7 @@ def _settings(name: str, value: Any) -> JointSettings | None:
     if isinstance(value, JointSettings):
         return value
     if isinstance(value, str) and value in SMALL_SERVOS:
-        return _settings_of(small_servo(value))
+        return JointSettings(**small_servo(value).model_dump())
     own = (
         value
         if isinstance(value, Mapping)
@@ -237,11 +204,3 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         return JointSettings(**settings)
     except ConfigurationError as error:
         raise ConfigurationError(f"joint {name!r}: {error}") from None
-
-
-def _settings_of(joint: ElasticJoint) -> JointSettings:
-    """A known joint with its servo, as settings."""
-    known = {name: getattr(joint, name) for name in JointSettings.model_fields if name != "servo"}
-    assert joint.servo is not None
-    servo = {name: getattr(joint.servo, name) for name in ServoSettings.model_fields}
-    return JointSettings(**known, servo=ServoSettings(**servo))

@@ -1,44 +1,34 @@
 """Keyframes of a rigid specification, carried over to one with rotors and servos."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import mujoco
 
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 
 
-@dataclass(frozen=True)
-class Keyframes:
-    """The rigid model with its keyframes, and its elements in the order of their vectors."""
+@contextmanager
+def carry_keyframes(spec: mujoco.MjSpec, joints: Sequence[str]) -> Iterator[None]:
+    """Keep the keyframes while joints become elastic within.
 
-    model: mujoco.MjModel
-    joints: list[mujoco.MjsJoint]
-    actuators: list[mujoco.MjsActuator]
-
-
-def take_keyframes(spec: mujoco.MjSpec) -> Keyframes | None:
-    """Remove the keyframes, whose vectors no longer fit once joints are added."""
+    Their vectors no longer fit then: they are removed, and added again with rotors at their link
+    angles and servos holding them.
+    """
     if not spec.keys:
-        return None
-    model = spec.compile()
-    joints = sorted(spec.joints, key=lambda joint: joint.id)
+        yield
+        return
+    rigid = spec.compile()
+    links = sorted(spec.joints, key=lambda joint: joint.id)
     actuators = sorted(spec.actuators, key=lambda actuator: actuator.id)
     for key in list(spec.keys):
         spec.delete(key)
-    return Keyframes(model, joints, actuators)
-
-
-def give_keyframes(spec: mujoco.MjSpec, keyframes: Keyframes | None, joints: Sequence[str]) -> None:
-    """Add the keyframes again, with rotors at their link angles and servos holding them."""
-    if keyframes is None:
-        return
-    rigid = keyframes.model
+    yield
     model = spec.compile()
     names = {actuator.name for actuator in spec.actuators}
     kept = {  # the others are replaced by a servo
         number: actuator.id
-        for number, actuator in enumerate(keyframes.actuators)
+        for number, actuator in enumerate(actuators)
         if actuator.id >= 0 and actuator.name in names
     }
     old = mujoco.MjData(rigid)
@@ -47,7 +37,7 @@ def give_keyframes(spec: mujoco.MjSpec, keyframes: Keyframes | None, joints: Seq
     for k in range(rigid.nkey):
         mujoco.mj_resetDataKeyframe(rigid, old, k)
         mujoco.mj_resetData(model, new)
-        for number, joint in enumerate(keyframes.joints):
+        for number, joint in enumerate(links):
             new.joint(joint.id).qpos = old.joint(number).qpos
             new.joint(joint.id).qvel = old.joint(number).qvel
         for number, own in kept.items():

@@ -18,12 +18,13 @@ from typing import Literal, get_args
 
 import mujoco
 import numpy as np
+from mujoco import MjsActuator, MjsBody, MjsJoint, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
-from elastic_env.joint.keyframes import give_keyframes, take_keyframes
+from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.motor import Motor
 from elastic_env.joint.supported_models import require_few
@@ -45,11 +46,11 @@ _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 def make_elastic(
-    spec: str | Path | mujoco.MjSpec,
+    spec: str | Path | MjSpec,
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
-) -> mujoco.MjSpec:
+) -> MjSpec:
     """A copy of a specification in which the named hinges are elastic.
 
     What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction
@@ -108,11 +109,11 @@ def make_elastic(
 
 
 def transform_hinges(
-    spec: mujoco.MjSpec,
+    spec: MjSpec,
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
-) -> mujoco.MjSpec:
+) -> MjSpec:
     """`make_elastic` without a look at stability, for a caller that sets the physics step later.
 
     The integrator and the automatic reset are those of the given specification.
@@ -120,15 +121,14 @@ def transform_hinges(
     require_known("form", [form], get_args(Form))
     require_known("actuator rule", [actuators], get_args(ActuatorRule))
     elastic = spec.copy()
-    keyframes = take_keyframes(elastic)
-    _resolve_springdampers(elastic, list(joints))
-    for name, joint in joints.items():
-        _transform(elastic, _hinge(elastic, name), joint, form, actuators)
-    give_keyframes(elastic, keyframes, list(joints))
+    with carry_keyframes(elastic, list(joints)):
+        _resolve_springdampers(elastic, list(joints))
+        for name, joint in joints.items():
+            _transform(elastic, _hinge(elastic, name), joint, form, actuators)
     return elastic
 
 
-def _choose_integrator(spec: mujoco.MjSpec) -> None:
+def _choose_integrator(spec: MjSpec) -> None:
     """Take `implicitfast` where the model's own integrator does not follow the joints.
 
     Refuse the model if neither does.
@@ -154,7 +154,7 @@ def _choose_integrator(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
+def _resolve_springdampers(spec: MjSpec, joints: list[str]) -> None:
     """Write out springs that are given as time constants, which depend on the inertias."""
     given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
     if given:
@@ -166,7 +166,7 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
             hinge.springdamper = np.zeros(2)
 
 
-def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
+def _hinge(spec: MjSpec, name: str) -> MjsJoint:
     hinges = [joint.name for joint in spec.joints if joint.type == _HINGE and joint.name]
     require_known("hinge", [name], hinges)
     taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
@@ -181,7 +181,7 @@ def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
 
 
 def _transform(
-    spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint, form: Form, rule: ActuatorRule
+    spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint, form: Form, rule: ActuatorRule
 ) -> None:
     name = hinge.name
     driven = name
@@ -196,16 +196,16 @@ def _transform(
     _follow_actuators(spec, name, driven)
 
 
-def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
+def _rotor_body(spec: MjSpec, hinge: MjsJoint) -> MjsBody:
     """A body for the rotor beside the link's.
 
     Where it is does not matter: it has no mass, only the armature.
     """
     body = hinge.parent
-    parent = body.parent if isinstance(body.parent, mujoco.MjsBody) else spec.worldbody
+    parent = body.parent if isinstance(body.parent, MjsBody) else spec.worldbody
     # from a specification of its own, so that the model's defaults, units and bounds of mass do not
     # apply to it
-    blank = mujoco.MjSpec()
+    blank = MjSpec()
     blank.compiler.degree = hinge.compiler.degree
     rotor = blank.worldbody.add_body(
         name=motor_name(""),
@@ -230,7 +230,7 @@ def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
     return parent.add_frame().attach_body(rotor, hinge.name, "")
 
 
-def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+def _add_rotor(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
     """The rotor's hinge.
 
     Every attribute is set: the model's default class must not leak into the rotor.
@@ -263,12 +263,12 @@ def _add_rotor(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint)
     hinge.actfrcrange = np.zeros(2)
 
 
-def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
+def _in_radians(hinge: MjsJoint, angle: Array) -> Array:
     """An angle of the specification, which may be written in degrees, in radians."""
     return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
 
 
-def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
+def _add_spring(spec: MjSpec, name: str, joint: ElasticJoint) -> None:
     """The spring as a tendon of length θ − q, without what a default class may hold."""
     spring = spec.add_tendon(
         name=spring_name(name),
@@ -285,7 +285,7 @@ def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
     spring.springlength = np.array([-joint.backlash / 2, joint.backlash / 2])
 
 
-def _add_friction(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+def _add_friction(spec: MjSpec, hinge: MjsJoint, joint: ElasticJoint) -> None:
     """Friction on the link angle, on top of what the hinge has."""
     hinge.damping = hinge.damping + np.array([joint.viscous_friction, 0.0, 0.0])
     hinge.frictionloss += joint.coulomb_friction
@@ -296,9 +296,7 @@ def _add_friction(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoi
         hinge.solimp_friction[:] = _FRICTION_SOLIMP
 
 
-def _drive(
-    spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule
-) -> None:
+def _drive(spec: MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule) -> None:
     """Put the hinge's actuators, or the servo, on the driven joint."""
     on_joints = [a for a in spec.actuators if a.trntype in _ON_JOINT]
     existing = [actuator for actuator in on_joints if actuator.target == name]
@@ -319,7 +317,7 @@ def _drive(
         )
 
 
-def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
+def _follow_actuators(spec: MjSpec, name: str, driven: str) -> None:
     """Sensors of the actuator torque on a hinge go where its actuators go."""
     kind = mujoco.mjtSensor.mjSENS_JOINTACTFRC
     for sensor in spec.sensors:
@@ -327,7 +325,7 @@ def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
             sensor.objname = driven
 
 
-def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
+def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
@@ -341,7 +339,7 @@ def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Ser
         sensor.objname = servo_name(joint)
 
 
-def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> None:
+def _add_servo(spec: MjSpec, name: str, target: str, servo: Servo) -> None:
     actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
     actuator.damping = np.zeros(3)
     actuator.armature = 0.0
@@ -369,7 +367,7 @@ def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> Non
     actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
 
 
-def _set_to_motor(actuator: mujoco.MjsActuator, servo: Servo, motor: Motor) -> None:
+def _set_to_motor(actuator: MjsActuator, servo: Servo, motor: Motor) -> None:
     """MuJoCo's DC motor with the servo's PID on its voltage.
 
     MuJoCo has one motor constant K = k_t = k_e, of a gear without losses. With K = sqrt(k_t k_e)

@@ -50,7 +50,7 @@ _READABLE = (".stl", ".obj")
 _PACKAGE = "package://"
 _MESH = mujoco.mjtGeom.mjGEOM_MESH
 _URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
-_REFERRING = ("actuators", "equalities", "sensors", "tendons", "excludes", "pairs", "tuples")
+_REFERRING = "actuators equalities sensors tendons excludes pairs tuples"
 """Elements of a specification that refer to others by name."""
 
 
@@ -337,7 +337,7 @@ def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
         ConfigurationError: An element refers to what the specification does not have.
     """
     copied: Any = from_mujoco(spec.copy, name, "copy")
-    for kind in _REFERRING:
+    for kind in _REFERRING.split():
         if len(getattr(copied, kind)) < len(getattr(spec, kind)):
             from_mujoco(spec.compile, name, "compile")  # which says what is wrong
             raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")

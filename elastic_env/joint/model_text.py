@@ -35,15 +35,7 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
-_NOT_OF_FILES = {
-    "idna",
-    "punycode",
-    "unicode_escape",
-    "raw_unicode_escape",
-    "undefined",
-    "mbcs",
-    "oem",
-}
+_NOT_OF_FILES = "idna punycode unicode_escape raw_unicode_escape undefined mbcs oem"
 _XACRO = "xacro"
 _EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
 _XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
@@ -157,10 +149,9 @@ def parse_xml(text: str, name: str) -> ET.Element:
         nonlocal depth
         depth += 1
         if depth > DEEPEST:
-            raise ConfigurationError(
-                f"{name} must be nested at most {DEEPEST} elements deep; line"
-                f" {parser.CurrentLineNumber} is deeper"
-            )
+            problem = f"{name} must be nested at most {DEEPEST} elements deep"
+            cure = f"line {parser.CurrentLineNumber} is deeper"
+            raise ConfigurationError(f"{problem}; {cure}")
         tree.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -204,7 +195,7 @@ def decode_xml(content: bytes, name: str) -> tuple[str, bool]:
             encoding = "utf-16-le" if content[0] else "utf-16-be"
     try:
         codec = codecs.lookup(encoding)
-        if not codec._is_text_encoding or codec.name.replace("-", "_") in _NOT_OF_FILES:  # type: ignore[attr-defined]
+        if not codec._is_text_encoding or codec.name.replace("-", "_") in _NOT_OF_FILES.split():  # type: ignore[attr-defined]
             raise LookupError
         text = content.decode(encoding)
     except LookupError:

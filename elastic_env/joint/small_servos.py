@@ -53,6 +53,9 @@ _DAMPING_RATIO = 0.17
 _KG_CM = 0.0980665
 """A kilogram-force at a centimetre [N·m]."""
 
+_Given = float | None
+"""A gain or a voltage [V]; None for the usual one."""
+
 
 @dataclass(frozen=True)
 class Gear:
@@ -97,7 +100,7 @@ class SmallServo:
     per_gain: float
     gain: float
 
-    def joint(self, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+    def joint(self, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
         """The elastic joint with this servo.
 
         Args:
@@ -153,13 +156,8 @@ def _identified(
     constant: float, resistance: float, voltage: float, pwm_limit: float = 1.0
 ) -> Motor:
     """A motor of which one constant k_t = k_e [N·m/A] was identified."""
-    return Motor(
-        torque_constant=constant,
-        back_emf=constant,
-        resistance=resistance,
-        voltage=voltage,
-        pwm_limit=pwm_limit,
-    )
+    own = {"torque_constant": constant, "back_emf": constant, "resistance": resistance}
+    return Motor(**own, voltage=voltage, pwm_limit=pwm_limit)
 
 
 _XL330 = Gear(rotor_inertia=0.002596, base=0.00232, share=0.2641, viscous=0.0169)
@@ -188,7 +186,7 @@ SMALL_SERVOS = {
 """Small servos by name."""
 
 
-def small_servo(name: str, gain: float | None = None, voltage: float | None = None) -> ElasticJoint:
+def small_servo(name: str, gain: _Given = None, voltage: _Given = None) -> ElasticJoint:
     """The elastic joint of a named servo.
 
     Args:

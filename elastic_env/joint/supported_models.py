@@ -147,10 +147,9 @@ def require_few(joints: Collection[str]) -> None:
         ConfigurationError: There are more than `MOST_ELASTIC`.
     """
     if len(joints) > MOST_ELASTIC:
-        raise ConfigurationError(
-            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that"
-            " matter"
-        )
+        problem = f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}"
+        cure = "name those that matter"
+        raise ConfigurationError(f"{problem}; {cure}")
 
 
 def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
@@ -199,6 +198,8 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     _require_inertia(model, joints)
 
 
+_PULLING = "stiffness stiffnesspoly damping frictionloss armature"
+"""Properties by which a tendon pulls."""
 _TRANSMISSIONS = {_TENDON: "a tendon", _SITE: "a site", _SLIDERCRANK: "a slider-crank"}
 
 
@@ -311,14 +312,7 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 
 def _pulls(model: mujoco.MjModel, tendon: int) -> bool:
-    own = (
-        model.tendon_stiffness,
-        model.tendon_stiffnesspoly,
-        model.tendon_damping,
-        model.tendon_frictionloss,
-        model.tendon_armature,
-    )
-    return any(np.any(values[tendon]) for values in own)
+    return any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in _PULLING.split())
 
 
 def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:

@@ -34,19 +34,18 @@ _LEFT_OUT = [
 """Flags of what holds a joint back, and of the reset that would hide a step without numbers."""
 
 
-def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> float:
+def spectral_radius(model: mujoco.MjModel, timestep_s: float) -> float:
     """Largest eigenvalue of a physics step about the reference posture, by magnitude [1].
 
     Args:
         model: It is not changed.
-        timestep_s: Physics step in place of the model's own [s].
+        timestep_s: Physics step [s].
 
     Returns:
         At most 1 for a stable step; infinite where a step gives no number.
     """
     linear = _without_constraints(model)
-    if timestep_s is not None:
-        linear.opt.timestep = timestep_s
+    linear.opt.timestep = timestep_s
     with _without_messages():
         A = _transition(linear)
     if not np.isfinite(A).all():

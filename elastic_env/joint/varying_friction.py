@@ -22,13 +22,10 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, joint_torque
 from elastic_env.joint.friction import dry_friction
-from elastic_env.joint.joint_names import (
-    JointAddresses,
-    friction_name,
-    spring_name,
-)
+from elastic_env.joint.joint_names import JointAddresses, friction_name, spring_name
 
 _TERMS = 4
+_Fields = Callable[[str], Array]
 
 
 def varies(joint: ElasticJoint) -> bool:
@@ -94,7 +91,7 @@ class VaryingFriction:
         limits = self.limits(lambda name: getattr(model, name)[None], _rows_of(data))
         model.dof_frictionloss[self.links] = limits[0]
 
-    def limits(self, field: Callable[[str], Array], state: Callable[[str], Array]) -> Array:
+    def limits(self, field: _Fields, state: _Fields) -> Array:
         """Friction F of worlds in their states, (num_worlds, n) [N·m].
 
         Args:
@@ -111,7 +108,7 @@ class VaryingFriction:
             stribeck_speed=terms[:, 3],
         )
 
-    def _load(self, field: Callable[[str], Array], state: Callable[[str], Array]) -> Array:
+    def _load(self, field: _Fields, state: _Fields) -> Array:
         """τ_J, (num_worlds, n) [N·m].
 
         A joint without a spring passes what its actuators leave when its rotor is accelerated, as
@@ -137,5 +134,5 @@ class VaryingFriction:
         return load
 
 
-def _rows_of(data: mujoco.MjData) -> Callable[[str], Array]:
+def _rows_of(data: mujoco.MjData) -> _Fields:
     return lambda name: getattr(data, name)[None]

@@ -1,8 +1,8 @@
-"""Timing of a walk in place: step periods, phases, and the ZMP reference that goes with them.
+"""A walk: step periods, phases, a foothold per step, and the ZMP reference that goes with them.
 
 A step is double, single, double support; its support foot is fixed and the other one swings. The
 first step swings the right foot, as Fig. 1 of the paper. Before and after the walk the robot
-stands.
+stands, its feet side by side.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from elastic_env.core.config import Model, plain_numbers, quantity
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.trajectory import STAND_S, control_times, minimum_jerk
+from elastic_env.rigid.leg_kinematics import turn
 
 LEFT = 0
 RIGHT = 1
@@ -41,7 +42,7 @@ _RAMP_INWARD_M = 0.02
 
 
 class Gait(Model):
-    """A walk in place."""
+    """A walk: in place, or with a step length and a turn per step."""
 
     double_support_s: float = quantity("s", 1.1, gt=0, le=3600)
     """First double support of a step [s]."""
@@ -53,6 +54,12 @@ class Gait(Model):
     """Number of steps [1]."""
     settling_steps: int = quantity("1", 0, ge=0)
     """First steps, which are walked but not scored: ramps end in them [1]."""
+    step_length_m: float = quantity("m", 0.0, ge=-1, le=1)
+    """By how much a step sets its foot ahead of the other one, negative for backwards [m]."""
+    step_width_m: float | None = quantity("m", None, gt=0, le=1)
+    """Distance of the feet side by side; None for that of the hips [m]."""
+    turn_rad: float = quantity("rad", 0.0, ge=-1, le=1)
+    """By how much a step turns its foot against the other one, positive to the left [rad]."""
     lift_m: float = quantity("m", 0.025, gt=0)
     """Height to which the swing foot is lifted [m]."""
     hip_height_m: float = quantity("m", 0.66, gt=0)
@@ -71,6 +78,11 @@ class Gait(Model):
     def duration_s(self) -> float:
         """Duration of the episode: the walk, and standing before and after it [s]."""
         return self.num_steps * self.step_period_s + 2.0 * STAND_S
+
+    @property
+    def is_in_place(self) -> bool:
+        """The feet come down where they stood, side by side under the hips."""
+        return not (self.step_length_m or self.turn_rad or self.step_width_m)
 
     @model_validator(mode="after")
     def _some_step_is_scored(self) -> Self:
@@ -188,22 +200,79 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     )
 
 
-def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
+@dataclass(frozen=True, eq=False)
+class Footholds:
+    """Where the feet stand after 0, 1, ... steps, in the plan's world frame, left foot first.
+
+    Attributes:
+        positions: Middles of the soles, (num_steps + 1, 2, 2) [m].
+        yaw: Headings of the feet, positive to the left, counted over full turns, (num_steps + 1, 2)
+            [rad].
+    """
+
+    positions: Array
+    yaw: Array
+
+    def swinging(self, timing: Timing) -> tuple[Array, Array]:
+        """Middles of the soles, (T, 2, 2) [m], and headings, (T, 2) [rad], swings included.
+
+        A swing goes straight from foothold to foothold with minimum jerk.
+        """
+        blend = minimum_jerk(timing.swing)[:, None]
+        before = timing.step
+        after = before + 1
+        moved = self.positions[after] - self.positions[before]
+        positions = self.positions[before] + blend[..., None] * moved
+        yaw = self.yaw[before] + blend * (self.yaw[after] - self.yaw[before])
+        return positions, yaw
+
+
+def footholds(gait: Gait, feet: Array) -> Footholds:
+    """Footholds of a gait.
+
+    A step takes its foot one step length and one turn further than the support foot: to where that
+    foot would stand beside the support foot, moved by the step length along the heading halfway
+    through the turn. The last step closes the feet side by side.
+
+    Args:
+        gait: Step length, width and turn.
+        feet: Middles of the soles where the robot stands with its usual width, left first, (2, 2)
+            [m].
+    """
+    beside = np.array(feet)
+    if gait.step_width_m is not None:
+        widths = np.array([0.5, -0.5]) * gait.step_width_m
+        beside[:, 1] = feet[:, 1].mean() + widths
+    # of the pair of feet that a foot belongs to, one per foot that was set down
+    taken = np.arange(gait.num_steps)
+    yaw = np.concatenate([gait.turn_rad * taken, [gait.turn_rad * taken[-1]]])
+    along = np.tile([gait.step_length_m, 0.0], (gait.num_steps - 1, 1))
+    advance = turn(along, yaw[1:-1] - 0.5 * gait.turn_rad)
+    middle = np.zeros((gait.num_steps + 1, 2))
+    middle[1:-1] = np.cumsum(advance, axis=0)
+    middle[-1] = middle[-2]
+    # after k steps the foot that swung last belongs to pair k, the other one to pair k - 1
+    steps = np.arange(gait.num_steps + 1)
+    pair = np.repeat(steps[:, None], 2, axis=1)
+    pair[1:, LEFT] -= steps[1:] % 2 == 1
+    pair[1:, RIGHT] -= steps[1:] % 2 == 0
+    return Footholds(middle[pair] + turn(beside, yaw[pair]), yaw[pair])
+
+
+def zmp_reference(gait: Gait, timing: Timing, feet: Footholds) -> Array:
     """Reference of the zero moment point.
 
     Args:
         gait: Durations and kind of transfer.
         timing: Phases at the control times.
-        feet: Middle of the left and the right sole, (2, 2) [m].
+        feet: Footholds by step.
 
     Returns:
         (T, 2) [m]; under the support foot in single support, halfway between the feet before and
         after the walk.
     """
-    middle = feet.mean(axis=0)
-    supports = support_points(gait, feet)
-    zmp = np.repeat(middle[None], len(timing.time), axis=0)
-    for begin, duration, start, target in _shifts(gait, supports, middle):
+    zmp = np.repeat(feet.positions[:1].mean(axis=1), len(timing.time), axis=0)
+    for begin, duration, start, target in _shifts(gait, feet):
         progress = (timing.time - begin) / duration
         is_smooth = gait.transfer == "smooth"
         blend = minimum_jerk(progress) if is_smooth else np.clip(progress, 0.0, 1.0)
@@ -211,31 +280,39 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
     return zmp
 
 
-def support_points(gait: Gait, feet: Array) -> Array:
-    """Place of the ZMP on one foot, under or inward of its ankle, (2, 2) [m]."""
+def inward_offsets(gait: Gait, standing: Array) -> Array:
+    """From the middles of the soles to the ZMP on one foot, in the frames of the feet, (2, 2) [m].
+
+    Args:
+        gait: Kind of transfer.
+        standing: Middles of the soles side by side, left first, (2, 2) [m].
+    """
     inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
-    towards = feet.mean(axis=0) - feet
-    return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    towards = standing.mean(axis=0) - standing
+    return inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
-def _shifts(gait: Gait, supports: Array, middle: Array) -> list[_Shift]:
+def _shifts(gait: Gait, feet: Footholds) -> list[_Shift]:
     """Moves of the ZMP: begin [s], duration [s], from and to [m]."""
     shifts: list[_Shift] = []
-    last = middle
+    middles = feet.positions.mean(axis=1)
+    offsets = inward_offsets(gait, feet.positions[0])
+    supports = feet.positions + turn(offsets, feet.yaw)
+    last = middles[0]
     begin = STAND_S
     for step in range(gait.num_steps):
         lift_off = begin + gait.double_support_s
         touch_down = lift_off + gait.single_support_s
         end = begin + gait.step_period_s
-        support = supports[step % 2]
+        support = supports[step, step % 2]
         if gait.transfer == "ramp":
-            shifts.append((lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middle, support))
-            shifts.append((touch_down, _RAMP_SHIFT_S, support, middle))
+            shifts.append((lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middles[step], support))
+            shifts.append((touch_down, _RAMP_SHIFT_S, support, middles[step + 1]))
         else:
             left = begin if step == 0 else begin - gait.last_double_support_s
             shifts.append((left, lift_off - left, last, support))
             if step == gait.num_steps - 1:
-                shifts.append((touch_down, end - touch_down, support, middle))
+                shifts.append((touch_down, end - touch_down, support, middles[-1]))
         last = support
         begin = end
     return shifts

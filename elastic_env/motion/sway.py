@@ -18,25 +18,33 @@ _DOF = 6
 _STEP = 1e-4  # of the finite differences [m], [rad]
 
 
-def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
+def sway_frequencies(
+    biped: Biped, pelvis: Array, stiffness: Array, ankles: Array | None = None
+) -> Array:
     """Natural frequencies of the robot standing with level pelvis, its weight shared equally.
 
     Args:
         biped: The robot.
         pelvis: Position of the pelvis over the middle between the soles, (3,) [m].
         stiffness: K of the twelve joints, (12,) [N·m/rad].
+        ankles: Of both feet, (2, 3) [m]; None for feet under the hips.
 
     Returns:
         The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes
         unstable.
     """
-    q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
+    feet = biped.ankles if ankles is None else ankles
+
+    def angles_at(x: Array) -> Array:
+        return _angles(biped, pelvis, feet, x)
+
+    q = angles_at(np.zeros((1, _DOF)))[0]
     gravity = np.array([0.0, 0.0, -biped.gravity])
     loads = biped.chains.loads(1, gravity, mass=-biped.chains.mass / 2.0)
     theta = q + biped.chains.torque(loads, q[None])[0] / stiffness
 
     def potential(x: Array) -> Array:
-        angles = _angles(biped, pelvis, x)
+        angles = angles_at(x)
         com = biped.chains.center_of_mass(angles)
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
         of_springs = 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1)
@@ -48,7 +56,7 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
     ends = np.concatenate([pairs, mixed, -mixed, -pairs]).reshape(-1, _DOF)
     V = potential(ends).reshape(4, _DOF, _DOF)
     hessian = (V[0] - V[1] - V[2] + V[3]) / (4.0 * _STEP**2)
-    change = _angles(biped, pelvis, unit) - _angles(biped, pelvis, -unit)
+    change = angles_at(unit) - angles_at(-unit)
     motion = np.vstack([np.eye(_DOF), change.T / (2.0 * _STEP)])
     body = FloatingBody(biped.rigid, biped.joint_names)
     mass = motion.T @ body.mass_matrix(q) @ motion
@@ -61,10 +69,9 @@ def _rotations(x: Array) -> Array:
     return turned @ legs.rotation_x(x[:, 3])
 
 
-def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
+def _angles(biped: Biped, pelvis: Array, ankles: Array, x: Array) -> Array:
     """Joint angles that keep both soles on the ground, small pelvis motions (n, 6) to (n, 12)."""
     R = _rotations(x)
-    ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
     turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
     return legs.leg_angles(biped.leg, relative, turned).reshape(len(x), -1)

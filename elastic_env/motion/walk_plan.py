@@ -1,11 +1,23 @@
-"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles.
+"""The walk as a table: gait, footholds, ZMP, center of mass, pelvis, feet and joint angles.
 
-The pelvis stays level at one height and moves so that the center of mass of the whole robot, not
-the pelvis, follows the preview control.
+The pelvis stays level at one height, heads where the feet do on average, and moves so that the
+center of mass of the whole robot, not the pelvis, follows the preview control.
+
+Feet that swing forward move the ZMP off that of the cart-table. Where the robot does not walk in
+place, the error of the motion's ZMP passes the preview control once more [Kajita2003], which leaves
+about a sixth of it.
+
+The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
+between the feet at the start. The local frame, in which policies read the plan: level, on the
+ground halfway between the planned feet, x along the planned heading, which is the mean of theirs.
+It moves and turns with a swing foot by half. Where the robot walks in place, both are the same.
+
+[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
+Zero-Moment Point", ICRA.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -13,28 +25,48 @@ from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import Servo
 from elastic_env.motion import gait as gaits
-from elastic_env.motion.gait import RIGHT, Gait, Timing
+from elastic_env.motion.foot_clearance import require_clear_feet
+from elastic_env.motion.gait import RIGHT, Footholds, Gait, Timing
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_kinematics import turn
 
 _COM_TOLERANCE_M = 1e-10
 _MAX_ITERATIONS = 50
 
 
 @dataclass(frozen=True, eq=False)
+class LocalPlan:
+    """A plan in the local frame of the module, one row per control step.
+
+    Attributes:
+        com: Center of mass in the plane, (T, 2) [m].
+        com_dot: Its rate against the feet that stand, (T, 2) [m/s].
+        pelvis: Position of the pelvis, (T, 3) [m].
+        ankles: Left and right ankle, (T, 2, 3) [m].
+        foot_yaw: Headings of the feet, (T, 2) [rad].
+    """
+
+    com: Array
+    com_dot: Array
+    pelvis: Array
+    ankles: Array
+    foot_yaw: Array
+
+
+@dataclass(frozen=True, eq=False)
 class WalkPlan:
-    """A walk in place, one row per control step.
+    """A walk, one row per control step.
 
-    Row k is the end of control period k, row 0 the start.
-
-    Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway
-    between the feet.
+    Row k is the end of control period k, row 0 the start. Positions are in the plan's world frame,
+    see the module.
 
     Attributes:
         gait: What was planned.
         timing: Phases.
+        footholds: Where the feet stand, by step.
         q, q_dot, q_ddot: Joint angles and their derivatives, (T, 12) [rad], [rad/s], [rad/s²].
         zmp: Reference of the ZMP, (T, 2) [m].
         zmp_of_motion: ZMP of the planned motion by inverse dynamics, (T, 2) [m].
@@ -42,7 +74,10 @@ class WalkPlan:
         com_height: Height of the center of mass over the ground while the robot stands [m].
         gravity: Acceleration of gravity [m/s²].
         pelvis: Position of the level pelvis, (T, 3) [m].
+        heading, heading_dot: Heading of the pelvis, positive to the left, counted over full turns,
+            and its rate, (T,) [rad], [rad/s].
         ankles: Left and right ankle, (T, 2, 3) [m].
+        foot_yaw: Headings of the feet, (T, 2) [rad].
         share: Share μ of the weight on the right foot, (T,).
         torque: Joint torques of the motion by inverse dynamics, the contact force shared by μ, (T,
             12) [N·m].
@@ -50,6 +85,7 @@ class WalkPlan:
 
     gait: Gait
     timing: Timing
+    footholds: Footholds
     q: Array
     q_dot: Array
     q_ddot: Array
@@ -60,7 +96,10 @@ class WalkPlan:
     com_height: float
     gravity: float
     pelvis: Array
+    heading: Array
+    heading_dot: Array
     ankles: Array
+    foot_yaw: Array
     share: Array
     torque: Array
 
@@ -73,6 +112,28 @@ class WalkPlan:
     def omega(self) -> float:
         """Natural frequency of the inverted pendulum, √(g/z_c) [1/s]."""
         return float(np.sqrt(self.gravity / self.com_height))
+
+    @cached_property
+    def origin(self) -> Array:
+        """Origin of the local frame, halfway between the feet, (T, 2) [m]."""
+        return self.ankles[..., :2].mean(axis=1)
+
+    @cached_property
+    def local(self) -> LocalPlan:
+        """The plan in the local frame."""
+        origin = np.pad(self.origin, ((0, 0), (0, 1)))
+        ankles = turn(self.ankles - origin[:, None], -self.heading[:, None])
+        com = turn(self.com - origin[:, :2], -self.heading)
+        rows = np.arange(len(com))
+        lever = com - ankles[rows, self.timing.support, :2]
+        turning = self.heading_dot[:, None] * np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+        return LocalPlan(
+            com=com,
+            com_dot=turn(self.com_dot, -self.heading) - turning,
+            pelvis=turn(self.pelvis - origin, -self.heading),
+            ankles=ankles,
+            foot_yaw=self.foot_yaw - self.heading[:, None],
+        )
 
 
 @lru_cache(maxsize=32)
@@ -89,23 +150,36 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         ElasticError: A foot out of reach.
     """
     timing = gaits.step_timing(gait, control_period_s)
-    ankles = _ankle_paths(gait, timing, biped)
-    zmp = gaits.zmp_reference(gait, timing, biped.footholds)
-    standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
+    footholds = gaits.footholds(gait, biped.footholds)
+    if not gait.is_in_place:
+        require_clear_feet(footholds, biped.sole_half_size)
+    feet = _foot_paths(gait, timing, footholds, biped)
+    zmp = gaits.zmp_reference(gait, timing, footholds)
+    standing, com_height = _standing(gait, biped, zmp[0], feet.at_start)
     preview = PreviewConfig(
         com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity
     )
     motion = follow_zmp(preview, zmp, zmp[0])
-    start = np.tile(standing, (len(zmp), 1))
-    pelvis = _pelvis_under(motion.com, start, biped, ankles, timing.time)
-    q = _angles(biped, pelvis, ankles, timing.time)
-    dynamics = _dynamics(biped, pelvis, q, control_period_s)
+    start = turn(np.tile(standing, (len(zmp), 1)), feet.heading)
+    start[:, :2] += feet.ankles[..., :2].mean(axis=1)
+    pelvis = _pelvis_under(motion.com, start, biped, feet, timing.time)
+    q = _angles(biped, pelvis, feet, timing.time)
+    dynamics = _dynamics(biped, pelvis, feet.heading, q, control_period_s)
+    if not gait.is_in_place:
+        further = follow_zmp(preview, zmp - dynamics.zmp, np.zeros(2))
+        com_dot = motion.com_dot + further.com_dot
+        motion = replace(motion, com=motion.com + further.com, com_dot=com_dot)
+        pelvis = _pelvis_under(motion.com, pelvis, biped, feet, timing.time)
+        q = _angles(biped, pelvis, feet, timing.time)
+        dynamics = _dynamics(biped, pelvis, feet.heading, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
-    share = load_share(zmp, gaits.support_points(gait, biped.footholds))
-    torque = _joint_torque(biped, ankles, q, dynamics, share)
+    offsets = turn(gaits.inward_offsets(gait, footholds.positions[0]), feet.yaw)
+    share = load_share(zmp, feet.ankles[..., :2] + offsets)
+    torque = _joint_torque(biped, feet, q, dynamics, share)
     return WalkPlan(
         gait=gait,
         timing=timing,
+        footholds=footholds,
         q=q,
         q_dot=q_dot,
         q_ddot=q_ddot,
@@ -116,7 +190,10 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         com_height=com_height,
         gravity=biped.gravity,
         pelvis=pelvis,
-        ankles=ankles,
+        heading=feet.heading,
+        heading_dot=derivatives(feet.heading, control_period_s)[0],
+        ankles=feet.ankles,
+        foot_yaw=feet.yaw,
         share=share,
         torque=torque,
     )
@@ -124,8 +201,9 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
     """The same motion with the torques and the ZMP that it has on another robot of that size."""
-    dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
-    torque = _joint_torque(biped, plan.ankles, plan.q, dynamics, plan.share)
+    dynamics = _dynamics(biped, plan.pelvis, plan.heading, plan.q, control_period_s)
+    feet = _Feet(plan.ankles, plan.foot_yaw, plan.heading)
+    torque = _joint_torque(biped, feet, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
 
 
@@ -171,32 +249,48 @@ def swing_height(progress: Array) -> Array:
     return 64.0 * (progress * (1.0 - progress)) ** 3
 
 
-def _ankle_paths(gait: Gait, timing: Timing, biped: Biped) -> Array:
+@dataclass(frozen=True)
+class _Feet:
+    """Ankles (T, 2, 3) [m], headings of the feet (T, 2) and of the pelvis (T,) [rad]."""
+
+    ankles: Array
+    yaw: Array
+    heading: Array
+
+    @property
+    def at_start(self) -> "_Feet":
+        """The first row alone."""
+        return _Feet(self.ankles[:1], self.yaw[:1], self.heading[:1])
+
+
+def _foot_paths(gait: Gait, timing: Timing, footholds: Footholds, biped: Biped) -> _Feet:
+    positions, yaw = footholds.swinging(timing)
     ankles = np.empty((len(timing.time), 2, 3))
-    ankles[..., :2] = biped.footholds
+    ankles[..., :2] = positions
     ankles[..., 2] = biped.ankle_height
     rows = np.arange(len(timing.time))
     ankles[rows, RIGHT - timing.support, 2] += gait.lift_m * swing_height(timing.swing)
-    return ankles
+    return _Feet(ankles, yaw, yaw.mean(axis=1))
 
 
-def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Array, float]:
+def _standing(gait: Gait, biped: Biped, zmp: Array, feet: _Feet) -> tuple[Array, float]:
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     begin = np.zeros(1)
-    pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], begin)
-    q = _angles(biped, pelvis, ankles[None], begin)
-    com = pelvis + biped.chains.center_of_mass(q)
+    pelvis = _pelvis_under(zmp[None], start, biped, feet, begin)
+    q = _angles(biped, pelvis, feet, begin)
+    com = pelvis + turn(biped.chains.center_of_mass(q), feet.heading)
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: Array) -> Array:
+def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, time: Array) -> Array:
     """Pelvis of one height that puts the center of mass where it belongs."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        q = _angles(biped, pelvis, ankles, time)
-        error = pelvis[:, :2] + biped.chains.center_of_mass(q)[:, :2] - com
+        q = _angles(biped, pelvis, feet, time)
+        from_pelvis = turn(biped.chains.center_of_mass(q)[:, :2], feet.heading)
+        error = pelvis[:, :2] + from_pelvis - com
         pelvis[:, :2] -= error
         if np.abs(error).max() < _COM_TOLERANCE_M:
             return pelvis
@@ -206,18 +300,23 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: A
     )
 
 
-def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
+def _angles(biped: Biped, pelvis: Array, feet: _Feet, time: Array) -> Array:
     try:
-        return biped.joint_angles(pelvis, ankles)
+        return biped.joint_angles(pelvis, feet.ankles, feet.heading, feet.yaw)
     except ElasticError:
-        from_hip = ankles - pelvis[:, None] - biped.hips
+        from_pelvis = turn(feet.ankles - pelvis[:, None], -feet.heading[:, None])
+        from_hip = from_pelvis - biped.hips
         reach = biped.leg.reach
         distance = np.linalg.norm(from_hip, axis=-1)
         row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
         x, y, z = from_hip[row, leg]
         vertical = "lift_m" if z > 0.0 else "hip_height_m"
         # what would bring the foot into reach if its part of the distance were gone
-        left = {vertical: np.hypot(x, y), "hip_half_spacing": np.hypot(x, z)}
+        left = {
+            vertical: np.hypot(x, y),
+            "hip_half_spacing": np.hypot(x, z),
+            "step_length_m": np.hypot(y, z),
+        }
         helps = [name for name, rest in left.items() if rest < reach]
         excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
         decimals = max(4, -int(np.floor(np.log10(excess))))
@@ -238,14 +337,18 @@ class _Dynamics:
     torque: Array
 
 
-def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynamics:
-    """Inverse dynamics of the whole body."""
+def _dynamics(biped: Biped, pelvis: Array, heading: Array, q: Array, period_s: float) -> _Dynamics:
+    """Inverse dynamics of the whole body; the force is in the world."""
     body = FloatingBody(biped.rigid, biped.joint_names)
-    pelvis_dot, pelvis_ddot = derivatives(pelvis, period_s)
     q_dot, q_ddot = derivatives(q, period_s)
-    wrench, torque = body.inverse_dynamics(q, pelvis_dot, q_dot, pelvis_ddot, q_ddot)
-    force = wrench[:, :3]
-    moment = wrench[:, 3:]
+    moved = zip(derivatives(pelvis, period_s), derivatives(heading, period_s), strict=True)
+    base_dot, base_ddot = (
+        np.concatenate([turn(linear, -heading), angular[:, None]], axis=1)
+        for linear, angular in moved
+    )
+    wrench, torque = body.inverse_dynamics(q, base_dot, q_dot, base_ddot, q_ddot)
+    force = turn(wrench[:, :3], heading)
+    moment = turn(wrench[:, 3:], heading)
     # the moment of the ground's force about the pelvis has no horizontal part about the ZMP
     height = -pelvis[:, 2]
     x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
@@ -255,18 +358,16 @@ def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynami
     return _Dynamics(force, zmp, about_zmp, torque)
 
 
-def _joint_torque(
-    biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, share: Array
-) -> Array:
+def _joint_torque(biped: Biped, feet: _Feet, q: Array, dynamics: _Dynamics, share: Array) -> Array:
     """Joint torques, the ground's force shared between the feet, (T, 12) [N·m]."""
     weights = shares(share)
     points = np.zeros((len(q), 2, 3))
-    points[..., :2] = contact_points(dynamics.zmp, share, biped.footholds)
+    points[..., :2] = contact_points(dynamics.zmp, share, feet.ankles[..., :2])
     forces = weights[..., None] * dynamics.force[:, None]
     moments = np.zeros_like(forces)
     moments[..., 2] = weights * dynamics.moment[:, None]
-    arms = points - ankles
-    # soles and pelvis are level: the feet's frames are parallel to the world's
+    arms = points - feet.ankles
     moments += np.cross(arms, forces)
-    contact = biped.chains.loads(len(q), wrench=(forces, moments))
+    in_feet = (turn(forces, -feet.yaw), turn(moments, -feet.yaw))
+    contact = biped.chains.loads(len(q), wrench=in_feet)
     return dynamics.torque + biped.chains.torque(contact, q)

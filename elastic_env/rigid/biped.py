@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_chains import LegChains
-from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry, leg_angles
+from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry, leg_angles, turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +71,12 @@ class Biped:
 
     @property
     def footholds(self) -> Array:
-        """Middles of the soles where the robot walks in place, under the hips, (2, 2) [m]."""
+        """Middles of the soles side by side under the hips, at the usual width, (2, 2) [m]."""
         return self.hips[:, :2]
 
     @property
     def foot_spacing(self) -> float:
-        """Distance from the right foothold to the left one [m]."""
+        """Distance from the right one of them to the left one [m]."""
         return float(self.hips[0, 1] - self.hips[1, 1])
 
     @property
@@ -84,12 +85,16 @@ class Biped:
         heights = np.full((2, 1), self.ankle_height)
         return np.hstack([self.footholds, heights])
 
-    def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
+    def joint_angles(
+        self, pelvis: Array, ankles: Array, heading: Array | float = 0.0, foot_yaw: Any = 0.0
+    ) -> Array:
         """Inverse kinematics with level pelvis and soles.
 
         Args:
             pelvis: Position of the pelvis, (..., 3) [m].
             ankles: Positions of the ankles, (..., 2, 3) [m].
+            heading: Of the pelvis, (...) [rad].
+            foot_yaw: Headings of the feet, (..., 2) [rad].
 
         Returns:
             (..., 12) [rad].
@@ -97,7 +102,11 @@ class Biped:
         Raises:
             ElasticError: A foot is out of reach.
         """
-        target = ankles - pelvis[..., None, :] - self.hips
+        ahead = np.asarray(heading)[..., None]
+        apart = ahead - foot_yaw
+        target = turn(ankles - pelvis[..., None, :], -ahead) - self.hips
         level = np.broadcast_to(np.eye(3), (*target.shape, 3))
-        q = leg_angles(self.leg, target, level)
+        # the hip's first axis is vertical: it turns the leg of a sole that does not turn
+        q = leg_angles(self.leg, turn(target, apart), level)
+        q[..., 0] -= apart
         return q.reshape(*pelvis.shape[:-1], 2 * len(JOINTS))

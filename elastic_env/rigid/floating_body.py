@@ -17,7 +17,7 @@ from elastic_env.rigid.rigid_body import require_hinge_tree
 
 
 class FloatingBody:
-    """A robot whose base is free and level, on (..., n) arrays.
+    """A robot whose base is free and level, of any heading, on (..., n) arrays.
 
     Args:
         model: Compiled rigid model with one free joint, at its base.
@@ -52,14 +52,15 @@ class FloatingBody:
 
         Args:
             q: Hinges, (N, n) [rad].
-            base_dot: Velocity of the level base, (N, 3) [m/s].
+            base_dot: Velocity of the level base, in its frame, and rate of its heading, (N, 4)
+                [m/s], [rad/s].
             q_dot: Rates of the hinges [rad/s].
-            base_ddot: Acceleration of the base [m/s²].
+            base_ddot: Acceleration of the base, in its frame, and of its heading [m/s²], [rad/s²].
             q_ddot: Accelerations of the hinges [rad/s²].
 
         Returns:
-            Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N,
-            n) [N·m].
+            Force and moment about the origin of the base, in its frame, (N, 6) [N], [N·m], and
+            joint torques, (N, n) [N·m].
         """
         base = self._base_v
         rate = np.zeros(self._model.nv)
@@ -67,9 +68,15 @@ class FloatingBody:
         wrench = np.empty((len(q), 6))
         torque = np.empty(q.shape)
         for i in range(len(q)):
-            rate[base : base + 3] = base_dot[i]
+            velocity = base_dot[i]
+            rate[base : base + 3] = velocity[:3]
+            rate[base + 5] = velocity[3]
             rate[self._v] = q_dot[i]
-            change[base : base + 3] = base_ddot[i]
+            # the change of the velocity in a frame that turns
+            change[base : base + 3] = base_ddot[i, :3]
+            change[base] += velocity[3] * velocity[1]
+            change[base + 1] -= velocity[3] * velocity[0]
+            change[base + 5] = base_ddot[i, 3]
             change[self._v] = q_ddot[i]
             position = self._position(q[i])
             effort = pinocchio.rnea(self._model, self._data, position, rate, change)

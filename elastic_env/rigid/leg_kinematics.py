@@ -99,6 +99,19 @@ def rotation_z(angle: Array) -> Array:
     return _rotation(angle, 0, 1)
 
 
+def turn(vectors: Array, angle: Array) -> Array:
+    """Vectors turned about z: (..., 2) or (..., 3) by (...) [rad], both broadcast."""
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    x = vectors[..., 0]
+    y = vectors[..., 1]
+    turned = np.empty(np.broadcast_shapes(vectors.shape, (*np.shape(angle), 1)))
+    turned[..., 0] = cosine * x - sine * y
+    turned[..., 1] = sine * x + cosine * y
+    turned[..., 2:] = vectors[..., 2:]
+    return turned
+
+
 def rotation_of_tilt(attitude: Array) -> Array:
     """Rotation about x by a roll, then about y by a pitch, (..., 2) [rad] to (..., 3, 3)."""
     R = np.empty((*attitude.shape[:-1], 3, 3))

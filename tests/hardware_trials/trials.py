@@ -21,8 +21,7 @@ from baselines.identification.identify import identify
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
 from elastic_env.hardware.safety.processes import child_command, child_environment
 from elastic_env.hardware.safety.realtime import (
@@ -606,9 +605,9 @@ def header_positions(share: float) -> Trial:
         ):
             bus.attach([1, 2, 0xFC])
             for value in (-131073, -131072, -131074, -3, -1, -513, 0xFDFF, 0xFFFF, -65537, 131071):
-                bus.write(1, "goal_position", value)
+                bus.write_register(1, "goal_position", value)
                 bus.write_all("goal_position", {2: value, 0xFC: value})
-                wrong += [bus.read(i, "goal_position") for i in bus.ids] != [value] * 3
+                wrong += [bus.read_register(i, "goal_position") for i in bus.ids] != [value] * 3
                 tried += 1
     return Trial(
         "header-positions",

@@ -126,14 +126,15 @@ class _Playing:
         cores = len(conditions)
         if self.place.is_local:
             cores = self.place.jobs or os.cpu_count() or 1
-        batches = in_batches(conditions, cores)
-        by_steps = [(sum(steps[i] for i in batch), batch) for batch in batches]
-        by_steps.sort(key=lambda own: -own[0])
-        self._steps = [steps for steps, _ in by_steps]
-        self._batches = [batch for _, batch in by_steps]
+
+        def length(batch: list[int]) -> int:
+            return sum(steps[i] for i in batch)
+
+        self._batches = sorted(in_batches(conditions, cores), key=length, reverse=True)
+        self._steps = list(map(length, self._batches))
         self._cells = [[conditions[i] for i in batch] for batch in self._batches]
         self._keys = [] if self.store is None else list(map(cell_key, conditions))
-        self._played = [0] * len(batches)
+        self._played = [0] * len(self._batches)
         self._tally = Tally(len(conditions))
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
         self._show: Show = lambda *_: None
@@ -158,7 +159,7 @@ class _Playing:
         given = [(cells, shown_warnings()) for cells in self._cells]
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self.store is None else self.store.folder.parent
-            with self.place.open(len(given), folder) as pool:
+            with self.place.open_pool(len(given), folder) as pool:
                 run_calls(_evaluate_beside, given, pool, watch)
 
     def _report(self, batch: int, played: int) -> None:

@@ -11,13 +11,10 @@ import numpy as np
 import tyro
 import yaml
 from pydantic import Field, model_validator
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from baselines.policies import is_saved
 from elastic_env.core.config import (
-    LARGEST_SEED,
     MOST_ENTRIES,
     Entries,
     Locator,
@@ -29,13 +26,11 @@ from elastic_env.core.config import (
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec, cell_of
-from train.evaluate.episodes import Evaluation
-from train.runs.console import make_table
-from train.runs.escaping import markdown_table
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec, Seed, cell_of
+from train.evaluate.episodes import Evaluation, group_by
+from train.report.table_formats import Head, Row, Table, to_markdown, to_terminal
 from train.runs.folders import run_folder
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel, load_without_code
+from train.runs.user_code import CodeNamingModel, is_a, load_without_code
 
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
@@ -51,7 +46,7 @@ class BenchCase(Model):
     scenario: Title = "nominal"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
+    seed: Seed = 0
     """Seed of the episode."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
@@ -112,12 +107,13 @@ class Bench(Model):
             for case, evaluation in zip(config.cases, evaluations, strict=True):
                 figures += _figures(case, evaluation, config.margin)
             write_whole(folder / "bench.json", json.dumps(figures, indent=2) + "\n")
-            markdown = _markdown(figures)
+            table = _table(figures)
+            markdown = f"## elastic bench\n\n{to_markdown(table)}\n"
             write_whole(folder / "bench.md", markdown)
         if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
             with Path(summary).open("a", encoding="utf-8") as file:
                 file.write(markdown)
-        console.print(_table(figures))
+        console.print(to_terminal(table))
         console.print(f"wrote {folder}/bench.json and bench.md")
         if self.update:
             _accept(path, evaluations)
@@ -207,32 +203,18 @@ def _child(node: Any, name: str) -> Any:
     return next(value for key, value in node.value if key.value == name)
 
 
-def _cells(figure: _Figure) -> list[str]:
-    """A figure in tables."""
-    case, metric, *numbers, problem = figure.values()
-    verdict = "falls short" if problem else "kept"
-    if figure["bound"] is None and figure["measured"] is not None:
-        verdict = "new"
-    texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
-    return [case, metric, *texts, verdict]
-
-
 def _table(figures: list[_Figure]) -> Table:
+    titles = ("rollout and figure", "measured", "accepted", "at most", "")
+    heads = [Head(title, is_number=0 < n < 4) for n, title in enumerate(titles)]
     rows = []
-    last = ""
-    for case, metric, measured, _, bound, verdict in map(_cells, figures):
-        if case != last:
-            rows.append((case, "", "", ""))
-        rows.append((f"  {metric}", measured, bound, verdict))
-        last = case
-    head = ["rollout and figure", "measured", "at most", ""]
+    for case, own in group_by(figures, lambda figure: figure["case"]).items():
+        rows.append(Row((case,), kind="heading"))
+        for figure in own:
+            _, metric, *numbers, problem = figure.values()
+            verdict = "falls short" if problem else "kept"
+            if figure["bound"] is None and figure["measured"] is not None:
+                verdict = "new"
+            texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
+            rows.append(Row((metric, *texts, verdict)))
     title = "short rollouts against what was accepted"
-    table = make_table(title, head, rows, box=box.SIMPLE)
-    table.columns[-1].justify = "left"
-    return table
-
-
-def _markdown(figures: list[_Figure]) -> str:
-    head = ("rollout", "figure", "measured", "accepted", "at most", "")
-    rules = ["---", "---", "---:", "---:", "---:", "---"]
-    return f"## elastic bench\n\n{markdown_table(head, rules, map(_cells, figures))}\n"
+    return Table(tuple(heads), tuple(rows), title=title)

@@ -29,20 +29,8 @@ from train.runs.import_path import leave
 from train.runs.progress import say_what_is_compiled
 
 COMMANDS = (
-    "identify",
-    "evaluate",
-    "compare",
-    "train",
-    "iterate",
-    "export",
-    "bench",
-    "speed",
-    "margins",
-    "play",
-    "view",
-    "robot",
-    "hardware",
-    "demo",
+    "identify evaluate compare train iterate export bench speed margins play view robot hardware"
+    " demo"
 )
 """Modules of this folder, each with a class of its name: options, and `run` with a console."""
 
@@ -115,7 +103,7 @@ def parse(arguments: list[str]) -> Any:
 
 
 def _parse(arguments: list[str]) -> Any:
-    if not arguments or arguments[0] not in COMMANDS:
+    if not arguments or arguments[0] not in COMMANDS.split():
         return _parse_overview(arguments)
 
     from train.commands.options import name_options
@@ -153,7 +141,7 @@ _STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 def _parse_overview(arguments: list[str]) -> Any:
     """Print the help of all commands, which are not loaded for it, or refuse an unknown command."""
     members: Any = []
-    for name in COMMANDS:
+    for name in COMMANDS.split():
         described = {"__doc__": _help_of(name)}
         kind = dataclasses.make_dataclass(name, [], namespace=described)
         members.append(Annotated[kind, tyro.conf.subcommand(name)])

@@ -12,26 +12,19 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from baselines.policies import is_saved
-from elastic_env.core.config import (
-    LARGEST_SEED,
-    MOST_ENTRIES,
-    Entries,
-    Model,
-    Title,
-    load_yaml,
-    quantity,
-)
+from elastic_env.core.config import MOST_ENTRIES, Entries, Model, Once, Title, load_yaml
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
-from train.commands.options import OnHardware
+from train.commands.options import OnHardware, name_options
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import (
-    MOST_EPISODES,
     Condition,
     GivenRanges,
     GivenReference,
+    NumEpisodes,
     PolicySpec,
+    Seed,
     require_drawn,
 )
 from train.evaluate.environments import Environment, Reference, environment
@@ -51,8 +44,7 @@ from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel, recorded_config
+from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
 
@@ -64,7 +56,7 @@ class Sweep(Model):
 
     option: Title
     """Option of the policies, such as stiffness_scale."""
-    values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
+    values: Annotated[list[float], Once] = Field(min_length=2, max_length=MOST_ENTRIES)
     label: Title | None = None
     """Label of the axis; None for the option's name."""
 
@@ -85,16 +77,16 @@ class CompareConfig(CodeNamingModel):
     env: str = "testbed"
     references: Entries[GivenReference]
     """Motions, see `Condition.reference`; default the environment's."""
-    scenarios: Entries[Title] = ["nominal"]
+    scenarios: Annotated[Entries[Title], Once] = ["nominal"]
     policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    episodes: NumEpisodes = 1
     """Episodes per cell."""
-    scenario_episodes: dict[str, int] = {}
+    scenario_episodes: dict[str, NumEpisodes] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is
     random.
     """
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
@@ -108,9 +100,9 @@ class CompareConfig(CodeNamingModel):
     """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are
     then the references.
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, Annotated[Entries[str], Once]] = {}
     """Scenarios that paired changes are also pooled over, by the name of the group."""
-    reference_scenarios: dict[str, list[Title]] = {}
+    reference_scenarios: dict[str, Annotated[Entries[Title], Once]] = {}
     """Scenarios of single references, by their names in tables, where not all are played: {24 s:
     [nominal]}.
     """
@@ -164,30 +156,16 @@ class CompareConfig(CodeNamingModel):
         require_known("policy of the figures", self.figure_policies, titles)
         known = self.scenarios
         own = self.reference_scenarios
-        episodes = self.scenario_episodes
-        require_known("scenario with episodes of its own", episodes, known)
+        require_known("scenario with episodes of its own", self.scenario_episodes, known)
         require_known("reference with scenarios of its own", own, references)
-        once: dict[str, list[Any]] = {"reference": references, "scenario": known}
-        once["value of the sweep"] = self.sweep.values if self.sweep else []
         for name, scenarios in own.items():
-            once[f"scenario of {name!r}"] = scenarios
             require_known(f"scenario of {name!r}", scenarios, known)
-            if not scenarios:
-                yield f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}"
-        for what, values in once.items():
-            for value in _repeated(values):
-                yield f"the {what} {quote(value)} stands twice; its episodes would count double"
-        for name, count in episodes.items():
-            if not 1 <= count <= MOST_EPISODES:
-                bounds = f">= 1 and <= {MOST_EPISODES}"
-                yield f"scenario_episodes of {name!r} must be {bounds}, got {quote(count)}"
+        if repeated := _repeated(references):
+            yield f"the reference {quote(repeated[0])} stands twice; leave out one of them"
         for name, scenarios in self.groups.items():
             require_known(f"scenario of the group {name!r}", scenarios, known)
-            if name in known or not scenarios or _repeated(scenarios):
-                yield (
-                    f"group {name!r} must have a name that no scenario has, and scenarios, each"
-                    f" once; got {quote(scenarios)}"
-                )
+            if name in known:
+                yield f"group {name!r} must have a name that no scenario has"
         is_real = environment(self.env).is_real
         if self.leaderboard and (self.sweep or self.map or is_real):
             yield "a leaderboard is of simulated cells without a sweep or a map; leave these out"
@@ -443,9 +421,9 @@ class Compare(Model):
     seed, versions and commit.
 
     A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all
-    training seeds of a residual, compared with their base on the same episodes, with intervals over
-    training seeds. The base is added if it is not among the policies. residual:walker_3s/seed_* and
-    the like are the trained ones of the package.
+    training seeds of a residual, compared with their base on the same episodes. The base is added
+    if it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of
+    the package. Intervals are over training seeds, and over the robots of scenarios that draw them.
 
     Example, one joint: elastic compare configs/testbed.yaml
 
@@ -500,7 +478,8 @@ class Compare(Model):
             real["env_options"] = {**config.env_options, **real["env_options"]}
             simulated = {"scenario_episodes": {}, "groups": {}}
             config = config.replace(scenarios=["hardware"], **simulated, **real)
-        executors = Executors(self.on, self.jobs)
+        with name_options():
+            executors = Executors(on=self.on, jobs=self.jobs)
         output = self.resume or self.output
         is_resumed = self.resume is not None
         finished = compare(config, console, output, executors, is_resumed, self.fresh)

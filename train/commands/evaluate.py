@@ -4,10 +4,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from elastic_env.core.config import LARGEST_SEED, Model, quantity
+from elastic_env.core.config import Model
 from train.commands.compare import CompareConfig, compare
 from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
-from train.evaluate.conditions import MOST_EPISODES, PolicySpec
+from train.evaluate.conditions import NumEpisodes, PolicySpec, Seed
 from train.runs.console import print_files
 
 
@@ -30,8 +30,8 @@ class Evaluate(Model):
     input_wrench, adaptive, posture, adaptive_posture, foothold,
     torque_sensor, hip_sensor, thormang, talos."""
     env: str = "testbed"
-    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in
-    place), robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
+    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks),
+    robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
     JointRobot."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
@@ -40,10 +40,11 @@ class Evaluate(Model):
     """MotionOrDefault. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some
     seconds), or a mapping such as '{kind: sine, amplitude: 0.3}'. Walker: step period 24, 3
     (default), 1.6 or 1.1 [s], or its durations of double, single, double support '[0.8, 0.6, 0.8]',
-    or a mapping such as '{step_period: 3, num_steps: 2}'."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    or a mapping such as '{step_period: 3, num_steps: 2}', or to walk forward and turn
+    '{step_period: 3, gait: {step_length_m: 0.1, turn_rad: 0.1}}'."""
+    episodes: NumEpisodes = 1
     """Number of episodes, seeds following --seed."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the first episode."""
     stiffness: Stiffness = None
     """K that the policy assumes: a number [N·m/rad], a list of one per joint

@@ -18,10 +18,9 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.packets import RATES, require_ids
+from elastic_env.hardware.buses.packets import RANGE_OF_RATES, RATES, require_ids
 from elastic_env.hardware.buses.servo_models import servo_models
-from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
@@ -44,13 +43,11 @@ class Scan(Model):
 
     port: Annotated[str, tyro.conf.Positional]
     """Port, such as /dev/ttyUSB0."""
-    baudrate: int | None = None
+    baudrate: int | None = quantity("bit/s", None, **RANGE_OF_RATES)
     """Bits per second; default: the usual rates, one after the other."""
 
     def run(self, console: Console) -> None:
         """Scan; exit code 3 where no servo answers."""
-        if self.baudrate is not None:
-            HardwareSettings(port=self.port, baudrate=self.baudrate)  # checks it
         rows = []
         for rate in RATES if self.baudrate is None else (self.baudrate,):
             with DynamixelBus(self.port, rate) as bus:
@@ -268,12 +265,7 @@ class Emulate(Model):
 class Hardware(Model):
     """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate."""
 
-    command: (
-        Annotated[Scan, tyro.conf.subcommand("scan")]
-        | Annotated[Check, tyro.conf.subcommand("check")]
-        | Annotated[Run, tyro.conf.subcommand("run")]
-        | Annotated[Emulate, tyro.conf.subcommand("emulate")]
-    )
+    command: Scan | Check | Run | Emulate
 
     def run(self, console: Console) -> None:
         """Do what was asked for."""

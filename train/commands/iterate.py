@@ -15,11 +15,11 @@ from baselines.adaptation.learned_signals import LearningGains, learned_signals
 from baselines.adaptation.offset_table import TableDescription, motion_of, save_table
 from baselines.catalogue import learned_base
 from baselines.options import PolicyOptions
-from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
+from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.world.robot_model import WalkerModel
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
-from train.evaluate.conditions import Condition, PolicySpec, cell_of
+from train.evaluate.conditions import Condition, PolicySpec, Seed, cell_of
 from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.chart import trials_chart
@@ -57,7 +57,7 @@ class Iterate(Model):
     """Trials that it learns from."""
     base: Title | None = None
     """Policy whose offsets are learned; default adaptive_posture, on the testbed input."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - _MOST_ROBOTS)
+    seed: Seed = 0
     """Seed of the robot, where the scenario draws one."""
     robots: int = quantity("1", 1, ge=1, le=_MOST_ROBOTS)
     """Robots, each of which learns by itself; their seeds follow --seed."""

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from baselines import PositionCompensator
-from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read_mapping
+from elastic_env.core.config import Locator, Model, read_mapping
 from elastic_env.core.errors import ConfigurationError, ElasticError, quote
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_of
@@ -34,9 +34,9 @@ from elastic_env.world.joint_task import JointPlant
 from train.commands.compare import CompareConfig, compare
 from train.commands.options import Motion, StiffnessOrFile
 from train.commands.play import play
-from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.conditions import Condition, PolicySpec, Seed
+from train.evaluate.environments import ENDINGS, read_robot_file
 from train.evaluate.episodes import Evaluation
-from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.figures import plots
 from train.report.write import require_libraries
 from train.runs.console import make_table, print_files
@@ -86,7 +86,7 @@ class Robot(Model):
     """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind
     and parameters.
     """
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED)
+    seed: Seed = 0
     """Seed of the episodes."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/robot, numbered if taken."""

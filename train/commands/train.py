@@ -62,7 +62,8 @@ class Train(Model):
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
             raise ConfigurationError(problem)
-        executors = Executors(self.on, self.jobs)
+        with name_options():
+            executors = Executors(on=self.on, jobs=self.jobs)
         if self.resume:
             folders = resume(self.resume, console, executors, self.trust_code)
         else:

@@ -28,10 +28,11 @@ from mujoco.studio import (
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from rich.console import Console
 
+from elastic_env.core.config import quantity
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.commands.play import WatchedEpisode, episode, steps_within
-from train.commands.view_proxy import LOOPBACK, Access, Proxy, listen
+from train.commands.view_proxy import LOOPBACK, Access, Proxy, open_listener
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import make_policy
 
@@ -89,7 +90,7 @@ class Playback:
             self.time_s = self.time_s + now - last if self.time_s < end else 0.0
 
 
-def record(condition: Condition, console: Console, max_s: float | None = None) -> Recording:
+def record(condition: Condition, console: Console, max_s: float | None) -> Recording:
     """Play an episode and keep what is drawn.
 
     Args:
@@ -98,7 +99,7 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         max_s: Stop after this much simulated time [s].
 
     Raises:
-        ElasticError: The picture of the robot cannot be drawn side by side, or `max_s` is no time.
+        ElasticError: The picture of the robot cannot be drawn side by side.
     """
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     task = env.unwrapped.task
@@ -215,7 +216,7 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
         ConfigurationError: Host or port cannot be.
         SystemFailedError: The port is taken.
     """
-    browsers = listen(host, port)
+    browsers = open_listener(host, port)
     access = Access(host, browsers.getsockname()[1])
     with (
         contextlib.closing(browsers),
@@ -268,13 +269,13 @@ class View(WatchedEpisode):
     """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others
     reach it too.
     """
-    port: int = 0
+    port: int = quantity("1", 0, ge=0, le=65535)
     """Port of the page; 0 takes the first free one from 8080 on."""
 
     def run(self, console: Console) -> None:
         """Play an episode, then show it until Ctrl-C."""
         # what cannot be is said before the episode
-        listen(self.host, self.port).close()
+        open_listener(self.host, self.port).close()
         condition = self.condition
         console.print(f"playing {self.policy} first")
         recording = record(condition, console, self.max_s)

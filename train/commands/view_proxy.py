@@ -27,7 +27,6 @@ LOOPBACK = "127.0.0.1"
 """The address of a page unless somebody asks for another one."""
 
 _FIRST_PORTS = range(8080, 8100)
-_LARGEST_PORT = 65535
 _LARGEST_HEAD = 32768
 """Of a request or a response [bytes]."""
 _HEAD_S = 10.0
@@ -214,7 +213,7 @@ def _is_loopback(host: str) -> bool:
     return is_name or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
-def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
+def open_listener(host: str = LOOPBACK, port: int = 0) -> socket.socket:
     """A socket that listens for browsers.
 
     Args:
@@ -222,12 +221,9 @@ def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
         port: 0 takes the first free one from 8080 on.
 
     Raises:
-        ConfigurationError: Host or port cannot be.
+        ConfigurationError: The host cannot be.
         SystemFailedError: The port is taken, or this machine has no such address.
     """
-    if not 0 <= port <= _LARGEST_PORT:
-        problem = f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {quote(port)}"
-        raise ConfigurationError(problem)
     kind = {"type": socket.SOCK_STREAM, "flags": socket.AI_PASSIVE}
     try:
         family = socket.getaddrinfo(host or None, port, **kind)[0][0]
@@ -253,7 +249,7 @@ class Proxy:
     """Answers browsers in a thread, until it is closed.
 
     Args:
-        listener: Where browsers come in, see `listen`.
+        listener: Where browsers come in, see `open_listener`.
         viewer: Path of the Unix socket at which the viewer answers.
         access: Who is let in.
     """

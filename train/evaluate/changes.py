@@ -18,13 +18,22 @@ from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.residual_seeds import Origin
 from train.evaluate.statistics import (
+    Counts,
     Estimate,
     change,
+    estimate,
     improvement,
     interquartile_mean,
-    over_seeds,
 )
-from train.evaluate.table import EpisodeTable, Groups, Scope, failures, pair, per_seed
+from train.evaluate.table import (
+    EpisodeTable,
+    Groups,
+    Scope,
+    failures,
+    means_of_cells,
+    pair,
+    per_robot,
+)
 
 CEILING = "ceiling on the training condition"
 SAME_ROBOT = "trained robot"
@@ -36,16 +45,21 @@ PARTLY = "partly held out"
 BEST_ANALYTIC = "best policy without learning"
 """Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
-every other one misses the truth, over five every eleventh."""
+"""Training seeds, or robots of a policy without them, from which on an interval is taken for a
+verdict: of 95 % intervals over two seeds every other one misses the truth, over five every
+eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any
 effect.
 """
+CLAIM_ROBOTS = 64
+"""Drawn robots that a claim about `drawn` needs: with 8 of them means differ by 15 %."""
 
 SIGNS = {"none": "*", "unclear": "?"}
 """Signs behind a change that is not shown, by its verdict."""
-SIGNS_ARE = "A star: the interval includes zero. A question mark: too few training seeds to say."
+SIGNS_ARE = (
+    "A star: the interval includes zero. A question mark: too few training seeds or robots to say."
+)
 
 _SMALL = 0.0995
 """Below it a share is shown with a decimal."""
@@ -66,7 +80,8 @@ class Change(Scope):
         is_judged: Whether policies are judged by it; else it stands in tables alone.
         per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
             baseline one value.
-        relative: Interquartile mean of it over training seeds.
+        relative: Interquartile mean of it over training seeds; its interval is over them and over
+            the robots of the cells that draw them.
         improvement: Probability that an episode is better than the base's.
         mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile
             mean over training seeds.
@@ -105,10 +120,14 @@ class Change(Scope):
 
     @property
     def verdict(self) -> Verdict:
-        """lower, higher, none (the interval includes zero), or unclear (too few training seeds)."""
+        """lower, higher, none (the interval includes zero), or unclear.
+
+        That is with too few training seeds, or too few robots of a policy that was not trained.
+        """
         low = self.relative.low
         high = self.relative.high
-        if low is None or high is None or self.num_compared < FEWEST_SEEDS:
+        units = self.num_compared if self.is_family else self.relative.robots
+        if low is None or high is None or units < FEWEST_SEEDS:
             return "unclear"
         return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
 
@@ -146,15 +165,18 @@ class Change(Scope):
         size = f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
         if value == 0.0:
             size = "no change"
-        if not self.is_family:
+        over = self.relative.over
+        if not self.is_family and not over:
             return f"{size} (difference of means, no training seeds)"
         if self.verdict == "none":
             return "the interval includes zero: no difference shown"
         if self.verdict != "unclear":
             return size
-        if self.num_compared == 1:
+        if not over:
             return f"{size} with one training seed: no interval"
-        return f"{size} with {self.num_compared} training seeds: too few to tell it from chance"
+        if self.is_family and self.num_compared == 1:
+            return f"{size} with one training seed: the interval is over {over} alone"
+        return f"{size} with {over}: too few to tell it from chance"
 
 
 def signed_off(text: str, verdict: str) -> str:
@@ -259,10 +281,21 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
     theirs = pd.concat(parts)
     both = pair(own, theirs, column.metric)
-    means = per_seed(both, "mine")
-    base_means = per_seed(both, "base")
-    played = np.nan_to_num(per_seed(both, "won", len))
-    relative = change(means, base_means)
+    mine = per_robot(both, "mine")
+    base_values = per_robot(both, "base")
+    robots = [values.shape[1] for values in mine]
+    once = [np.ones((1, number)) for number in robots]
+    means = means_of_cells(mine, once)[:, 0].T
+    base_means = means_of_cells(base_values, once)[:, 0].T
+
+    def relative(counts: Counts) -> Array:
+        sides = (means_of_cells(values, counts).T for values in (mine, base_values))
+        return change(*sides).T
+
+    won, played = (
+        [np.nan_to_num(values) for values in per_robot(both, "won", statistic)]
+        for statistic in ("sum", "count")
+    )
     falls, episodes = failures(own)
     base_falls, base_episodes = failures(theirs)
     member = scope.first.member
@@ -272,12 +305,12 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         marks=_marks(table.families.get(scope.policy), scope.conditions),
         column=column,
         is_judged=column in table.environment.judged,
-        per_seed=relative,
-        relative=over_seeds(relative),
-        improvement=improvement(np.nan_to_num(per_seed(both, "won", np.sum)), played),
+        per_seed=change(means, base_means),
+        relative=estimate(relative, robots),
+        improvement=improvement(won, played),
         mine=_mean(means),
         theirs=_mean(base_means),
-        num_pairs=int(played.sum()),
+        num_pairs=int(sum(values.sum() for values in played)),
         falls=falls,
         episodes=episodes,
         base_falls=base_falls,

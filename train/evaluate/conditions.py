@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
@@ -23,6 +23,9 @@ from train.evaluate.environments import (
 )
 
 MOST_EPISODES = 100_000
+NumEpisodes = Annotated[int, quantity("1", ge=1, le=MOST_EPISODES)]
+Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
+"""Seed of the first episode; others follow."""
 """Episodes of a cell."""
 SCENARIO = "scenario."
 """Prefix of a field of the scenario that is varied, such as scenario.stiffness_scale."""
@@ -32,6 +35,9 @@ def _options(value: dict[str, Any]) -> dict[str, Any]:
     motions = {known.motion for known in ENVIRONMENTS.values()}
     _refuse(value.keys() & {*RESERVED, *motions}, "given here")
     return value
+
+
+_EnvOptions = Annotated[dict[str, Any], AfterValidator(_options)]
 
 
 def _reference(value: Any) -> Reference:
@@ -94,7 +100,7 @@ class PolicySpec(Model):
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}
     """Keyword arguments of `baselines.make`, or of one's own function."""
-    env_options: dict[str, Any] = {}
+    env_options: _EnvOptions = {}
     """Arguments of the environment for this policy alone, such as form: rigid."""
     level: bool = False
     """In a sweep: whether it plays once without the swept option, as a level to compare with."""
@@ -102,8 +108,6 @@ class PolicySpec(Model):
     """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the
     standard sensors.
     """
-
-    _checked = field_validator("env_options")(_options)
 
     @property
     def title(self) -> str:
@@ -139,7 +143,7 @@ class Condition(Model):
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
-    env_options: dict[str, Any] = {}
+    env_options: _EnvOptions = {}
     """Further arguments of the environment, such as stiffness."""
     ranges: GivenRanges = {}
     """Intervals in place of those of the scenario, where it draws robots from ranges."""
@@ -147,12 +151,10 @@ class Condition(Model):
     """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it
     one of the scenario.
     """
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    episodes: NumEpisodes = 1
     """Number of episodes [1]."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    seed: Seed = 0
     """Seed of the first episode; the next ones follow [1]."""
-
-    _checked = field_validator("env_options")(_options)
 
     def swept_values(self, names: Iterable[str]) -> list[str]:
         """Varied values as tables show them; - of what does not vary here."""
@@ -212,6 +214,13 @@ class Condition(Model):
             return self.scenario
         scenario = make_scenario(self.scenario).with_ranges(self.ranges)
         return vary_scenario(scenario, fields)
+
+    @property
+    def draws_robots(self) -> bool:
+        """True if episodes differ in their robots; on hardware there is one."""
+        known = self.environment
+        scenario = make_scenario(self.scenario_played, known.walks)
+        return not known.is_real and scenario.draws_robots
 
     @property
     def policy_options(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The environments as the commands know them: their arguments, figures and tables."""
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,12 +10,76 @@ from typing import Any, TypeAlias
 from pydantic import ConfigDict, ImportString, TypeAdapter
 
 from elastic_env import IDS
+from elastic_env.core.config import Locator, Model, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.robots.joint_robot import JointRobot
 from elastic_env.world.scenario import make_scenario
-from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
+
+ENDINGS = (".yaml", ".yml")
+"""Of files of robots."""
+
+
+class RobotFile(Model):
+    """A robot on a fixed base; keys as of `gymnasium.make("elastic_env/Robot-v0", ...)`."""
+
+    model: Locator
+    """Rigid model, a file of MJCF (.xml) or URDF (.urdf)."""
+    joints: Locator | dict[str, Any]
+    """Elastic joints: a YAML file, or a mapping from names or patterns."""
+    end_effector: Locator | None = None
+    """Site or body whose place and tilt are scored; None for the outermost body."""
+    home: dict[str, float] | list[float] | None = None
+    """Angles about which the joints follow a reference, by name or in order [rad]."""
+    load_kg: float | None = quantity("kg", None, gt=0)
+    """The scenario `payload` adds a fifth of it at the end effector [kg]."""
+    imu: Locator | None = None
+    """Site of the accelerometer."""
+
+    def arguments(self, folder: Path) -> dict[str, Any]:
+        """Arguments of the environment; files are those of a folder."""
+        given = self.model_dump(exclude_none=True)
+        files = {name: str(folder / path) for name, path in _files(given)}
+        return {**given, **files}
+
+
+def read_robot_file(name: str) -> dict[str, Any]:
+    """Arguments of `elastic_env/Robot-v0` from a file, which `--env arm.robot.yaml` names.
+
+        model: arm.xml
+        joints: arm.yaml
+        end_effector: tool
+
+    Files that it names are looked for beside it.
+
+    Raises:
+        ConfigurationError: The file is missing or does not describe a robot.
+    """
+    try:
+        return load_yaml(name, RobotFile).arguments(Path(name).parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(
+            f"--env {quote(name)[1:-1]} must be a file of a robot, with the keys model and joints:"
+            f" {error}"
+        ) from None
+
+
+def files_of_robot(name: str) -> Iterator[Path]:
+    """The files that a robot's file names, if it is one."""
+    if name.endswith(ENDINGS) and Path(name).is_file():
+        try:
+            arguments = read_robot_file(name)
+        except ConfigurationError:
+            return  # another file
+        yield from (Path(path) for _, path in _files(arguments))
+
+
+def _files(arguments: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Arguments that name a file."""
+    given = [(name, arguments[name]) for name in ("model", "joints")]
+    return [(name, value) for name, value in given if isinstance(value, str)]
+
 
 Reference: TypeAlias = str | int | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says
@@ -221,10 +285,14 @@ class _Walker(Environment):
         parts = _durations(reference)
         texts = (f"{p:g}" if isinstance(p, int | float) else str(p) for p in parts)
         label = f"{'+'.join(texts)} s"
-        steps = reference.get("num_steps") if isinstance(reference, dict) else None
+        given = reference if isinstance(reference, dict) else {}
+        steps = given.get("num_steps")
         usual = Gait.model_fields["num_steps"].default
         is_usual = steps in (None, usual, _STEPS_OF_THE_PAPER.get(label))
-        return label if is_usual else f"{label} num_steps={steps}"
+        gait = given.get("gait")
+        differs = gait if isinstance(gait, dict) else {}
+        further = {**({} if is_usual else {"num_steps": steps}), **differs}
+        return " ".join([label, *(f"{name}={value}" for name, value in further.items())])
 
     def abscissa(self, reference: Reference) -> dict[str, float]:
         return {"step_period_s": float(f"{sum(map(float, _durations(reference))):.6g}")}
@@ -251,7 +319,7 @@ def environment(name: str) -> Environment:
     """The environment of a short name, or that of a robot of one's own.
 
     Args:
-        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or
+        name: Short name; a file of a robot, see `read_robot_file`; or "FILE.py:ROBOT" or
             "module:ROBOT", a `JointRobot`, which is imported and registered.
 
     Raises:

@@ -23,8 +23,8 @@ _REPORTED = 250
 """Control steps after which progress is reported."""
 
 Progress = Callable[[int], None]
-ItemT = TypeVar("ItemT")
-KeyT = TypeVar("KeyT", bound=Hashable)
+Item = TypeVar("Item")
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass
@@ -74,9 +74,9 @@ Episodes = Sequence[tuple[Evaluation, int]]
 """Numbered episodes, each with the evaluation that it belongs to."""
 
 
-def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
+def group_by(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
     """Items by a key, in the order in which it first occurs."""
-    groups: dict[KeyT, list[ItemT]] = {}
+    groups: dict[Key, list[Item]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
     return groups

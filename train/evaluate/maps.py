@@ -6,13 +6,13 @@ An axis is a field of the scenario, such as the stiffness, or the motion, such a
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from baselines.catalogue import Track
 from baselines.options import PolicyOptions
-from elastic_env.core.config import MOST_ENTRIES, Model, Title
+from elastic_env.core.config import MOST_ENTRIES, Model, Once, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, change_of
@@ -33,7 +33,7 @@ class Axis(Model):
     """A field of the scenario, such as scenario.stiffness_scale or
     scenario.pelvis_imu.bias_spread_rad, or the motion: step_period on the walker, reference on the
     testbed."""
-    values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
+    values: Annotated[list[Any], Once] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""
     label: Title | None = None
     """Title of the axis, with its unit; None for the description of the field."""
@@ -110,9 +110,6 @@ class MapConfig(Model):
                     f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}"
                 )
             for value in axis.values:
-                if axis.values.count(value) > 1:
-                    problem = f"the value {quote(value)} of map.{name} stands twice"
-                    raise ConfigurationError(problem)
                 if axis.is_motion:
                     continue  # `references` holds and checks them
                 if isinstance(value, bool) or not isinstance(value, int | float):

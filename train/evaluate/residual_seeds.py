@@ -100,7 +100,7 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
                 policy.replace(name=f"{RESIDUAL}{own.folder}", label=policy.title),
                 Member(
                     folder=str(own.folder),
-                    training_seed=own.seed,
+                    training_seed=own.training_seed,
                     base=base.title,
                     rival=rival.title if rival in bases else None,
                 ),
@@ -141,7 +141,7 @@ class _Folder:
     description: ResidualDescription
 
     @property
-    def seed(self) -> int | None:
+    def training_seed(self) -> int | None:
         """As the residual says it, or the name of its folder."""
         if self.description.origin.seed is not None:
             return self.description.origin.seed
@@ -172,9 +172,8 @@ def _matching(pattern: str) -> list[Path]:
             disk.
     """
     if "**" in pattern:
-        raise ConfigurationError(
-            f"* stands for one part of a path, got {quote(pattern)}; leave ** out"
-        )
+        problem = f"* stands for one part of a path, got {quote(pattern)}; leave ** out"
+        raise ConfigurationError(problem)
     anchor = Path(pattern).anchor
     try:
         found = Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
@@ -223,6 +222,7 @@ def _require_one_family(pattern: str, members: Sequence[_Folder]) -> None:
     for member in members:
         mine = _kin(member.description)
         folder = member.folder
+        seed = member.training_seed
         for what in {**mine, **theirs}:
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
@@ -230,17 +230,17 @@ def _require_one_family(pattern: str, members: Sequence[_Folder]) -> None:
                     f" {shorten(folder)} is {mine.get(what)!r} and of {members[0].folder}"
                     f" {theirs.get(what)!r}; give each an entry of its own"
                 )
-        if member.seed is None:
+        if seed is None:
             raise ConfigurationError(
                 f"{folder} does not say its training seed: residual.json has no training.seed and"
                 " the path no seed_N"
             )
-        if member.seed in seen:
+        if seed in seen:
             raise ConfigurationError(
-                f"{pattern!r} matches training seed {member.seed} twice: {seen[member.seed]} and"
+                f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and"
                 f" {shorten(folder)}"
             )
-        seen[member.seed] = folder
+        seen[seed] = folder
 
 
 _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every")

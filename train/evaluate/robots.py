@@ -6,20 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from elastic_env.core.signals import Array
-from elastic_env.world.scenario import make_scenario
 from train.evaluate.changes import opponents
-from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.evaluate.statistics import Estimate, interquartile_mean, worst_share_mean
+from train.evaluate.statistics import Estimate, mean_of_part, middle_half, worst_share
 from train.evaluate.table import (
     EpisodeTable,
     Scope,
-    estimate,
     failures,
+    over_cells,
     pair,
-    per_seed,
+    per_robot,
     score,
 )
 
@@ -29,7 +26,7 @@ FEWEST_ROBOTS = 4
 
 @dataclass(frozen=True, eq=False)
 class RobotScores(Scope):
-    """A policy in one metric over the drawn robots of a cell; of residuals with intervals.
+    """A policy in one metric over the drawn robots of a cell, with intervals.
 
     Attributes:
         column: The metric.
@@ -68,7 +65,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
             (cell,) = scope.cells
             rows = table.of(policy, cell)
             is_small = len(set(rows["seed"])) < FEWEST_ROBOTS
-            if scope.swept or is_small or not _draws_robots(scope.first):
+            if scope.swept or is_small or not scope.first.draws_robots:
                 continue
             against = [other for other in others if (other, cell) in table.conditions]
             failed, episodes = failures(rows)
@@ -76,14 +73,13 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
             for column in table.environment.judged:
                 better = {}
                 for title, theirs in beside.items():
-                    share = share_better(rows, theirs, column.metric)
-                    better[title] = estimate(rows, share)
+                    better[title] = share_better(rows, theirs, column.metric)
                 scores = RobotScores(
                     **vars(scope),
                     column=column,
                     mean=score(rows, column),
-                    middle=score(rows, column, interquartile_mean),
-                    worst=score(rows, column, worst_share_mean),
+                    middle=score(rows, column, mean_of_part(middle_half)),
+                    worst=score(rows, column, mean_of_part(worst_share)),
                     failed=failed,
                     episodes=episodes,
                     better=better,
@@ -92,15 +88,15 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     return found
 
 
-def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Array:
-    """Share of common episodes in which a policy is better (lower), by training seed.
+def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Estimate:
+    """Share of the robots for which a policy is better (lower).
 
     Ties count half. To fail is worse than any value, and where both fail it is a tie. nan where
-    they have no episode in common. An episode that reached its end without a figure, such as a ZMP
+    they have no robot in common. An episode that reached its end without a figure, such as a ZMP
     of feet that never carried anything, is left out.
 
     Args:
-        mine: Episodes of one cell with `member`, `cell`, `seed`, `failed` and the metric.
+        mine: Episodes of one cell with `member`, `cell`, `robot`, `seed`, `failed` and the metric.
         base: The same of the base.
         metric: Name of the metric.
     """
@@ -108,10 +104,4 @@ def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> Array:
         rows.assign(**{metric: rows[metric].where(~rows["failed"], np.inf)})
         for rows in (mine, base)
     )
-    return per_seed(pair(mine, base, metric), "won")[:, 0]
-
-
-def _draws_robots(condition: Condition) -> bool:
-    known = condition.environment
-    scenario = condition.scenario
-    return not known.is_real and make_scenario(scenario, known.walks).draws_robots
+    return over_cells(per_robot(pair(mine, base, metric), "won"))

@@ -42,9 +42,9 @@ class Standing:
             scenarios.
         title: Words for the metric.
         metric: Its name, with its unit in SI.
-        score: Mean over scenarios of means over the episodes that did not fail; of residuals the
-            interquartile mean over training seeds with its interval; nan where a scenario has no
-            such episode.
+        score: Mean over scenarios of means over the robots that did not fail; of residuals the
+            interquartile mean over training seeds; nan where a scenario has no such episode. Its
+            interval is over training seeds and drawn robots.
         failed, episodes: Episodes that failed, and all.
         training_seeds: Of a residual; 0 of another policy.
         base: Of a residual: its change against its base.
@@ -52,6 +52,7 @@ class Standing:
             standard sensors, in the same scope and metric. It is chosen on the same episodes, which
             favours it.
         step_us: Median time of the policy alone for a control step of one world [µs].
+        interval_over: What the interval of the score is over; empty without one.
     """
 
     track: Track
@@ -69,6 +70,7 @@ class Standing:
     base: Paired | None
     rival: Paired | None
     step_us: float
+    interval_over: str = ""
 
 
 def standings(
@@ -105,6 +107,7 @@ def standings(
                 base = _paired(table, scope, scope.first.member.base, column)
                 beside = rivals.get(scope.place, [])
                 best = _paired(table, scope, _best(table, beside, column), column)
+            level = score(rows, column)
             standing = Standing(
                 track=table.condition(scope.policy).track,
                 policy=scope.policy,
@@ -114,13 +117,14 @@ def standings(
                 is_column=scope.is_group or scope.scope not in pooled,
                 title=column.title,
                 metric=column.metric,
-                score=score(rows, column),
+                score=level,
                 failed=failed,
                 episodes=episodes,
                 training_seeds=len(table.members.get(scope.policy, ())),
                 base=base,
                 rival=best,
                 step_us=step_us.get(scope.policy, float("nan")),
+                interval_over=level.over,
             )
             found.append(standing)
     return found

@@ -1,52 +1,66 @@
-"""Statistics over training seeds: changes, interquartile means, bootstrap intervals.
+"""Statistics over training seeds and robots: changes, interquartile means, bootstrap intervals.
 
-What is drawn at random in learning is the training seed, so intervals are over training seeds and
-never over the episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its
-base on the same episodes.
+Learning draws the training seed at random, and a scenario draws robots. An interval is over both
+where there are several of both, and over the one of which there are several; never over the
+episodes of one robot [Agarwal 2021, Colas 2019]. All seeds play the same robots. So a resample
+draws seeds, and robots of every cell, and crosses the two [Owen 2007]. A policy is compared with
+its base on the same episodes.
 
 [Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice", NeurIPS. [Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons
-of Reinforcement Learning Algorithms".
+of Reinforcement Learning Algorithms". [Owen 2007] A. B. Owen, "The Pigeonhole Bootstrap", Ann.
+Appl. Stat. 1(2).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
-_BOOTSTRAP: dict[str, Any] = {
-    **{"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE},
-    **{"method": "percentile", "paired": True, "vectorized": True},
-}
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
 _CUT = 0.25
 _BOOTSTRAP_SEED = 0
 
+Counts: TypeAlias = Sequence[Array]
+"""How often every robot is in each resample, (resamples, robots) for every cell."""
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure over training seeds.
+    """A figure over training seeds and drawn robots.
 
     Attributes:
         value: The figure; nan where there is none.
-        low, high: 95 % interval over training seeds; None where fewer than two of them have the
-            figure.
+        low, high: 95 % interval over seeds and robots; None where there are fewer than two of each.
+        seeds, robots: Training seeds that the interval is over, and drawn robots of all cells; 0
+            where it is not over them.
     """
 
     value: float
     low: float | None = None
     high: float | None = None
+    seeds: int = field(default=0, compare=False)
+    robots: int = field(default=0, compare=False)
 
     @property
     def has_interval(self) -> bool:
-        """True if there are training seeds enough for an interval."""
+        """True if there are training seeds or robots enough for an interval."""
         return self.low is not None
+
+    @property
+    def over(self) -> str:
+        """What the interval is over: "10 training seeds and 64 robots"; empty without one."""
+        seeds = f"{self.seeds} training seeds"
+        robots = f"{self.robots} robots"
+        return " and ".join([seeds] * bool(self.seeds) + [robots] * bool(self.robots))
 
     @property
     def is_known(self) -> bool:
@@ -68,9 +82,10 @@ class Estimate:
 
     def times(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""
-        if self.low is None or self.high is None:
-            return Estimate(factor * self.value)
-        return Estimate(factor * self.value, factor * self.low, factor * self.high)
+        ends: dict[str, Any] = {}
+        if self.low is not None and self.high is not None:
+            ends = {"low": factor * self.low, "high": factor * self.high}
+        return replace(self, value=factor * self.value, **ends)
 
 
 def change(mine: Array, base: Array) -> Array:
@@ -126,47 +141,146 @@ def over_seeds(values: Sequence[float] | Array) -> Estimate:
         values: One per training seed; those that are nan have no figure and are left out.
     """
     found = np.asarray(values, dtype=np.float64)
-    found = np.sort(found[np.isfinite(found)])
-    if len(found) == 0:
-        return Estimate(float("nan"))
-    value = float(interquartile_mean(found))
-    if len(found) < 2:
-        return Estimate(value)
-    return Estimate(value, *_interval((found,), interquartile_mean))
+    return estimate(lambda _: found[None], ())
 
 
-def improvement(won: Array, played: Array) -> Estimate:
+def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
     """Probability that an episode is better (lower) than the same with the base; ties count half.
 
     Args:
-        won: Pairs of episodes in which the policy is better, (seeds, scenarios).
-        played: Pairs of episodes, (seeds, scenarios).
+        won: Pairs of episodes in which the policy is better, (seeds, robots) for every cell.
+        played: Pairs of episodes, likewise.
 
     Returns:
-        Share of all pairs of training seed and episode, with an interval over training seeds. As in
-        `change`, seeds count that have pairs in every scenario.
+        Share of all pairs of training seed and episode, with an interval. As in `change`, seeds
+        count that have pairs in every cell.
     """
-    whole = (played > 0).all(axis=1)
-    both = np.column_stack([won[whole].sum(axis=1), played[whole].sum(axis=1)])
-    if not len(both):
+    whole = np.all([own.sum(axis=1) > 0 for own in played], axis=0)
+
+    def figures(counts: Counts) -> Array:
+        parts = [
+            sum(count @ own.T for count, own in zip(counts, cells, strict=True))
+            for cells in (won, played)
+        ]
+        return np.where(whole, np.array(parts), np.nan)
+
+    return estimate(figures, [own.shape[1] for own in played], _share)
+
+
+def _share(parts: Array, axis: int = -1) -> Any:
+    """Won over played pairs, of (2, ..., seeds)."""
+    won, played = parts.sum(axis=axis)
+    return won / played
+
+
+def mean_of_robots(values: Array, counts: Array) -> Array:
+    """Means over robots in resamples, (seeds, robots) to (resamples, seeds).
+
+    Robots that are nan have no figure and are left out; a mean of none is nan.
+    """
+    is_known = np.isfinite(values)
+    total = counts @ np.where(is_known, values, 0.0).T
+    number = counts @ is_known.T.astype(np.float64)
+    return total / np.where(number > 0.0, number, np.nan)
+
+
+Part: TypeAlias = Callable[[Array], tuple[Array, Array]]
+"""Of a sorted sample of n values, how many lie below the part that counts, and where it ends."""
+
+
+def middle_half(n: Array) -> tuple[Array, Array]:
+    """The part of `interquartile_mean`."""
+    cut = np.floor(_CUT * n)
+    return cut, n - cut
+
+
+def worst_share(n: Array) -> tuple[Array, Array]:
+    """The part of `worst_share_mean`."""
+    return n - np.maximum(WORST * n, 1.0), n
+
+
+def mean_of_part(part: Part) -> Callable[[Array, Array], Array]:
+    """A mean over a part of the robots, from the best to the worst; as `mean_of_robots`."""
+
+    def mean(values: Array, counts: Array) -> Array:
+        return np.stack([_mean_of_part(own, counts, part) for own in values], axis=-1)
+
+    return mean
+
+
+def _mean_of_part(values: Array, counts: Array, part: Part) -> Array:
+    """Means of one seed, (robots,) to (resamples,)."""
+    known = np.sort(values[np.isfinite(values)])
+    order = np.argsort(values)[: len(known)]
+    if not len(known):
+        return np.full(len(counts), np.nan)
+    own = counts[:, order]
+    above = own.cumsum(axis=1)
+    low, high = part(above[:, -1:])
+    counted = np.minimum(above, high) - np.maximum(above - own, low)
+    share = high - low
+    total = np.maximum(counted, 0.0) @ known
+    return total / np.where(share > 0.0, share, np.nan)[:, 0]
+
+
+def estimate(
+    figures: Callable[[Counts], Array],
+    robots: Sequence[int],
+    combine: Callable[..., Any] = interquartile_mean,
+) -> Estimate:
+    """A figure with its 95 % percentile bootstrap interval over training seeds and robots.
+
+    With training seeds alone it is the one of `scipy.stats.bootstrap`, bit for bit.
+
+    Args:
+        figures: Figures of every seed in resamples of the robots, (..., resamples or 1, seeds);
+            seeds that are nan with all robots are left out.
+        robots: Robots of every cell; 1 where none is drawn.
+        combine: A figure over seeds, the last axis.
+    """
+    once = np.asarray(figures([np.ones((1, number)) for number in robots]))
+    values = once.reshape(math.prod(once.shape[:-1]), once.shape[-1])
+    known = np.flatnonzero(np.isfinite(values).all(axis=0))
+    if not len(known):
         return Estimate(float("nan"))
-    samples = np.array(sorted(both.tolist())).T
-    share = float(_share(*samples))
-    if len(both) < 2:
-        return Estimate(share)
-    return Estimate(share, *_interval(tuple(samples), _share))
+    # sorted, so that the order of the files makes no difference
+    order = known[np.lexsort(values[::-1, known])]
+    value = float(np.squeeze(combine(once[..., order], axis=-1)))
+    seeds = len(order)
+    drawn = sum(number for number in robots if number > 1)
+    if seeds < 2 and not drawn:
+        return Estimate(value)
+    chosen, counts = _resamples(seeds, tuple(robots))
+    found = np.asarray(figures(counts) if drawn else once)[..., order]
+    found = np.broadcast_to(found, (*found.shape[:-2], RESAMPLES, seeds))
+    chosen = np.broadcast_to(chosen, found.shape)
+    replicates = combine(np.take_along_axis(found, chosen, axis=-1), axis=-1)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    tails = 100.0 * np.array([tail, 1.0 - tail])
+    low, high = np.percentile(replicates[np.isfinite(replicates)], tails)
+    is_of_seeds = seeds > 1
+    return Estimate(value, float(low), float(high), seeds if is_of_seeds else 0, drawn)
 
 
-def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Percentile bootstrap over training seeds; the same sorted samples give the same interval."""
-    # here: it takes half a second to load, and most programs need none of it
-    from scipy import stats
+def named_intervals(estimates: Iterable[Estimate]) -> str:
+    """What the intervals of some figures are over, such as "95 % over 64 robots"; empty if none."""
+    over = dict.fromkeys(own.over for own in estimates if own.over)
+    return f"{100.0 * CONFIDENCE:g} % over {', or '.join(over)}" if over else ""
 
+
+@lru_cache(maxsize=8)
+def _resamples(seeds: int, robots: tuple[int, ...]) -> tuple[IntArray, list[Array]]:
+    """Seeds of every resample, and how often it has each robot of every cell; always the same."""
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    found = stats.bootstrap(samples, statistic, rng=rng, **_BOOTSTRAP)
-    low, high = found.confidence_interval
-    return float(low), float(high)
+    chosen = rng.integers(0, seeds, (RESAMPLES, seeds))
+    return chosen, [_drawn_counts(rng, number) for number in robots]
 
 
-def _share(won: Array, played: Array, axis: int = -1) -> Any:
-    return won.sum(axis=axis) / played.sum(axis=axis)
+def _drawn_counts(rng: np.random.Generator, number: int) -> Array:
+    """How often each of some units is drawn in as many draws, (RESAMPLES, number)."""
+    if number == 1:
+        return np.ones((RESAMPLES, 1))
+    drawn = rng.integers(0, number, (RESAMPLES, number))
+    drawn += number * np.arange(RESAMPLES)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * number)
+    return counts.reshape(RESAMPLES, number).astype(np.float64)

@@ -9,7 +9,8 @@ deflection δ of the hip roll joint alone (the paper's θ), with leg length L, t
 Where the support foot changes, the frame is taken anew from the other foot, and the estimated
 center of mass jumps.
 
-Axes are level and have the heading of the pelvis, which no sensor of the robot shows.
+Axes are level and have the heading of the pelvis, which no sensor of the robot shows. The footholds
+are those of the plan in its local frame (`elastic_env.motion.walk_plan`).
 """
 
 from typing import Any
@@ -62,6 +63,7 @@ class SupportChanges:
 
     def __init__(self, model: WalkerModel) -> None:
         self._biped = model.biped
+        self._soles = model.plan.local.ankles[..., :2]
         self._support = model.plan.timing.support
         self._changes = set(support_changes(model.plan.timing).tolist())
         self._attitude = model.observation_table.group("imu_attitude")
@@ -84,7 +86,7 @@ class SupportChanges:
         old = int(self._support[step - 1])
         new = int(self._support[step])
         self._errors.append(frame_error(estimate, true, new))
-        self._jumps.append(com_jump(estimate, self._biped.footholds, old, new))
+        self._jumps.append(com_jump(estimate, self._soles[step], old, new))
 
     def metrics(self, world: int) -> dict[str, float]:
         """Figures of a world over its support changes so far; none without a change."""

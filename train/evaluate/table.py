@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.residual_seeds import Origin, origin
-from train.evaluate.statistics import Estimate, beats, over_seeds
+from train.evaluate.statistics import Counts, Estimate, beats, estimate, mean_of_robots
 
 Groups = Mapping[str, Sequence[str]]
 """Scenarios to pool over, by the name of the group."""
@@ -80,8 +80,8 @@ class EpisodeTable:
 
     Attributes:
         rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a
-            policy that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the
-            metrics [SI], nan where the episode failed.
+            policy that was not trained), `reference`, `scenario`, `cell`, `seed`, `robot` (which of
+            the cell's), `failed`, and the metrics [SI], nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.
@@ -108,10 +108,11 @@ class EpisodeTable:
                 "scenario": condition.scenario,
                 "cell": cell,
             }
-            records += [
-                {**episode, **labels, "failed": bool(episode["termination"])}
-                for episode in e.episodes
-            ]
+            draws_robots = condition.draws_robots
+            for episode in e.episodes:
+                robot = _robot_of(episode) if draws_robots else ""
+                failed = bool(episode["termination"])
+                records.append({**episode, **labels, "robot": robot, "failed": failed})
         self.rows = pd.DataFrame(records)
         known = self.environment
         columns = chain(known.columns, known.judged, known.also, *known.splits.values())
@@ -220,36 +221,78 @@ def per_seed(
     return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])
 
 
+def per_robot(
+    rows: pd.DataFrame, metric: str, statistic: Literal["mean", "sum", "count"] = "mean"
+) -> list[Array]:
+    """Means over the episodes of each robot, (seeds, robots) for every cell; nan without a figure.
+
+    Args:
+        rows: With `member`, `cell`, `robot` and the metric.
+        metric: Its name.
+        statistic: Over the episodes of a robot.
+    """
+    members = rows["member"].unique()
+    grouped: Any = rows.groupby(["cell", "member", "robot"])[metric]
+    found = grouped.agg(statistic)
+    return [
+        found[cell].unstack().reindex(members).to_numpy(dtype=np.float64)
+        for cell in rows["cell"].unique()
+    ]
+
+
 def score(
-    rows: pd.DataFrame, column: Column, statistic: Callable[[Array], float] = np.mean
+    rows: pd.DataFrame,
+    column: Column,
+    mean: Callable[[Array, Array], Array] = mean_of_robots,
 ) -> Estimate:
     """Mean over cells of a metric of one policy [SI]; over training seeds the interquartile mean.
 
     Args:
         rows: Rows of one policy in one or several cells.
         column: The metric.
-        statistic: Over the episodes of a cell that have a figure.
+        mean: Over the robots of a cell that have a figure, as `mean_of_robots`.
     """
-    return estimate(rows, per_seed(rows, column.metric, statistic).mean(axis=-1))
+    return over_cells(per_robot(rows, column.metric), mean)
 
 
-def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
-    """An estimate from one value per training seed; without training the value itself."""
-    return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
+def over_cells(
+    values: Sequence[Array], mean: Callable[[Array, Array], Array] = mean_of_robots
+) -> Estimate:
+    """Mean over cells of means over robots, with its interval; values as of `per_robot`."""
+
+    def figures(counts: Counts) -> Array:
+        return means_of_cells(values, counts, mean).mean(axis=0)
+
+    return estimate(figures, [own.shape[1] for own in values])
+
+
+def means_of_cells(
+    values: Sequence[Array],
+    counts: Counts,
+    mean: Callable[[Array, Array], Array] = mean_of_robots,
+) -> Array:
+    """Means over the robots of every cell, (cells, resamples, seeds)."""
+    return np.array([mean(own, count) for own, count in zip(values, counts, strict=True)])
+
+
+def _robot_of(episode: Mapping[str, Any]) -> str:
+    """Which robot an episode has: by its recorded figures, else that of its seed."""
+    figures = [(name, value) for name, value in episode.items() if name.startswith("robot_")]
+    return str(figures or episode["seed"])
 
 
 def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
     """Episodes of a policy beside those of its base with the same cell and seed.
 
     Args:
-        mine: Rows of a policy, with `member`, `cell`, `seed` and the metric.
+        mine: Rows of a policy, with `member`, `cell`, `robot`, `seed` and the metric.
         base: Rows of the base, one per cell and seed.
         metric: Name of the metric.
 
     Returns:
-        A row for each of the policy's, with `member` and `cell`, the metric as `mine` and `base`,
-        and `won`: 1 where the policy is better (lower), one half in a tie. These three are nan
-        where either has no figure.
+        A row for each of the policy's, with `member`, `cell` and `robot`, the metric as `mine` and
+        `base`, and `won`: 1 where the policy is better (lower), one half in a tie. These three are
+        nan where either has no figure.
 
     Raises:
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
@@ -260,7 +303,7 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
                 f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}"
             )
     theirs = base[["cell", "seed"]].assign(base=base[metric])
-    both = mine[["member", "cell", "seed"]].assign(mine=mine[metric])
+    both = mine[["member", "cell", "robot", "seed"]].assign(mine=mine[metric])
     both = both.merge(theirs, on=["cell", "seed"], how="left")
     both = both.assign(won=beats(both["mine"], both["base"]))
     figures = both[["mine", "base", "won"]]

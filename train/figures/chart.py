@@ -20,7 +20,8 @@ from train.figures.colours import REFERENCE, dash_of
 
 Colours = Mapping[str, str]
 """Colour of every policy."""
-Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
+Evaluations = Sequence[Evaluation]
+Cells = Mapping[str, Mapping[float | None, Evaluations]]
 """Evaluations of every policy by the value of what is swept; None where it is not swept."""
 
 
@@ -98,7 +99,7 @@ class Chart:
 
 
 def time_chart(
-    policies: Mapping[str, Sequence[Evaluation]],
+    policies: Mapping[str, Evaluations],
     signals: Sequence[TracedSignal],
     colours: Colours,
     most_points: int | None = None,
@@ -120,7 +121,7 @@ def time_chart(
     panels = []
     for signal in signals:
         curves = [
-            _median_curve(title, colours[title], own, signal, stride)
+            _trace_curve(title, colours[title], own, signal, stride)
             for title, own in policies.items()
         ]
         if signal.reference is not None:
@@ -132,36 +133,31 @@ def time_chart(
     return Chart("", "time [s]", panels, shaded=intervals(single, time_s))
 
 
-def _longest(evaluations: Sequence[Evaluation]) -> Mapping[str, Array]:
+def _longest(evaluations: Evaluations) -> Mapping[str, Array]:
     """The longest trace."""
     traces = [e.trace for e in evaluations]
     return max(traces, key=lambda trace: len(trace["time_s"]))
 
 
-def _median_curve(
-    title: str,
-    colour: str,
-    own: Sequence[Evaluation],
-    signal: TracedSignal,
-    stride: int,
+def _trace_curve(
+    title: str, colour: str, own: Evaluations, signal: TracedSignal, stride: int
 ) -> Curve:
     time_s = _longest(own)["time_s"]
     values = np.full((len(own), len(time_s)), np.nan)
     for row, e in zip(values, own, strict=True):
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
-    low, middle, high = spread(values[:, ::stride])
-    return Curve(
-        title,
-        colour,
-        time_s[::stride],
-        middle,
-        dash=dash_of(title),
-        band=(low, high) if len(own) > 1 else None,
-        fails=len(own) == 1 and own[0].first_failed,
-    )
+    look = {"dash": dash_of(title), "fails": len(own) == 1 and own[0].first_failed}
+    return _median_curve(title, colour, time_s[::stride], values[:, ::stride], **look)
 
 
-def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[float, float]:
+def _median_curve(name: str, colour: str, x: Array, values: Array, **look: Any) -> Curve:
+    """Median of values, (series, n), with the band of all where there are several."""
+    low, middle, high = quantiles(values)
+    band = (low, high) if len(values) > 1 else None
+    return Curve(name, colour, x, middle, band=band, **look)
+
+
+def _limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
     """Range of a signal and its reference, shortly before a fall left out, with a margin."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
     parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
@@ -180,7 +176,7 @@ def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
     return [(float(time[begin]), float(time[end - 1])) for begin, end in pairs]
 
 
-def spread(values: Array) -> tuple[Array, Array, Array]:
+def quantiles(values: Array) -> tuple[Array, Array, Array]:
     """Least, median and most over the first axis, nan where there is nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
@@ -188,13 +184,13 @@ def spread(values: Array) -> tuple[Array, Array, Array]:
     return low, middle, high
 
 
-def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
+def median(cell: Evaluations, column: Column) -> Estimate:
     """Median over the episodes of a cell that did not fail [SI]; nan where all did."""
     values = np.concatenate([e.values(column.metric) for e in cell])
     return Estimate(float(np.median(values)) if len(values) else float("nan"))
 
 
-Statistic = Callable[[Sequence[Evaluation], Column], Estimate]
+Statistic = Callable[[Evaluations, Column], Estimate]
 
 
 def sweep_chart(
@@ -274,11 +270,8 @@ def learning_chart(
     for column in columns:
         curves = []
         for title, found in learning.items():
-            ratios = found.ratios[column.metric]
-            low, middle, high = spread(ratios)
-            band = (low, high) if len(ratios) > 1 else None
-            line = {"band": band, "width": 2.0, "has_points": True}
-            curves.append(Curve(title, colours[title], found.decisions, middle, **line))
+            line = (title, colours[title], found.decisions, found.ratios[column.metric])
+            curves.append(_median_curve(*line, width=2.0, has_points=True))
         ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
         ratios = [own.ratios[column.metric].ravel() for own in learning.values()]
         all_ratios = np.concatenate(ratios)

@@ -1,7 +1,7 @@
 """Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,10 @@ from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.figures.chart import Chart, Curve
+from train.figures.chart import Chart, Curve, Evaluations
 from train.figures.colours import FAILED, policy_colours
 from train.runs.escaping import visible
 
-Evaluations = Sequence[Evaluation]
 MRAD = 1e3
 """Factor from rad to what figures show."""
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from baselines.identification.servo_log import ServoLog
 from elastic_env.core.signals import Array
-from train.figures.plots import MRAD, label_text, require_matplotlib, save
+from train.figures.plots import MRAD, label_text, new_figure, save
 
 _COLUMNS = 3
 _MEASURED = "#222222"
@@ -27,14 +27,11 @@ def draw_servo(
         path: PNG file.
         is_held_out: True if the replay was not fitted to them; the title says so.
     """
-    plt = require_matplotlib()
     shown = list(zip(logs, played, strict=True))[:_MOST_SHOWN]
     columns = min(_COLUMNS, len(shown))
     rows = -(-len(shown) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(4.3 * columns, 2.7 * rows + 0.4), squeeze=False
-    )
-    for axis, (log, q) in zip(axes.ravel(), shown, strict=False):
+    figure, axes = new_figure(rows, columns, (4.3 * columns, 2.7 * rows + 0.4))
+    for axis, (log, q) in zip(axes, shown, strict=False):
         goal = np.where(log.enabled, log.goal, np.nan)
         axis.plot(log.time, goal, "--", color=_GOAL, lw=1.2, label="goal")
         axis.plot(log.time, log.position, color=_MEASURED, lw=1.6, label="measured")
@@ -42,12 +39,11 @@ def draw_servo(
         rms = MRAD * float(np.sqrt(np.mean((q - log.position) ** 2)))
         gain = "" if log.gain == 1.0 else f", gain {log.gain:g}"
         axis.set_title(label_text(f"{log.name}{gain}: {rms:.1f} mrad rms"), fontsize=9)
-    for axis in axes.ravel()[len(shown) :]:
+    for axis in axes[len(shown) :]:
         axis.set_visible(False)
-    axes[0, 0].legend(fontsize=8)
+    axes[0].legend(fontsize=8)
     figure.supxlabel("time [s]", fontsize=10)
     figure.supylabel("angle [rad]", fontsize=10)
     if is_held_out:
         figure.suptitle("logs that were not fitted", fontsize=11)
-    figure.tight_layout()
     return save(figure, path)

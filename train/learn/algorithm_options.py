@@ -4,14 +4,12 @@ A number beyond its bound would become nan, or fill the memory, in the midst of 
 refused before one.
 """
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.errors import quote
 
 CONSTANTS = "CMA-ES"
 """Algorithm that searches constants instead of training a network."""
@@ -28,44 +26,24 @@ _OURS = {
 """Arguments of the algorithms that are no options, and what stands in their place."""
 
 _LARGEST_WEIGHT = 1e3
-_WIDEST = 4096
-_MOST_LAYERS = 16
 
 
-def _network(*parts: str) -> Any:
-    """Annotation of the widths of hidden layers: of all networks, or a mapping by their names."""
-
-    def require(given: Any) -> Any:
-        named = given if isinstance(given, dict) else dict.fromkeys(parts, given)
-        if named.keys() != set(parts) or not all(map(_are_widths, named.values())):
-            raise ValueError(
-                f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <="
-                f" {_WIDEST}, or a mapping of such lists by {' and '.join(parts)}, got"
-                f" {quote(given)}"
-            )
-        return given
-
-    return Annotated[Any, AfterValidator(require)]
+_Width = Annotated[int, Field(ge=1, le=4096)]
+_Widths = Annotated[list[_Width], Field(max_length=16)]
+"""Widths of the hidden layers of a network."""
 
 
-def _are_widths(given: Any) -> bool:
-    if not isinstance(given, list) or len(given) > _MOST_LAYERS:
-        return False
-    return all(type(width) is int and 1 <= width <= _WIDEST for width in given)
+class _ActorAndValue(Model):
+    pi: _Widths
+    vf: _Widths
 
 
-def _entropy_weight(given: Any) -> Any:
-    """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
-    if isinstance(given, str):
-        is_right = re.fullmatch(r"auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?", given)
-    else:
-        is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
-    if not is_right:
-        raise ValueError(
-            f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn"
-            f" it, or such as auto_0.1 to begin with it, got {quote(given)}"
-        )
-    return given
+class _ActorAndCritics(Model):
+    pi: _Widths
+    qf: _Widths
+
+
+_Auto = Annotated[str, Field(pattern=r"^auto(_|_[0-9]{1,3}(\.[0-9]{1,9})?)?$")]
 
 
 class _Options(Model):
@@ -100,7 +78,7 @@ class _NetworkOptions(Model):
 class _ActorCriticNetwork(_NetworkOptions):
     """Parameters of the network of PPO and A2C."""
 
-    net_arch: _network("pi", "vf") = [64, 64]  # pyright: ignore[reportInvalidTypeForm]
+    net_arch: _Widths | _ActorAndValue = [64, 64]
     """Widths of the hidden layers of both networks, or of actor (pi) and value (vf)."""
     share_features_extractor: bool = True
     ortho_init: bool = True
@@ -111,10 +89,7 @@ class _ActorCriticNetwork(_NetworkOptions):
 class _SACNetwork(_NetworkOptions):
     """Parameters of the networks of SAC."""
 
-    net_arch: _network("pi", "qf") = {  # pyright: ignore[reportInvalidTypeForm]
-        "pi": [64, 64],
-        "qf": [256, 256],
-    }
+    net_arch: _Widths | _ActorAndCritics = _ActorAndCritics(pi=[64, 64], qf=[256, 256])
     """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
     activation_fn: Literal["Tanh", "ReLU"] = "ReLU"
     log_std_init: float = quantity("1", -3.0, ge=-20, le=2)
@@ -171,7 +146,7 @@ class _A2C(_OnPolicy):
 
 
 class _SAC(_StableBaselines):
-    ent_coef: Annotated[Any, AfterValidator(_entropy_weight)] = "auto"
+    ent_coef: _Auto | Annotated[float, Field(ge=0, le=_LARGEST_WEIGHT)] = "auto"
     """Weight of the entropy, at most 1000; auto to learn it, auto_0.1 to begin at 0.1."""
     batch_size: int = quantity("1", 512, ge=1, le=10**7)
     """Decisions in a minibatch."""

@@ -16,9 +16,8 @@ from baselines.residual.settings import ResidualDescription
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from train.learn.algorithm_options import complete_options
-from train.learn.finite import require_finite
 from train.learn.train_config import first_episode, joints_of, training_worlds
-from train.learn.trainer import Trainer
+from train.learn.trainer import Trainer, require_finite
 
 _TOLD = "told.json"
 _FALL_COST = 1e6
@@ -79,7 +78,7 @@ class ConstantSearch(Trainer):
 
     def _write(self, checkpoint: Path) -> None:
         """Write the costs that the search was told: from its seed and these, its state follows."""
-        told = {"decisions": self.done, "best": self._scores.best, "told": self._told}
+        told = {"decisions": self.done, "best": self._best, "told": self._told}
         (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
 
     def _read(self, checkpoint: Path) -> None:
@@ -87,7 +86,7 @@ class ConstantSearch(Trainer):
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
         self._done = state["decisions"]
-        self._scores.best = state["best"]
+        self._best = state["best"]
 
     def _ask(self) -> Array:
         """Candidates of a generation, (population, constants)."""

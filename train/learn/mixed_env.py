@@ -80,14 +80,12 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     @property
     def assumed_model(self) -> RobotModel:
         """The robot as a compensator may know it; the same in all environments."""
-        model: RobotModel = self.envs[0].assumed_model
-        return model
+        return self.envs[0].assumed_model
 
     @property
     def task(self) -> Task:
         """The rules of the first environment, whose length and observation are those of all."""
-        task: Task = self.envs[0].task
-        return task
+        return self.envs[0].task
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

@@ -1,6 +1,6 @@
 """`elastic train`: the training seeds of configurations, in turn or side by side, resumable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from train.evaluate.environments import environment
+from train.evaluate.episodes import Progress
 from train.evaluate.progress import read_progress
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig
@@ -132,7 +133,7 @@ def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
             threads = executors.threads_per_call(len(calls))
             given = [(run.here, seed, threads) for run, seed in calls]
             watch = _watch(names, console, show)
-            with executors.open(len(given), runs[0].folder) as pool:
+            with executors.open_pool(len(given), runs[0].folder) as pool:
                 # Ctrl-C ends at once: a seed may take hours, and goes on from its checkpoint
                 outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
             _raise_first(names, outcomes)
@@ -164,7 +165,7 @@ def _raise_first(names: Sequence[str], outcomes: Sequence[Outcome | None]) -> No
             raise error
 
 
-def _train_seed(run: Run, seed: int, threads: int, report: Callable[[int], None]) -> None:
+def _train_seed(run: Run, seed: int, threads: int, report: Progress) -> None:
     """Train a seed, or go on with it.
 
     A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed

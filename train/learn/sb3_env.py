@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from elastic_env.core.errors import ConfigurationError
-from train.learn.finite import require_finite
+from train.learn.trainer import require_finite
 
 _NOTHING: dict[str, Any] = {}
 

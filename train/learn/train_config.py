@@ -8,22 +8,21 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 import baselines
 from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import Entries, Locator, Title, quantity
-from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.config import Entries, Locator, Once, Title, quantity
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
-    MOST_EPISODES,
     Condition,
     GivenRanges,
     GivenReference,
+    NumEpisodes,
     PolicySpec,
     require_drawn,
 )
 from train.evaluate.environments import environment
 from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
-from train.runs.kinds import is_a
-from train.runs.user_code import CodeNamingModel
+from train.runs.user_code import CodeNamingModel, is_a
 
 FIRST_TRAINING_SEED = 10_000_000
 EVALUATION_SEED = 50_000
@@ -72,11 +71,11 @@ class TrainConfig(CodeNamingModel):
     """Worlds, shared out to the scenarios."""
     decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
     """Decisions of all worlds together."""
-    seeds: Entries[Annotated[int, Field(ge=0, lt=2**32)]] = [0]
+    seeds: Annotated[Entries[Annotated[int, Field(ge=0, lt=2**32)]], Once] = [0]
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between evaluations."""
-    evaluation_episodes: int = quantity("1", 4, ge=1, le=MOST_EPISODES)
+    evaluation_episodes: NumEpisodes = 4
     """Episodes per scenario in an evaluation."""
     checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS)
     """Decisions between checkpoints.
@@ -88,17 +87,8 @@ class TrainConfig(CodeNamingModel):
     _checked = field_validator("base")(require_plain_base)
 
     @model_validator(mode="after")
-    def _weights_are_of_scenarios(self) -> Self:
-        for name in self.weights:
-            if name not in self.scenarios:
-                raise ValueError(
-                    f"weights must be of scenarios that are learned from, {quote(self.scenarios)},"
-                    f" got {quote(name)}"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _ranges_are_of_a_scenario(self) -> Self:
+    def _scenarios_fit(self) -> Self:
+        require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
         return self
 
@@ -108,16 +98,6 @@ class TrainConfig(CodeNamingModel):
         cls, options: dict[str, Any], others: ValidationInfo
     ) -> dict[str, Any]:
         return checked_options(str(others.data.get("algorithm")), options)
-
-    @field_validator("seeds")
-    @classmethod
-    def _each_seed_once(cls, seeds: list[int]) -> list[int]:
-        if len(set(seeds)) < len(seeds):
-            raise ValueError(
-                "every training seed has a folder of its own and can stand but once, got"
-                f" {quote(seeds)}"
-            )
-        return seeds
 
     @property
     def names_of_code(self) -> list[str]:
@@ -180,8 +160,7 @@ def first_episode(seed: int) -> int:
 
 def joints_of(worlds: Any) -> list[str]:
     """Names of the joints of the robot that is trained on."""
-    names: list[str] = worlds.unwrapped.assumed_model.joint_names
-    return names
+    return worlds.unwrapped.assumed_model.joint_names
 
 
 def training_worlds(

@@ -1,19 +1,63 @@
-"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints."""
+"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints.
 
+Policies are evaluated on episodes that the training never learns from; the best and the last one
+are kept.
+"""
+
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
+from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription
-from elastic_env.core.errors import ElasticError, shorten
+from elastic_env.core.errors import ConfigurationError, ElasticError, shorten
+from elastic_env.core.files import read_bounded, write_whole
+from elastic_env.core.signals import Array, BoolArray
+from train.evaluate.conditions import Condition
+from train.evaluate.environments import environment
+from train.evaluate.progress import MOST_BYTES, PROGRESS
+from train.evaluate.rollout import control_steps, make_policy
 from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
-from train.learn.finite import DivergedError
-from train.learn.scores import Scores
+from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
+from train.runs.folders import provenance
+
+
+class DivergedError(ElasticError):
+    """A quantity of a training is no longer a finite number.
+
+    Args:
+        quantity: What it is, such as the reward.
+    """
+
+    def __init__(self, quantity: str) -> None:
+        super().__init__(f"{quantity} is not a finite number")
+        self.quantity = quantity
+
+
+def require_finite(quantity: str, values: Any) -> None:
+    """Refuse nan and infinity among the numbers of a training.
+
+    Raises:
+        DivergedError: There is one.
+    """
+    if not np.isfinite(values).all():
+        raise DivergedError(quantity)
+
 
 CHECKPOINT = "checkpoint"
 """Folder, within that of a training seed, to go on from."""
+_Scored = tuple[Array, Array]
+"""Means of metrics over the episodes that did not fail, (scenarios, metrics), and how many did,
+(scenarios,).
+"""
 
 
 class Trainer(ABC):
@@ -22,7 +66,8 @@ class Trainer(ABC):
     Args:
         config: What is trained.
         seed: Training seed.
-        folder: Where its files go; one with a checkpoint is gone on with.
+        folder: Where its files go: `progress.csv`, `best/`, `last/` and the checkpoint, with which
+            it goes on.
         threads: Threads of the physics, 0 for all cores; the result does not depend on it.
     """
 
@@ -30,8 +75,13 @@ class Trainer(ABC):
         self.config = config
         self.folder = folder
         self._seed = seed
-        self._scores = Scores(config, seed, folder, threads)
+        self._threads = threads
         self._kept: int | None = None
+        self._provenance = provenance(seed)
+        self._table = ""
+        self._base: _Scored | None = None
+        self._best: float | None = None
+        """Score of the best policy so far: mean ratio to the base, and what falls cost."""
         self._prepare(threads)
         folder.mkdir(parents=True, exist_ok=True)
         self._go_on()
@@ -57,7 +107,7 @@ class Trainer(ABC):
                 self.checkpoint()
             if progress is not None:
                 progress(self.done)
-        self._scores.keep("last", self.done, self._policy())
+        self._keep_policy("last")
 
     @property
     @abstractmethod
@@ -84,7 +134,7 @@ class Trainer(ABC):
             except (LookupError, TypeError, ValueError, RuntimeError) as error:
                 raise damage_error(path, f"{type(error).__name__}: {error}") from error
             self._kept = self.done
-        self._scores.forget_after(self.done)
+        self._forget_later_scores()
 
     def _divergence_text(self, quantity: str) -> str:
         """The sentence for a quantity that is no longer finite."""
@@ -119,8 +169,124 @@ class Trainer(ABC):
         """The present policy, as it is exported."""
 
     def _evaluate(self) -> None:
-        """Score the present policy."""
-        self._show(self._scores.evaluate(self.done, self._policy()))
+        """Score the present policy, and keep it where it is the best so far.
+
+        A residual begins as its base, within a hundredth of its range: before the first decision
+        the base's score is its own.
+        """
+        current = self._keep_policy("current")
+        columns = [column.metric for column in environment(self.config.env).judged]
+        if self._base is None:
+            self._base = self._play_policy(self.config.base, columns)
+        base, base_failed = self._base
+        mine, failed = self._base
+        if self.done > 0:
+            mine, failed = self._play_policy(f"residual:{current}", columns)
+        names = self.config.scenarios
+        table = pd.DataFrame({"decisions": self.done, "scenario": names})
+        table[columns] = mine
+        table[[f"base_{name}" for name in columns]] = base
+        table = table.assign(failed=failed, base_failed=base_failed)
+        self._table += table.to_csv(index=False, header=not self._table, na_rep="nan")
+        write_whole(self.folder / PROGRESS, self._table)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = mine / base
+        score = float((np.nan_to_num(ratios, nan=10.0).mean(axis=1) + failed).mean())
+        if self._best is None or score < self._best:
+            self._best = score
+            self._keep_policy("best")
+        shutil.rmtree(current)
+        changes = {"failed": float(failed.sum())}
+        for name, ratio in zip(columns, ratios.mean(axis=0).tolist(), strict=True):
+            if np.isfinite(ratio):
+                changes[f"{name}_change"] = ratio - 1.0
+        self._show(changes)
 
     def _show(self, changes: Mapping[str, float]) -> None:  # noqa: B027  who has curves shows them
-        """Show the scores of an evaluation beside the curves of the training."""
+        """Show the scores of an evaluation beside the curves of the training.
+
+        Args:
+            changes: METRIC_change of every judged metric: relative to the base's, [1], mean over
+                the scenarios; negative is better. One is left out where all episodes of a scenario
+                failed. And `failed`: how many did.
+        """
+
+    def _keep_policy(self, name: str) -> Path:
+        """Write the present policy as a folder, replacing the one of that name."""
+        tensors, description = self._policy()
+        recorded = self.config.model_dump(mode="json")
+        training = {"config": recorded, "decisions": self.done, **self._provenance}
+        fresh = self.folder / f"{name}.new"
+        shutil.rmtree(fresh, ignore_errors=True)
+        save_residual(fresh, description.replace(training=training), tensors)
+        shutil.rmtree(self.folder / name, ignore_errors=True)
+        return fresh.rename(self.folder / name)
+
+    def _forget_later_scores(self) -> None:
+        """Drop evaluations that were made after a checkpoint; they will be made again.
+
+        Raises:
+            ConfigurationError: Their table is no text, no plain file, or too large.
+        """
+        path = self.folder / PROGRESS
+        try:
+            content = read_bounded(path, MOST_BYTES)
+        except FileNotFoundError:
+            return
+        try:
+            lines = content.decode("utf-8").splitlines(keepends=True)
+            whole = [line for line in lines[1:] if line.endswith("\n")]
+            kept = [line for line in whole if int(line.split(",")[0]) <= self.done]
+        except ValueError as error:
+            problem = f"{path} is no table of evaluations ({error}); remove it"
+            raise ConfigurationError(problem) from None
+        if self.done == 0 or not lines:
+            path.unlink()
+            return
+        self._table = "".join([lines[0], *kept])
+        write_whole(path, self._table)
+
+    def _play_policy(self, policy: str, metrics: list[str]) -> _Scored:
+        """Scores of a policy in every scenario."""
+        conditions = [self.config.condition(name, policy) for name in self.config.scenarios]
+        results = play_together(conditions, metrics, self._threads)
+        means = [
+            [np.mean(some) if len(some) else np.nan for some in scores[~failed].T]
+            for scores, failed in results
+        ]
+        return np.array(means), np.array([failed.sum() for _, failed in results])
+
+
+def play_together(
+    conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
+) -> list[tuple[Array, BoolArray]]:
+    """Play the episodes of several conditions at once: scores as of `evaluate`, without traces.
+
+    Args:
+        conditions: Cells of one environment, motion and policy.
+        metrics: Names of scores.
+        num_threads: Threads, 0 for all cores.
+
+    Returns:
+        For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
+    """
+    sizes = [condition.episodes for condition in conditions]
+    spans = [range(own.seed, own.seed + own.episodes) for own in conditions]
+    seeds = [*chain(*spans)]
+    values = np.full((len(seeds), len(metrics)), np.nan)
+    failed = np.zeros(len(seeds), dtype=np.bool_)
+    playing = np.ones_like(failed)
+    with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
+        policy = make_policy(conditions[0].policy, worlds)
+        for step in control_steps(worlds, policy, seeds):
+            first = playing & step.is_over
+            if first.any():
+                found = step.info["episode_metrics"]
+                scores = np.stack([found[name] for name in metrics], axis=1)
+                values[first] = scores[first]
+                failed[first] = step.terminated[first]
+                playing &= ~first
+            if not playing.any():
+                break
+    parts = np.cumsum(sizes)[:-1]
+    return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))

@@ -27,7 +27,6 @@ from baselines.residual.settings import ResidualDescription
 from train.learn.algorithm_options import complete_options
 from train.learn.checkpoint import read_state, write_state
 from train.learn.export import algorithm_class, name_options, network_of
-from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.train_config import (
     FIRST_TRAINING_SEED,
@@ -35,7 +34,7 @@ from train.learn.train_config import (
     joints_of,
     training_worlds,
 )
-from train.learn.trainer import Trainer
+from train.learn.trainer import Trainer, require_finite
 
 _OF_MODEL = ("num_timesteps", "_n_updates", "_episode_num")
 """Attributes of an algorithm of SB3 that a training goes on from."""
@@ -170,7 +169,7 @@ class Training(Trainer):
         state = {
             "model": {name: getattr(model, name) for name in _OF_MODEL},
             "statistics": [[s.mean, s.var, float(s.count)] for s in self._statistics],
-            "best": self._scores.best,
+            "best": self._best,
             "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002
             "python": _to_lists(random.getstate()),
             "actions": model.action_space.np_random.bit_generator.state,
@@ -189,7 +188,7 @@ class Training(Trainer):
             setattr(model, name, value)
         for rms, own in zip(self._statistics, state["statistics"], strict=True):
             rms.mean, rms.var, rms.count = own
-        self._scores.best = state["best"]
+        self._best = state["best"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_to_tuples(state["python"]))
         model.action_space.np_random.bit_generator.state = state["actions"]

@@ -11,7 +11,7 @@ from train.evaluate import changes as terms
 from train.evaluate.changes import Change, by_line, percent_interval, signed_interval
 from train.evaluate.episodes import group_by
 from train.evaluate.maps import HeatMap
-from train.evaluate.statistics import Estimate
+from train.evaluate.statistics import Estimate, named_intervals
 from train.report.table_formats import Cell, Head, Part, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
@@ -80,7 +80,7 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
     heads += [Head(name.replace("_", " ")) for name in swept]
     heads += [Head("metric", is_number=False)]
     heads += [Head(name) for name in ("base → policy", "change", "better than base")]
-    heads += [Head(f"{rows[0].failure} (base)")]
+    heads += [Head("95 % over"), Head(f"{rows[0].failure} (base)")]
     heads += [Head("what it shows", is_number=False)] * is_family
     lines = []
     blocks = group_by(rows, lambda row: (row.policy, row.base))
@@ -94,7 +94,8 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
             cells: list[Cell] = [row.reference, _scope(row)]
             cells += [*row.first.swept_values(swept), row.column.title, _means(row)]
             cells += [(Part(percent_interval(row.relative), row.verdict),)]
-            cells += [percent_interval(row.improvement, signed=False), (failed,)]
+            cells += [percent_interval(row.improvement, signed=False)]
+            cells += [row.relative.over or "-", (failed,)]
             cells += [row.sentence] if is_family else []
             lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
     return Table(tuple(heads), tuple(lines), keys=3 + len(swept), kind="changes")
@@ -123,8 +124,9 @@ def _means(row: Change) -> str:
 def _seeds(rows: Sequence[Change]) -> str:
     seeds = sorted({row.num_seeds for row in rows})
     if seeds == [1]:
-        return "one training seed, no interval"
-    return f"interquartile mean and 95 % interval over {'/'.join(map(str, seeds))} training seeds"
+        named = named_intervals(row.relative for row in rows)
+        return f"one training seed, {named or 'no interval'}"
+    return f"interquartile mean with interval, {named_intervals(row.relative for row in rows)}"
 
 
 def _opponent(rows: Sequence[Change]) -> str:
@@ -169,6 +171,7 @@ def _record(row: Change, swept: Sequence[str]) -> dict[str, object]:
         "mean": row.mine,
         **row.relative.record("change"),
         **row.improvement.record("improvement"),
+        "interval_over": row.relative.over,
         "training_seeds": row.num_seeds,
         "pairs": row.num_pairs,
         "failed": row.falls,
@@ -209,6 +212,7 @@ def _map_records(found: HeatMap) -> Iterator[dict[str, object]]:
                     "metric": found.column.metric,
                     "policy": title,
                     **estimate.record("mean"),
+                    "interval_over": estimate.over,
                     "failed": failed,
                     "episodes": episodes,
                     "is_best": title == cell.best,

@@ -135,7 +135,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
             dots.append(Dot(row, shown, text, text_x, policy, colours[policy], symbol))
         panels.append((axis, dots))
     chart = _dot_plot(
-        {row: chart_text(specs.shorten(policy)) for row, policy, _ in rungs},
+        {row: chart_text(specs.cut_name(policy)) for row, policy, _ in rungs},
         panels,
         left=8 * min(max(map(len, table.policies)), LONGEST_NAME) + 24,
         height=70 + (24 if len(rungs) < 40 else 19) * (place + 1.0),

@@ -1,16 +1,13 @@
 """The leaderboard as tables for the report, as CSV and as Markdown."""
 
-import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from baselines.catalogue import Track
-from elastic_env.core.errors import ConfigurationError, shorten
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
@@ -20,10 +17,10 @@ from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
-from train.report.table_formats import Head, Part, Row, Table, print_table, to_markdown
+from train.report.table_formats import Head, Part, Row, Table, print_table
 from train.runs.escaping import write_records
 
-_COLUMNS = {
+COLUMNS = {
     "is_group": ("pooled",),
     "is_column": ("column",),
     "score": ("mean", "low", "high"),
@@ -166,7 +163,9 @@ def legend(found: Sequence[Standing]) -> str:
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in single})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
     episodes = f"episodes of a scenario, per training seed: {span}"
-    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}"
+    over = dict.fromkeys(s.interval_over for s in found if s.interval_over)
+    intervals = f" Intervals are 95 % over {', or '.join(over)}." if over else ""
+    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}"
 
 
 def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
@@ -175,7 +174,7 @@ def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
     page.add("table", board(found))
     claims = claims_table(found)
     if claims.rows:
-        page.add("text", _paired_text(), "What learning adds")
+        page.add("text", paired_text(), "What learning adds")
         page.add("table", claims)
     single = scenarios_board(found)
     if single is not None:
@@ -187,15 +186,11 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
     """The tables of the leaderboard, without a title."""
     page = Page("", "")
     add_leaderboard(page, found)
-    return "\n\n".join(page.sections[0].markdown[1:]) + "\n"
+    return "\n\n".join(page.sections[0].as_markdown[1:]) + "\n"
 
 
-def claims_markdown(found: Sequence[Standing]) -> str:
-    """The paired changes of residuals, as a table."""
-    return f"{_paired_text()}\n\n{to_markdown(claims_table(found))}\n"
-
-
-def _paired_text() -> str:
+def paired_text() -> str:
+    """The paragraph above the paired changes."""
     return TEXTS["paired"].format(signs=SIGNS_ARE)
 
 
@@ -205,10 +200,10 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
-    """Write `leaderboard.csv`, and from it `leaderboard.md`, so that they agree."""
+    """Write `leaderboard.csv` and `leaderboard.md`."""
     table = write_records(list(map(_record, found)), folder / "leaderboard.csv")
     text = folder / "leaderboard.md"
-    board = leaderboard_markdown(read_leaderboard(table))
+    board = leaderboard_markdown(found)
     write_whole(text, f"# Leaderboard\n\n{board}")
     return [table, text]
 
@@ -216,7 +211,7 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
 def _record(standing: Standing) -> dict[str, str]:
     record = {}
     for name, value in vars(standing).items():
-        columns = _COLUMNS.get(name, (name,))
+        columns = COLUMNS.get(name, (name,))
         record |= dict(zip(columns, _cells(value, len(columns)), strict=True))
     return {**record, "step_us": f"{standing.step_us:.3g}"}
 
@@ -229,45 +224,3 @@ def _cells(value: Any, number: int) -> list[str]:
         figures = (value.value, value.low, value.high)
         return ["" if figure is None else f"{figure:.6g}" for figure in figures]
     return [""] * number if value is None else [str(value)]
-
-
-def read_leaderboard(path: Path) -> list[Standing]:
-    """The rows of a `leaderboard.csv`.
-
-    Raises:
-        ConfigurationError: It is none.
-    """
-    with path.open(newline="", encoding="utf-8") as file:
-        try:
-            found = [_standing(row) for row in csv.DictReader(file)]
-        except ValidationError as error:
-            said = error.errors()[0]["msg"]
-            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {said}") from None
-        except (KeyError, TypeError, ValueError) as error:
-            problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
-            raise ConfigurationError(problem) from None
-    if not found:
-        raise ConfigurationError(f"{shorten(path)} has no rows")
-    return found
-
-
-def _standing(row: Mapping[str, str]) -> Standing:
-    fields = {}
-    for name in Standing.__dataclass_fields__:
-        cells = [row[column] for column in _COLUMNS.get(name, (name,))]
-        fields[name] = _FIELDS[len(cells)](*cells)
-    return _STANDING.validate_python(fields)
-
-
-def _estimate(value: str, low: str, high: str) -> Estimate:
-    ends = (float(low), float(high)) if low else ()
-    return Estimate(float(value), *ends)
-
-
-def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
-    return Paired(to, _estimate(value, low, high), verdict) if to else None
-
-
-_FIELDS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
-"""Fields from so many columns."""
-_STANDING = TypeAdapter(Standing)

@@ -36,7 +36,7 @@ class Part:
     is_open: bool = False
 
     @property
-    def markdown(self) -> list[str]:
+    def as_markdown(self) -> list[str]:
         """Blocks of Markdown; none of a chart."""
         if self.kind in ("caption", "chart"):
             return []
@@ -62,9 +62,9 @@ class Section:
     parts: list[Part] = field(default_factory=list)
 
     @property
-    def markdown(self) -> list[str]:
+    def as_markdown(self) -> list[str]:
         """Blocks of Markdown; none of a section of charts."""
-        blocks = [block for part in self.parts for block in part.markdown]
+        blocks = [block for part in self.parts for block in part.as_markdown]
         text = [markdown_text(self.text)] if self.text else []
         return [f"## {markdown_text(self.title)}", *text, *blocks] if blocks else []
 
@@ -94,9 +94,9 @@ class Page:
         """The whole page, with the source of plotly.js in it."""
         return load_template().render(page=self, plotly_js=plotly_js)
 
-    def markdown(self) -> str:
+    def as_markdown(self) -> str:
         """The texts and tables of the page."""
-        blocks = [block for section in self.sections for block in section.markdown]
+        blocks = [block for section in self.sections for block in section.as_markdown]
         return "\n\n".join([f"# {markdown_text(self.title)}", *blocks]) + "\n"
 
 

@@ -96,7 +96,7 @@ class Results:
         }
 
     @property
-    def judged(self) -> list[Change]:
+    def judged_changes(self) -> list[Change]:
         """Changes of residuals in what policies are judged by."""
         return [row for row in self.changes if row.is_family and row.is_judged]
 
@@ -154,7 +154,7 @@ def _scores(rows: pd.DataFrame, column: Column) -> Scores:
 
 def _learning_sentence(results: Results) -> str:
     """Change by learning in the first judged metric, or that there are too few training seeds."""
-    rows = [row for row in results.judged if not row.is_rival]
+    rows = [row for row in results.judged_changes if not row.is_rival]
     if not rows:
         return ""
     row = next((row for row in rows if row.is_group), rows[0])
@@ -205,7 +205,7 @@ def in_short(results: Results) -> list[str]:
     """Gains by learning in a sentence each; then how many cells are better or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)]
     found += claims(results)
-    pairs = group_by(results.judged, lambda row: (row.policy, row.is_rival))
+    pairs = group_by(results.judged_changes, lambda row: (row.policy, row.is_rival))
     for rows in pairs.values():
         for own in group_by(rows, lambda row: row.column).values():
             found += _of_a_metric(results, own)
@@ -259,8 +259,8 @@ def claims(results: Results) -> list[str]:
 
     Scopes are the groups; without groups the scenarios, where there are few.
     """
-    rivals = [row for row in results.judged if row.is_rival]
-    others = [row for row in results.judged if not row.is_rival]
+    rivals = [row for row in results.judged_changes if row.is_rival]
+    others = [row for row in results.judged_changes if not row.is_rival]
     bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
     shown = [row for row in rivals if row.is_group]
     if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:

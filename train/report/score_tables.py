@@ -12,7 +12,7 @@ from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
-from train.figures.chart import spread
+from train.figures.chart import quantiles
 from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
 
@@ -27,10 +27,12 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
                     own = table.of(policy, cell)
                     condition = table.conditions[policy, cell]
                     values = condition.swept_values(table.swept)
-                    figures = [number_interval(score(own, c), c) for c in columns]
-                    rows.append([reference, scenario, policy, *values, *figures])
+                    scores = {column: score(own, column) for column in columns}
+                    figures = [number_interval(found, column) for column, found in scores.items()]
+                    over = next((found.over for found in scores.values() if found.over), "-")
+                    rows.append([reference, scenario, policy, *values, *figures, over])
     labels = [column.label for column in columns]
-    head = ["reference", "scenario", "policy", *table.swept, *labels]
+    head = ["reference", "scenario", "policy", *table.swept, *labels, "95 % over"]
     return Table.plain(head, rows, words=3 + len(table.swept))
 
 
@@ -39,7 +41,7 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
     rows = []
     for title, curves in learning.items():
         for column in columns:
-            best, median, worst = spread(curves.ratios[column.metric])
+            best, median, worst = quantiles(curves.ratios[column.metric])
             for at, *values in zip(curves.decisions, median, best, worst, strict=True):
                 figures = (f"{value:.2f}" for value in values)
                 rows.append([title, column.title, f"{at:.0f}", *figures])
@@ -50,7 +52,7 @@ def learning_table(learning: Mapping[str, Curves], columns: Sequence[Column]) ->
 def robots_table(found: Sequence[RobotScores]) -> Table:
     """All scores over drawn robots, a row per cell and metric."""
     figures = ("mean", "interquartile mean", "worst tenth", found[0].failure)
-    head = ["reference", "scenario", "policy", "metric", *figures]
+    head = ["reference", "scenario", "policy", "metric", *figures, "95 % over"]
     rows = []
     for row in found:
         names = (row.reference, row.scope, row.policy, row.column.label)
@@ -60,7 +62,8 @@ def robots_table(found: Sequence[RobotScores]) -> Table:
             for title, share in row.better.items()
         ]
         others = "; ".join(better) or "-"
-        rows.append(Row((*names, *scores, f"{row.failed}/{row.episodes}", others)))
+        failed = f"{row.failed}/{row.episodes}"
+        rows.append(Row((*names, *scores, failed, row.mean.over or "-", others)))
     heads = Table.plain(head, [], words=4).heads
     return Table((*heads, Head("better than", is_number=False)), tuple(rows), keys=4)
 
@@ -81,7 +84,8 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
             cells = (figures[column] for column in columns)
             rows.append(Row((policy, *cells, failed)))
     figures = "mean / interquartile mean / mean of the worst tenth"
-    title = f"over the drawn robots that did not fail: {figures}"
+    number = max(row.mean.robots for row in found)
+    title = f"over up to {number} drawn robots, those that did not fail: {figures}"
     print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
 
 
@@ -109,6 +113,7 @@ def _records(row: RobotScores) -> Iterator[dict[str, object]]:
             **row.mean.record("mean"),
             **row.middle.record("interquartile_mean"),
             **row.worst.record("worst_tenth"),
+            "interval_over": row.mean.over,
             "failed": row.failed,
             "episodes": row.episodes,
             "against": other,

@@ -30,7 +30,7 @@ def page_chart(chart: Chart) -> Spec:
     curves = [curve for panel in chart.panels for curve in panel.curves]
     names = dict.fromkeys(curve.name for curve in curves if curve.name)
     legend_rows = -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW)
-    rows = [shorten(row) for panel in chart.panels for row in panel.rows]
+    rows = [cut_name(row) for panel in chart.panels for row in panel.rows]
     left = max(76, 7.4 * max(map(len, rows), default=0) + 20)
     layout = base_layout(left=left, top=28 + 20 * legend_rows, bottom=50)
     total = sum(panel.height for panel in chart.panels)
@@ -65,7 +65,7 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
     if panel.is_log:
         options = {"type": "log", "dtick": "D2", "tickformat": "~r"}
     if panel.rows:
-        titles = [chart_text(shorten(row)) for row in panel.rows]
+        titles = [chart_text(cut_name(row)) for row in panel.rows]
         places = list(range(len(titles)))
         options = {"tickvals": places, "ticktext": titles, "showgrid": False}
     if panel.limits is not None:
@@ -76,9 +76,10 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
-    where = {"type": "scatter", "yaxis": f"y{axis}", **_abscissa(curve.x)}
     line = {
-        **where,
+        "type": "scatter",
+        "yaxis": f"y{axis}",
+        **_abscissa(curve.x),
         "mode": "lines+markers" if curve.has_points else "lines",
         "y": numbers(curve.y),
         "name": chart_text(curve.name),
@@ -93,14 +94,8 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
         return [{**line, "mode": "markers", "marker": marker, "hoverinfo": "skip"}]
     if curve.band is None:
         return [line]
-    hidden = {
-        **where,
-        "mode": "lines",
-        "legendgroup": curve.name,
-        "showlegend": False,
-        "hoverinfo": "skip",
-        "line": {"width": 0},
-    }
+    style = {"mode": "lines", "showlegend": False, "hoverinfo": "skip"}
+    hidden = {**line, **style, "line": {"width": 0}}
     low, high = map(numbers, curve.band)
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
     return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
@@ -120,7 +115,7 @@ def _shade(begin: float, end: float) -> Spec:
     return {"type": "rect", **x, **y, **look}
 
 
-def shorten(name: str) -> str:
+def cut_name(name: str) -> str:
     """The end of a name that is too long: of a path it is what differs."""
     return name if len(name) <= LONGEST_NAME else "…" + name[1 - LONGEST_NAME :]
 

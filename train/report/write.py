@@ -61,7 +61,7 @@ def write_report(results: Results) -> list[Path]:
     text = results.folder / "report.md"
     content = _page(results)
     write_whole(page, content.html(require_plotly()))
-    write_whole(text, content.markdown())
+    write_whole(text, content.as_markdown())
     return [page, text]
 
 

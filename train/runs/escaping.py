@@ -83,15 +83,6 @@ def _escape(found: re.Match[str]) -> str:
     return f"{sign}\\" if sign == "]" else f"\\{sign}"
 
 
-_Row = Sequence[str]
-
-
-def markdown_table(head: _Row, rules: _Row, rows: Iterable[_Row]) -> str:
-    """A table of plain texts; `rules` say how columns are aligned, such as "---:"."""
-    above, *below = [[markdown_text(cell) for cell in row] for row in (head, *rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (above, rules, *below))
-
-
 def script_json(value: Any) -> str:
     """JSON within a script element: nothing in it ends the element or begins a comment."""
     plain = {"ensure_ascii": False, "separators": (",", ":"), "allow_nan": False}

@@ -121,10 +121,9 @@ def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
         while not _take_lock(file):
             if time.monotonic() >= last:
                 holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
-                raise ConfigurationError(
-                    f"another program, process {holder}, works on {folder}; wait until it has"
-                    " ended, or end it"
-                )
+                problem = f"another program, process {holder}, works on {folder}"
+                cure = "wait until it has ended, or end it"
+                raise ConfigurationError(f"{problem}; {cure}")
             time.sleep(_RETRY_S)
         file.truncate(0)
         file.write(f"{os.getpid()} of {platform.node()}\n")

@@ -127,29 +127,21 @@ def say_what_is_compiled(console: Console) -> Iterator[None]:
     Args:
         console: Where it is said.
     """
-    handler = _FirstRecord(console)
+    said: list[str] = []
+
+    def show(record: logging.LogRecord) -> bool:
+        if not said:
+            said.append(record.getMessage())
+            # nobody reads: no reason to end what is compiled
+            with contextlib.suppress(OSError):
+                console.print(said[0], soft_wrap=True)
+        return True
+
     level = _COMPILER.level
-    _COMPILER.addHandler(handler)
+    _COMPILER.addFilter(show)
     _COMPILER.setLevel(logging.INFO)
     try:
         yield
     finally:
-        _COMPILER.removeHandler(handler)
+        _COMPILER.removeFilter(show)
         _COMPILER.setLevel(level)
-
-
-class _FirstRecord(logging.Handler):
-    """Shows the first record and no other."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(logging.INFO)
-        self._console = console
-        self._is_said = False
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Print the first record."""
-        if not self._is_said:
-            self._is_said = True
-            # nobody reads: no reason to end what is compiled
-            with contextlib.suppress(OSError):
-                self._console.print(record.getMessage(), soft_wrap=True)

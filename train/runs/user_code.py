@@ -3,7 +3,7 @@
 Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual
 folder runs code. A configuration that was found, as in the folder of a run, and not named by the
 user, is read by `load_without_code`: all imports go through `named_object`, which then imports
-nothing.
+nothing. One that is given to the wrong command is recognised by `is_a`.
 """
 
 import importlib
@@ -21,6 +21,43 @@ from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, quote, shorten
 from train.runs.folders import require_run
 from train.runs.import_path import look_last_in
+
+TELLING = {
+    "comparison": (
+        "elastic compare",
+        "references policies episodes scenario_episodes reference_scenarios figure_policies sweep"
+        " map groups leaderboard",
+    ),
+    "training": (
+        "elastic train",
+        "weights base base_options settings algorithm algorithm_options anneal clip worlds"
+        " decisions seeds evaluate_every evaluation_episodes checkpoint_every",
+    ),
+    "bench": ("elastic bench", "cases margin"),
+}
+"""Command of each kind, and keys that no other kind has."""
+
+
+def is_a(kind: str) -> Callable[[Any], Any]:
+    """A check of raw parameters: they are of a kind, or of none in particular.
+
+    Raises:
+        ValueError: More of the keys are of another kind.
+    """
+
+    def check(values: Any) -> Any:
+        given = set(values) if isinstance(values, dict) else set()
+
+        def count(name: str) -> int:
+            return len(given.intersection(TELLING[name][1].split()))
+
+        likely = max(TELLING, key=count)
+        if count(likely) > count(kind):
+            command = f"{TELLING[likely][0]} FILE"
+            raise ValueError(f"this is the configuration of a {likely}: {command}")
+        return values
+
+    return check
 
 
 class CodeNamingModel(Model):

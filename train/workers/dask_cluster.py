@@ -43,10 +43,9 @@ def dask_pool(address: str) -> Iterator[Pool]:
     try:
         client = distributed.Client(f"tcp://{address}", **options)
     except (OSError, ValueError) as error:
-        raise SystemFailedError(
-            f"no dask scheduler answers at {address} ({error}); start one there with: dask"
-            " scheduler --host ADDRESS"
-        ) from None
+        problem = f"no dask scheduler answers at {address} ({error})"
+        cure = "start one there with: dask scheduler --host ADDRESS"
+        raise SystemFailedError(f"{problem}; {cure}") from None
     with client:
         _prepare(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
@@ -91,15 +90,13 @@ def _prepare(client: Any, address: str) -> None:
         found = client.run(everything)
         client.run_on_scheduler(_limit_moves, most=MOST_MOVES)
     except TimeoutError:
-        raise SystemFailedError(
-            f"the dask scheduler at {address} had no worker within {_WORKER_S} s; start one with: "
-            f"dask worker {address} --nthreads 1"
-        ) from None
+        problem = f"the dask scheduler at {address} had no worker within {_WORKER_S} s"
+        cure = f"start one with: dask worker {address} --nthreads 1"
+        raise SystemFailedError(f"{problem}; {cure}") from None
     except ModuleNotFoundError as error:
-        raise ConfigurationError(
-            f"the dask cluster at {address} has no module {error.name!r}; install elastic-env on"
-            " its scheduler and its workers"
-        ) from None
+        problem = f"the dask cluster at {address} has no module {error.name!r}"
+        cure = "install elastic-env on its scheduler and its workers"
+        raise ConfigurationError(f"{problem}; {cure}") from None
     for worker, versions in found.items():
         require_same(everything(), versions, worker)
 

@@ -1,13 +1,12 @@
 """Executors of calls, as `--on` names them: this machine, a dask cluster, jobs of Slurm."""
 
 import os
-import re
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 
-from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError, quote
+from pydantic import Field
+
+from elastic_env.core.config import Model, load_yaml, quantity
 from train.workers.calls import Pool
 from train.workers.dask_cluster import dask_pool
 from train.workers.local import local_pool
@@ -15,36 +14,18 @@ from train.workers.slurm import SlurmConfig, slurm_pool
 
 _LOCAL = "local"
 _DASK = "dask://"
-_SLURM = "slurm"
-_MOST_JOBS = 1024
+_NAMES = rf"(?s)^({_LOCAL}|{_DASK}.+:\d+|slurm(:.*)?)$"
 
 
-@dataclass(frozen=True)
-class Executors:
-    """Executors that run calls beside each other.
+class Executors(Model):
+    """Executors of calls beside each other: cells of a comparison, or training seeds."""
 
-    Attributes:
-        on: local, dask://HOST:PORT, slurm, or slurm:FILE.yaml with a `SlurmConfig`.
-        jobs: Processes of this machine, 0 for one per core; elsewhere the cluster says how many.
-
-    Raises:
-        ConfigurationError: There are none of this name.
-    """
-
-    on: str = _LOCAL
-    jobs: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.jobs <= _MOST_JOBS:
-            bound = ">= 0" if self.jobs < 0 else f"<= {_MOST_JOBS}"
-            raise ConfigurationError(
-                f"jobs must be {bound}, 0 for one per core, got {quote(self.jobs)}"
-            )
-        if not re.fullmatch(rf"(?s){_LOCAL}|{_DASK}.+:\d+|{_SLURM}(:.*)?", self.on):
-            raise ConfigurationError(
-                f"on must be {_LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or"
-                f" {_SLURM}:FILE.yaml with what a job asks for, got {quote(self.on)}"
-            )
+    jobs: int = quantity("1", 0, ge=0, le=1024)
+    """Calls that run at the same time on this machine, 0 for one per core; several share the cores.
+    On hardware cells come one after the other; a cluster says itself how many."""
+    on: str = Field(default=_LOCAL, pattern=_NAMES)
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml with what a job
+    asks for; see docs/cluster.md."""
 
     @property
     def is_local(self) -> bool:
@@ -61,7 +42,7 @@ class Executors:
         """Processes of this machine for some calls: no more than those."""
         return min(self.jobs or os.cpu_count() or 1, calls)
 
-    def open(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
+    def open_pool(self, calls: int, folder: Path) -> AbstractContextManager[Pool]:
         """Workers for the calls within.
 
         Args:

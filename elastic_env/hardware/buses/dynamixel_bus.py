@@ -132,7 +132,7 @@ class DynamixelBus:
                 f"the servos of one bus must have one control table, at {self.name} are {names}"
             )
 
-    def read(self, servo_id: int, name: str) -> int:
+    def read_register(self, servo_id: int, name: str) -> int:
         """A register [count].
 
         Raises:
@@ -143,7 +143,7 @@ class DynamixelBus:
         data = self._request(servo_id, packets.READ, where, register.size)
         return register.decode(data)
 
-    def write(self, servo_id: int, name: str, value: int) -> None:
+    def write_register(self, servo_id: int, name: str, value: int) -> None:
         """Write a register [count].
 
         Raises:
@@ -170,15 +170,15 @@ class DynamixelBus:
 
     def read_position(self, servo_id: int) -> float:
         """Present position of one servo [rad]."""
-        count = self.read(servo_id, "present_position")
+        count = self.read_register(servo_id, "present_position")
         return count * self.models[servo_id].position_unit
 
     def read_condition(self, servo_id: int) -> Condition:
         """Velocity, temperature and hardware error of one servo."""
-        counts = self.read(servo_id, "present_velocity")
-        temperature = float(self.read(servo_id, "present_temperature"))
-        highest = float(self.read(servo_id, "temperature_limit"))
-        status = self.read(servo_id, "hardware_error_status")
+        counts = self.read_register(servo_id, "present_velocity")
+        temperature = float(self.read_register(servo_id, "present_temperature"))
+        highest = float(self.read_register(servo_id, "temperature_limit"))
+        status = self.read_register(servo_id, "hardware_error_status")
         error = servo_models.explain_errors(status)
         unit = self.models[servo_id].velocity_unit
         return Condition(counts * unit, temperature, highest, error)
@@ -190,7 +190,7 @@ class DynamixelBus:
             ReplyError: As `write`.
         """
         count = round(angle / self.models[servo_id].position_unit)
-        self.write(servo_id, "goal_position", count)
+        self.write_register(servo_id, "goal_position", count)
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos at once.
@@ -204,7 +204,7 @@ class DynamixelBus:
 
     def write_torque(self, servo_id: int, is_on: bool) -> None:
         """Switch the torque of one servo, which confirms it."""
-        self.write(servo_id, "torque_enable", int(is_on))
+        self.write_register(servo_id, "torque_enable", int(is_on))
 
     def write_watchdog(self, servo_id: int, is_on: bool) -> None:
         """Set the bus watchdog of a servo to 60 ms, or clear it.
@@ -212,7 +212,7 @@ class DynamixelBus:
         Nothing on models that have none.
         """
         if self.models[servo_id].has_watchdog:
-            self.write(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
+            self.write_register(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
 
     def torque_off(self) -> None:
         """Switch all torque off; also after a read that was interrupted.
@@ -231,7 +231,7 @@ class DynamixelBus:
 
     def _is_off(self, servo_id: int) -> bool:
         try:
-            if self.read(servo_id, "torque_enable") != 0:
+            if self.read_register(servo_id, "torque_enable") != 0:
                 self.write_torque(servo_id, False)
         except ReplyError:
             return False

@@ -133,7 +133,7 @@ class Parser:
     def __init__(self) -> None:
         self._bytes = bytearray()
 
-    def feed(self, data: bytes) -> list[Packet]:
+    def parse(self, data: bytes) -> list[Packet]:
         """The packets that are complete with these bytes, in order."""
         self._bytes += data
         return list(iter(self._next, None))

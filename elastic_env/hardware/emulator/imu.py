@@ -12,8 +12,7 @@ from collections import deque
 
 import numpy as np
 
-from elastic_env.hardware.emulator.faults import Faults, flip_bit
-from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, flip_bit
 from elastic_env.world.sensors import attitude
 
 Angles = tuple[float, float, float]

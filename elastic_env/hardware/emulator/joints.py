@@ -2,7 +2,6 @@
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.hardware.emulator.servos import Motor
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import JOINT, elastic_spec
@@ -20,7 +19,6 @@ class Joints:
         start_s: The clock when they begin.
 
     Attributes:
-        motors: Motor sides as the servos measure them, kept up to date.
         skipped_s: Time that was left out because the emulator was not given the processor.
     """
 
@@ -29,10 +27,9 @@ class Joints:
         if joint.servo is None:
             raise ConfigurationError("an emulated joint needs a servo, got None")
         if joint.servo.motor is not None:
-            raise ConfigurationError(
-                "an emulated servo controls its current, so that it has no motor; leave `motor` of"
-                " its servo out"
-            )
+            problem = "an emulated servo controls its current, so that it has no motor"
+            cure = "leave `motor` of its servo out"
+            raise ConfigurationError(f"{problem}; {cure}")
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
         model = spec.compile()
         self._simulation = simulate(model, num_joints, num_threads=1)
@@ -42,7 +39,6 @@ class Joints:
         self._torque_limit = joint.servo.torque_limit
         self._timestep_s = config.timestep_s
         self._clock_s = start_s
-        self.motors = [Motor() for _ in range(num_joints)]
         self.skipped_s = 0.0
         for index in range(num_joints):
             self.set_torque(index, is_on=False)
@@ -57,14 +53,11 @@ class Joints:
         if steps > 0:
             self._simulation.advance(steps)
             self._clock_s += steps * self._timestep_s
-            self._update_motors()
 
-    def _update_motors(self) -> None:
-        theta_dot = self._simulation.qvel[:, self._at.theta_dot[0]]
-        for index, motor in enumerate(self.motors):
-            motor.position = float(self.theta[index])
-            motor.velocity = float(theta_dot[index])
-            motor.torque = float(self._force[index, 0])
+    def motion(self, index: int) -> tuple[float, float, float]:
+        """Angle, its rate and the torque of a servo [rad], [rad/s], [N·m]."""
+        theta_dot = self._simulation.qvel[index, self._at.theta_dot[0]]
+        return float(self.theta[index]), float(theta_dot), float(self._force[index, 0])
 
     def lag(self, now_s: float) -> float:
         """How far the joints are behind the clock [s]."""

@@ -19,10 +19,9 @@ import numpy as np
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
-from elastic_env.hardware.emulator.faults import damage
 from elastic_env.hardware.emulator.imu import EmulatedImu
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, damage
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
@@ -60,7 +59,7 @@ class Terminal:
         with contextlib.suppress(OSError):
             os.write(self.master, data)
 
-    def read(self) -> bytes:
+    def read_bytes(self) -> bytes:
         """Bytes that have come."""
         with contextlib.suppress(OSError):
             return os.read(self.master, 4096)
@@ -105,12 +104,11 @@ class Emulator:
         self._instruction_faults = np.random.default_rng([config.seed, 2])
         self._joints = Joints(config.testbed, len(config.ids), now)
         claimed = config.claimed_model_number
-        self._servos = [
-            EmulatedServo(servo_id, model, partial(self._note, index), claimed, motor)
-            for index, (servo_id, motor) in enumerate(
-                zip(config.ids, self._joints.motors, strict=True)
-            )
-        ]
+        self._servos: list[EmulatedServo] = []
+        for index, servo_id in enumerate(config.ids):
+            motion = partial(self._joints.motion, index)
+            note = partial(self._note, index)
+            self._servos.append(EmulatedServo(servo_id, model, note, claimed, motion))
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
         self._parser = packets.Parser()
@@ -208,11 +206,11 @@ class Emulator:
 
     def _hear(self, terminal: Terminal) -> float:
         """Answer the instructions that have come; returns when they were read."""
-        data = terminal.read()
+        data = terminal.read_bytes()
         now = time.monotonic()
         if not terminal.has_rate(self.config.baudrate):
             return now  # noise
-        for packet in self._parser.feed(data):
+        for packet in self._parser.parse(data):
             if self._instruction_faults.random() < self.faults.unheard:
                 continue
             for reply in self._bus.answer(packet, now):

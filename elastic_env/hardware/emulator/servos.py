@@ -22,18 +22,6 @@ _WATCHDOG_FIRED = -1
 
 
 @dataclass
-class Motor:
-    """The motor side of a joint, as its servo measures it."""
-
-    position: float = 0.0
-    """Angle [rad]."""
-    velocity: float = 0.0
-    """Its rate [rad/s]."""
-    torque: float = 0.0
-    """Torque of the servo [N·m]."""
-
-
-@dataclass
 class EmulatedServo:
     """One servo on an emulated bus.
 
@@ -42,14 +30,14 @@ class EmulatedServo:
         model: Its type, by which its registers and units go.
         notify: Called with id, register and value when torque, goal or watchdog change.
         model_number: Number that it claims, if another one than its type's.
-        motor: What it measures.
+        motion: Gives what it measures: angle, its rate and torque [rad], [rad/s], [N·m].
     """
 
     servo_id: int
     model: ServoModel
     notify: Notify
     model_number: int | None = None
-    motor: Motor = field(default_factory=Motor)
+    motion: Callable[[], tuple[float, float, float]] = lambda: (0.0, 0.0, 0.0)
     _memory: bytearray = field(init=False)
     _heard_s: float = 0.0
 
@@ -90,9 +78,10 @@ class EmulatedServo:
 
     def measure(self) -> None:
         """Put what it measures into its registers."""
-        self["present_position"] = round(self.motor.position / self.model.position_unit)
-        self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
-        current = servo_models.current_of_torque(self.motor.torque)
+        position, velocity, torque = self.motion()
+        self["present_position"] = round(position / self.model.position_unit)
+        self["present_velocity"] = round(velocity / self.model.velocity_unit)
+        current = servo_models.current_of_torque(torque)
         self["present_current"] = round(current / self.model.current_unit)
 
     def heat(self, is_hot: bool) -> None:
@@ -129,20 +118,20 @@ class EmulatedServo:
                 number = word(self["model_number"])
                 return self._alert, number + bytes([self["firmware_version"]])
             case packets.READ if len(parameters) == 4:
-                return self.read(*words(parameters))
+                return self.read_memory(*words(parameters))
             case packets.WRITE if len(parameters) > 2:
-                return self.write(words(parameters)[0], parameters[2:]), b""
+                return self.write_memory(words(parameters)[0], parameters[2:]), b""
             case _:
                 return packets.INSTRUCTION_ERROR | self._alert, b""
 
-    def read(self, address: int, length: int) -> tuple[int, bytes]:
+    def read_memory(self, address: int, length: int) -> tuple[int, bytes]:
         """Error number and bytes; beyond the table there is nothing to read."""
         if address + length > len(self._memory) or length == 0:
             return packets.ACCESS_ERROR | self._alert, b""
         self.measure()
         return self._alert, bytes(self._memory[address : address + length])
 
-    def write(self, address: int, data: bytes) -> int:
+    def write_memory(self, address: int, data: bytes) -> int:
         """Write whole registers from an address on.
 
         The error number, and then nothing is written.
@@ -227,13 +216,13 @@ class EmulatedBus:
             case packets.SYNC_READ:
                 address, length = words(parameters)
                 asked = [i for i in parameters[4:] if i in self.servos]
-                replies = [(i, *self.servos[i].read(address, length)) for i in asked]
+                replies = [(i, *self.servos[i].read_memory(address, length)) for i in asked]
                 return [packets.status(*reply) for reply in replies]
             case packets.SYNC_WRITE:
                 address, length = words(parameters)
                 for at in range(4, len(parameters) - length, length + 1):
                     if servo := self.servos.get(parameters[at]):
-                        servo.write(address, parameters[at + 1 : at + 1 + length])
+                        servo.write_memory(address, parameters[at + 1 : at + 1 + length])
                 return []
             case packets.PING if packet.servo_id == packets.BROADCAST:
                 return [self._instruct(i, packet) for i in sorted(self.servos)]

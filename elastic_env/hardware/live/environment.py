@@ -1,19 +1,128 @@
-"""Entry points of the registered environment on hardware."""
+"""The registered environment on hardware, where measurements stand in the place of the truth.
+
+The rules are those of `elastic_env/Testbed-v0`.
+
+What differs, because a real joint does not tell it:
+
+| signal | here |
+|---|---|
+| `link_angle`, `link_error`, `deflection` | from the IMU, with its offset and noise; nan without one |
+| `joint_torque` | from the motor current by a measured line: rough, and in motion the motor's, not the spring's |
+| reward | its term `link_error` is by the IMU; nan without one |
+| `truth()`, and with it the policy `oracle` | an error |
+
+Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies`
+and `limited`, see `elastic_env.hardware.live.plant.CycleRecord`.
+"""  # noqa: E501
 
 import inspect
 from functools import partial
-from typing import Any
+from typing import Any, get_type_hints
 
+import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
+from elastic_env.core.signals import BoolArray, Signals
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.live import ID
-from elastic_env.hardware.live.task import HardwareTestbedTask
+from elastic_env.hardware.live.plant import CycleRecord, ServoPlant
 from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.joint_task import METRICS_OF_ONE, JointTask, JointTruth
+from elastic_env.world.metrics import Metric
+from elastic_env.world.rows import REAL, WHOLE, Records, record_type
+from elastic_env.world.sensors import AttitudeSensor
+
+TIMING_METRICS = (
+    Metric("jitter_rms_s", "jitter", "rms", over="all"),
+    Metric("jitter_peak_s", "jitter", "peak", over="all"),
+    Metric("overruns", "overruns", "max", over="all"),
+    Metric("missed_replies", "missed_replies", "max", over="all"),
+    Metric("limited", "limited", "max", over="all"),
+)
+_KINDS = {float: REAL, int: WHOLE}
+_FIELDS = get_type_hints(CycleRecord).items()
+_CYCLE = record_type(*((name, _KINDS[kind]) for name, kind in _FIELDS))
+_LINK = JointTask.world_type
+_OF_LINK = [(name, _LINK[name]) for name in _LINK.names or ()]
+
+
+class HardwareTestbedTask(JointTask):
+    """Rules of `elastic_env/HardwareTestbed-v0`.
+
+    Args:
+        config: Reference, assumed joint and pendulum; its scenario says nothing here.
+        settings: Wiring, mounting and limits.
+    """
+
+    config: TestbedConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+    world_type = record_type(*_OF_LINK, ("cycle", _CYCLE))
+
+    def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
+        # the IMU is read in every cycle
+        period_s = config.control_period_s
+        imu = AttitudeSensor(rate_hz=1.0 / period_s)
+        scenario = config.scenario.replace(imu=imu)
+        super().__init__(config.replace(scenario=scenario), num_worlds=1)
+        self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
+        at = JointAddresses.of(self.model, self.assumed_model.joint_names)
+        load_nm = config.pendulum.gravity_torque
+        self.plant = ServoPlant(self.model, at, settings, period_s, load_nm)
+        extent = config.reference.extent()
+        limits = settings.limits
+        if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
+            raise HardwareError(
+                f"the reference {config.reference.kind!r} can reach {extent.lowest:.3f} to"
+                f" {extent.highest:.3f} rad, the limits allow {limits.lowest_rad:g} to"
+                f" {limits.highest_rad:g} rad; lower its amplitude or widen the limits"
+            )
+
+    def truth(self) -> JointTruth:
+        """There is none on hardware.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError(
+            "hardware has no truth: 'oracle' and scores by the true link need a simulation"
+        )
+
+    def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one
+        """Drive the testbed to its start and let it settle under zero offset."""
+        self.plant.begin(float(self._reference.motion[0, 0, 0, 0]))
+
+    def _begin_worlds(self, worlds: BoolArray) -> None:
+        super()._begin_worlds(worlds)
+        self._keep_cycle()
+
+    def _sense_worlds(self, control: tuple[Any, ...]) -> bool:
+        """Behind the last step the pendulum is brought to rest."""
+        is_over = super()._sense_worlds(control)
+        self._keep_cycle()  # before the way back to rest, which measures too
+        if is_over:
+            self.plant.finish()
+        return is_over
+
+    def _signals(self, joints: Records, worlds: Records) -> Signals:
+        """Signals of a step, as in the table of the module."""
+        cycle = worlds["cycle"]
+        own = {name: cycle[name].copy() for name in _CYCLE.names or ()}
+        return {**super()._signals(joints, worlds), **own}
+
+    @property
+    def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Several where a cycle had to be repeated."""
+        periods = self.plant.record.period / self.config.control_period_s
+        return float(np.rint(max(periods, 1.0)))
+
+    def _keep_cycle(self) -> None:
+        self._worlds[self._row]["cycle"] = tuple(self.plant.record)
+
 
 SCENARIO = "hardware"
 """Name in the place of the scenario in tables of results."""

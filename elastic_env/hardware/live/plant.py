@@ -306,10 +306,9 @@ def require_agreement(settings: HardwareSettings, angle: float, load_nm: float) 
         "word yes: "
     )
     if not sys.stdin.isatty():
-        raise HardwareError(
-            f"nobody is at the terminal to agree to a motion at {settings.port}; if the way is "
-            "free, say so by --yes, in Python by confirm=False"
-        )
+        problem = f"nobody is at the terminal to agree to a motion at {settings.port}"
+        cure = "if the way is free, say so by --yes, in Python by confirm=False"
+        raise HardwareError(f"{problem}; {cure}")
     try:
         answer = input(question)
     except EOFError:

@@ -92,7 +92,7 @@ def _check_line(bus: DynamixelBus, servo_id: int) -> list[Check]:
 def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
     checks: list[Check] = []
     model = bus.models[servo_id]
-    read = partial(bus.read, servo_id)
+    read = partial(bus.read_register, servo_id)
 
     def check(what: str, *found: Any, **marks: bool) -> None:
         checks.append(Check(f"{servo_id}: {what}", *found, **marks))

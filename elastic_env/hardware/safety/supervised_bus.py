@@ -154,7 +154,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         last = (bool(answer["is_held"]), float(answer["late_s"]))
         return Cycle(States.load(answer), goals, is_limited, *last)
 
-    def read(self) -> States:
+    def read_states(self) -> States:
         """States without a command."""
         return States.load(self._request("read", _READ_S + self._answer_s))
 

@@ -16,7 +16,8 @@ from elastic_env.robots.thormang.task import WalkTask
 from elastic_env.world.robot_model import read_stiffness, with_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 
-_GAIT = ("lift_m", "hip_height_m", "transfer", "settling_steps")
+_OF_STEP_PERIOD = ("double_support_s", "single_support_s", "last_double_support_s", "num_steps")
+_GAIT = tuple(name for name in Gait.model_fields if name not in _OF_STEP_PERIOD)
 
 
 def configure_walk(
@@ -46,7 +47,8 @@ def configure_walk(
         joint: Elastic joint for all twelve, or a mapping of what differs from the paper's
             H54-200-S500-R, the default.
         robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
-        gait: What differs from the default gait: lift_m, hip_height_m, transfer, settling_steps.
+        gait: What differs from walking in place: step_length_m, step_width_m, turn_rad (per step),
+            lift_m, hip_height_m, transfer, settling_steps.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         bank: Number of the bank that random robots come from, to keep those that are learned from

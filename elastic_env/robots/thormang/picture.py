@@ -5,7 +5,7 @@ attitude; the feet, the ZMP and its reference are drawn to scale, so that the ro
 floor and the ZMP is where it is under the soles. The legs connect both, which enlarges the link
 errors of the supporting leg to first order by the same factor. The factor becomes smaller, down to
 one, where the legs could not reach the feet: a fall is drawn as it is. The translucent robot is the
-plan.
+plan. Camera and light go with its feet.
 """
 
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.rendering.picture import Picture
+from elastic_env.rendering.picture import CAMERA, Picture
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import shares
-from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_z
 from elastic_env.robots.thormang import humanoid
 from elastic_env.robots.thormang.humanoid import PLAN, ZMP, ZMP_REFERENCE
 from elastic_env.robots.thormang.model import LEG_JOINTS
@@ -71,8 +71,8 @@ class Posture:
     @classmethod
     def of_plan(cls, plan: WalkPlan, row: int) -> "Posture":
         """That of the plan, with pelvis and feet level."""
-        level = np.eye(3)
-        return cls(plan.pelvis[row], level, plan.ankles[row], np.stack([level, level]))
+        R = rotation_z(plan.heading[row])
+        return cls(plan.pelvis[row], R, plan.ankles[row], rotation_z(plan.foot_yaw[row]))
 
     def joint_angles(self, robot: Biped) -> Array:
         """Its joint angles, (12,) [rad]; of a straight leg where a foot is out of reach."""
@@ -114,8 +114,8 @@ def enlarge_posture(
     # takes a quarter of a second, and few draw
     from scipy.spatial.transform import Rotation
 
-    turned = Rotation.from_matrix(true.R).as_rotvec()
-    R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix()
+    turned = Rotation.from_matrix(true.R @ planned.R.T).as_rotvec()
+    R = Rotation.from_rotvec(np.outer(factors, turned)).as_matrix() @ planned.R
     legs = hip_to_ankle(robot, pelvis, R, true.ankles)
     reaches = (np.linalg.norm(legs, axis=-1) <= robot.leg.reach).all(axis=-1)
     reaches[-1] = True  # the true posture
@@ -135,6 +135,8 @@ class WalkerPicture(Picture):
         super().__init__(humanoid.display_spec(task.config.robot), _LEGEND)
         self._task = task
         self._factor = LARGEST_FACTOR
+        self._eye = self._model.camera(CAMERA).pos[:2].copy()
+        self._lights = self._model.light_pos[:, :2].copy()
 
     def alone(self) -> Alone:
         """The robot of a side-by-side picture."""
@@ -163,6 +165,8 @@ class WalkerPicture(Picture):
         true = Posture.of_truth(truth, world)
         planned = Posture.of_plan(plan, row)
         robot = truth.model.biped
+        self._model.camera(CAMERA).pos[:2] = self._eye + plan.origin[row]
+        self._model.light_pos[:, :2] = self._lights + plan.origin[row]
         drawn, self._factor = enlarge_posture(true, planned, plan.share[row], robot)
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)

@@ -132,6 +132,8 @@ METRICS = (
     *metrics_of("servo_torque", "nm", "rms"),
     *metrics_of("joint_torque", "nm", "peak", over="all"),
     *metrics_of("command_rate", "rad_s", "rms", "peak", over="all"),
+    Metric("end_position_error_m", "position_error", "mean", over="end"),
+    Metric("end_heading_error_rad", "heading_error", "mean", over="end"),
     Metric("clipped_share", "clipped", "mean", over="all"),
     Metric("duration_s", "time_s", "max", over="all"),
 )

@@ -1,4 +1,6 @@
-"""The walking task: walk in place on elastic legs, the pelvis level, the ZMP as planned.
+"""The walking task: walk on elastic legs, in place or from foothold to foothold.
+
+The pelvis is to stay level, and the ZMP and the feet where they are planned.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
 l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one
@@ -27,7 +29,7 @@ Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in
 joints, within ±0.3.
 
 `info` of one world, all at the end of the control period, the truth where nothing else is said;
-positions are in the plan's world frame, x forward, y to the left:
+positions are in the plan's world frame, x forward at the start, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
@@ -53,6 +55,8 @@ positions are in the plan's world frame, x forward, y to the left:
 | `load_share` | 1 | planned share of the weight on the right foot |
 | `swing`, `single_support` | 1 | progress of the swing; 1 where one foot carries alone, else 0 |
 | `support` | 1 | support foot of the step, 0 left, 1 right |
+| `position_error` | m | distance of the middle of the ankles from the planned one |
+| `heading_error` | rad | heading of the pelvis less the planned one, positive to the left |
 | `early_touchdown` | s | at a planned touch-down, time since the first touch in the second half of the swing; else 0 |
 | `clipped` | 1 | 1 where an action was beyond its bounds |
 | `reward_terms` | 1 | weighted terms of the reward, by name |
@@ -321,6 +325,7 @@ class WalkTask(Task):
         drift = foot_drift(truth["force"], truth["ankles"], plan.ankles[row])
         drift[np.isnan(deviation)] = np.nan
         in_feet = deviation - drift
+        middle = truth["ankles"][:, :, :2].mean(axis=1)
         return {
             "time_s": truth["step"] * self.config.control_period_s,
             "pelvis_roll": truth["roll"].copy(),
@@ -353,6 +358,8 @@ class WalkTask(Task):
             "swing": timing.swing[row],
             "single_support": timing.single[row],
             "support": timing.support[row],
+            "position_error": np.hypot(*(middle - plan.origin[row]).T),
+            "heading_error": heading_error(truth["quaternion"], plan.heading[row]),
             "early_touchdown": self._earliness(truth, row),
         }
 
@@ -367,6 +374,7 @@ class WalkTask(Task):
             **dict(zip(["scored", *parts, "touchdown"], phases, strict=True)),
             **dict(zip(["loaded", *names], phases[:-1] & loaded, strict=True)),
             "unloaded": phases[0] & ~loaded,
+            "end": truth["step"] == self.num_steps,
         }
 
     def _plan_row(self, truth: Records) -> IntArray:
@@ -468,6 +476,18 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
     rows["time_constant_s"] = [kind.inertial.time_constant_s for kind, _, _ in fits]
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
+
+
+def heading_error(quaternion: Array, planned: Array) -> Array:
+    """Heading (of yaw, pitch, roll) less the planned one, within half a turn, (n,) [rad].
+
+    Args:
+        quaternion: Orientation w, x, y, z, (n, 4).
+        planned: Heading, counted over full turns, (n,) [rad].
+    """
+    w, x, y, z = quaternion.T
+    error = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - planned
+    return error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
 
 
 TOUCHDOWN = -1

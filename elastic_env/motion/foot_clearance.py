@@ -1,0 +1,62 @@
+"""Feet that keep clear of each other: soles as rectangles, standing and while one swings."""
+
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.motion.gait import Footholds
+from elastic_env.rigid.leg_kinematics import turn
+
+_ALONG_A_SWING = 16
+"""Parts of a swing at whose ends the soles are compared."""
+
+
+def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> None:
+    """Refuse footholds at which soles cross or touch, or which a swing reaches only through one.
+
+    Args:
+        feet: Footholds by step.
+        sole_half_size: Half length and half width of a sole [m].
+
+    Raises:
+        ConfigurationError: The left foot does not stay clear to the left of the right one.
+    """
+    share = np.linspace(0.0, 1.0, _ALONG_A_SWING + 1)[:, None, None]
+    before = feet.positions[:-1, None]
+    yaw_before = feet.yaw[:-1, None]
+    positions = before + share * (feet.positions[1:, None] - before)
+    yaw = yaw_before + share[..., 0] * (feet.yaw[1:, None] - yaw_before)
+    gap = sole_gap(positions, yaw, sole_half_size)
+    step = int(np.argmin(gap.min(axis=1)))
+    if gap[step].min() <= 0.0:
+        half_length, half_width = sole_half_size
+        raise ConfigurationError(
+            f"the feet touch or cross in step {step + 1}: soles of {2 * half_length:g} m x"
+            f" {2 * half_width:g} m must stay apart, left and right of each other; take a larger"
+            " step_width_m, or a smaller turn_rad"
+        )
+
+
+def sole_gap(positions: Array, yaw: Array, sole_half_size: tuple[float, float]) -> Array:
+    """Distance between two soles along the best of their sides, negative where they overlap.
+
+    The right sole must lie to the right of a side of the left one, or in front of or behind it
+    with its middle to the right, and likewise the other way round.
+
+    Args:
+        positions: Middles of the soles, left first, (..., 2, 2) [m].
+        yaw: Their headings, (..., 2) [rad].
+        sole_half_size: Half length and half width of a sole [m].
+
+    Returns:
+        (...) [m]; at most the distance by which the middle of the left sole is to the left.
+    """
+    half = np.array(sole_half_size)
+    apart = positions[..., 0, :] - positions[..., 1, :]
+    corners = half * np.array([[1.0, 1.0], [1.0, -1.0]])
+    turned = (yaw[..., 0] - yaw[..., 1])[..., None]
+    # extent of the other sole along the sides of a sole
+    other = np.abs(turn(corners, turned)).max(axis=-2)
+    gaps = [np.abs(turn(apart, -yaw[..., foot])) - half - other for foot in range(2)]
+    aside = turn(apart, -yaw.mean(axis=-1))[..., 1]
+    return np.minimum(np.concatenate(gaps, axis=-1).max(axis=-1), aside)
