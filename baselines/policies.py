@@ -85,7 +85,8 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | – |
     | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
     | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
-    | `adaptive_posture` | – | both: the strongest with the standard sensors |
+    | `adaptive_posture` | – | both |
+    | `foothold` | – | and feet that land as planned: the strongest with the standard sensors |
     | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
     | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
     | `hip_sensor` | – | the same at the hips alone |
@@ -93,7 +94,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `talos` | – | hip rolls led by their measured torque, as TALOS' published controller does |
     | `iterative` | `input`, offsets learned in ten trials before | `adaptive_posture`, in ten walks |
     | `iterative:PATH` | offsets that `elastic iterate` has learned and saved | the same |
-    | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
+    | `oracle` | true parameters, integral action on the true link error | true K, links and sensors, `foothold` |
     | `uncompensated_open`, `input_open` | – | without feedback of the center of mass |
     | `residual:PATH` | a trained residual on its base: a folder, or a shipped name | the same |
 

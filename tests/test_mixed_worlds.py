@@ -238,4 +238,5 @@ def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(
     assert failed.error is not None
     assert "'payload'" in str(failed.error)
     assert "too heavy" in str(failed.error)
-    assert passed.value.episodes == evaluate(cells[1], num_threads=1).episodes
+    alone = evaluate(cells[1], num_threads=1)
+    np.testing.assert_equal(passed.value.episodes, alone.episodes)  # what fell has no end

@@ -631,7 +631,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     ),
     "infeasible": (
         ["evaluate", "--reference", "{kind: sine, frequency_hz: 9}"],
-        ["84.0 N·m", "amplitude"],
+        ["84 N·m", "amplitude"],
     ),
     "environment": (["evaluate", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
     "walk": (

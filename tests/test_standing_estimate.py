@@ -14,9 +14,11 @@ def test_the_plan_is_shifted_before_the_walk_by_what_standing_shows() -> None:
     env = vector()
     model = env.unwrapped.task.assumed_model
     rows = standing(env)
-    pitch = model.observation_table.group("imu_attitude").start + 1
+    roll = model.observation_table.group("imu_attitude").start
+    pitch = roll + 1
     rows[0, pitch] = 0.02
-    rows[1, pitch] = -0.1
+    rows[0, roll] = -0.03
+    rows[1, [roll, pitch]] = [0.0, -0.1]
     recorder = Recorder(model)
     policy = StandingEstimate(recorder, model, GAINS)
     state = None
@@ -25,10 +27,10 @@ def test_the_plan_is_shifted_before_the_walk_by_what_standing_shows() -> None:
     for step in range(steps + 20):
         _, state = policy.predict(rows, state, np.full(2, step == 0))
         if step == rest:
-            rows[:, pitch] = 0.05  # what comes later does not count
+            rows[:, [roll, pitch]] = 0.05  # what comes later does not count
     shifts = np.array(recorder.shifts)
     forward = GAINS.zmp_x * OFFSET_M[0] + GAINS.pitch_m_rad * 0.02 + GAINS.constant_m
-    to_the_left = GAINS.zmp_y * OFFSET_M[1]
+    to_the_left = GAINS.zmp_y * OFFSET_M[1] - GAINS.roll_m_rad * 0.03
     np.testing.assert_array_equal(shifts[: rest - 1], 0.0)
     np.testing.assert_allclose(shifts[steps - 1 :, 0, 0], -forward, atol=1e-12)
     np.testing.assert_allclose(shifts[steps - 1 :, 0, 1], -to_the_left, atol=1e-12)

@@ -38,15 +38,15 @@ _HIP_PITCH = 2
 class PostureGains(Model):
     """Gains of the posture feedback."""
 
-    proportional: float = quantity("1", 3.0, ge=0)
+    proportional: float = quantity("1", 2.0, ge=0)
     """Hip angle per tilt [1]."""
-    integral: float = quantity("1/s", 14.0, ge=0)
+    integral: float = quantity("1/s", 4.0, ge=0)
     """Hip angle per tilt and time [1/s]."""
     derivative: float = quantity("s", 0.1, ge=0)
     """Hip angle per rate of the tilt [s]."""
-    leak_s: float = quantity("s", 0.6, gt=0)
+    leak_s: float = quantity("s", 1.0, gt=0)
     """Time constant with which the integral leaks [s]."""
-    filter_s: float = quantity("s", 0.008, gt=0)
+    filter_s: float = quantity("s", 0.02, gt=0)
     """Time constant of the attitude's filter [s]."""
     swing_s: float = quantity("s", 0.5, ge=0)
     """Time constant with which the pitch of a leg in the air follows [s]."""

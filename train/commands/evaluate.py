@@ -27,8 +27,8 @@ class Evaluate(Model):
     iterative, oracle; on a fixed base also friction,
     disturbance_observer; on the walker also
     uncompensated_open, input_open, input_output,
-    input_wrench, adaptive, posture, adaptive_posture, foothold,
-    torque_sensor, hip_sensor, thormang, talos."""
+    input_wrench, adaptive, posture, adaptive_posture,
+    foothold, torque_sensor, hip_sensor, thormang, talos."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks),
     robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a
@@ -37,7 +37,7 @@ class Evaluate(Model):
     """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
     sensor, ideal+soft; on the walker also imu, push, slope, drawn, drawn_beyond."""
     reference: MotionOrDefault = None
-    """MotionOrDefault. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some
+    """Motion. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some
     seconds), or a mapping such as '{kind: sine, amplitude: 0.3}'. Walker: step period 24, 3
     (default), 1.6 or 1.1 [s], or its durations of double, single, double support '[0.8, 0.6, 0.8]',
     or a mapping such as '{step_period: 3, num_steps: 2}', or to walk forward and turn

@@ -219,8 +219,9 @@ class Condition(Model):
     def draws_robots(self) -> bool:
         """True if episodes differ in their robots; on hardware there is one."""
         known = self.environment
-        scenario = make_scenario(self.scenario_played, known.walks)
-        return not known.is_real and scenario.draws_robots
+        if known.is_real:
+            return False
+        return make_scenario(self.scenario_played, known.walks).draws_robots
 
     @property
     def policy_options(self) -> dict[str, Any]:

@@ -114,6 +114,10 @@ class WalkTruth:
         theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
         pelvis: Position of the pelvis, (num_worlds, 3) [m].
         pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
+        attitude: Its roll and pitch, (num_worlds, 2) [rad].
+        pelvis_rate: Its rate in its own frame, (num_worlds, 3) [rad/s].
+        wrench: Force and moment of the feet on the legs in the frames of the feet, (num_worlds, 2,
+            2, 3) [N], [N·m].
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
         models: The true joints and masses of the worlds of each scenario, what is drawn aside.
@@ -125,6 +129,9 @@ class WalkTruth:
     q_dot: Array
     pelvis: Array
     pelvis_R: Array
+    attitude: Array
+    pelvis_rate: Array
+    wrench: Array
     ankles: Array
     stiffness: Array
     models: tuple[WalkerModel, ...]

@@ -227,6 +227,9 @@ class WalkTask(Task):
             pelvis=body["pelvis"].copy(),
             ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
+            attitude=np.column_stack([body["roll"], body["pitch"]]),
+            pelvis_rate=body["pelvis_rate"].copy(),
+            wrench=body["wrench"].copy(),
             models=self._true_models,
         )
 
