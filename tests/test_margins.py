@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from baselines.catalogue import QUICK_POSTURE
 from baselines.walking.posture import PostureGains
 from docs.pages.cells import read_rows
 from elastic_env.core.signals import Array
@@ -186,6 +187,6 @@ def test_foothold_keeps_a_margin_of_its_gains() -> None:
         seed=9000,
     )
     assert make_scenario("imu").delay_steps == 1
-    found = gain_margin(condition, PostureGains(), 1.25)
+    found = gain_margin(condition, QUICK_POSTURE, 1.25)
     assert found.failed == (0, 0)
     assert found.ratio <= 1.1
