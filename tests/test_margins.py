@@ -174,7 +174,6 @@ def test_the_command_writes_a_table_that_reads_as_its_records(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="one robot of four oscillates: 1.36 times the error", strict=True)
 def test_foothold_keeps_a_margin_of_its_gains() -> None:
     """Catches gains that are tuned to the edge: a quarter more, a delayed IMU as it is sold, and
     twenty steps."""
