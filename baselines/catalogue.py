@@ -212,7 +212,7 @@ def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 def _quick_posture(options: PolicyOptions) -> PolicyOptions:
     """With a posture feedback that only feet held to their footholds bear."""
     given = options.posture.model_dump(exclude_unset=True)
-    return options.replace(posture=_QUICK_POSTURE.replace(**given))
+    return options.replace(posture=QUICK_POSTURE.replace(**given))
 
 
 def _with_footholds(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -227,7 +227,7 @@ _BASE = "input_output"
 _FAST_STEP_S = 2.0
 """Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
 _ZMP_OFFSET_S = 23.0
-_QUICK_POSTURE = PostureGains(proportional=3.0, integral=14.0, leak_s=0.6, filter_s=0.008)
+QUICK_POSTURE = PostureGains(proportional=3.0, integral=14.0, leak_s=0.6, filter_s=0.008)
 """Found on robots of bank 1, with a test of the margin. Without footholds the feet drift more under
 them than under the default."""
 

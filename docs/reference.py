@@ -95,7 +95,7 @@ def commands_page() -> str:
         "Output of `--help`. [Commands](../commands.md) has examples and durations.",
     ]
     for words in [
-        *((command,) for command in COMMANDS if command != "hardware"),
+        *((command,) for command in COMMANDS.split() if command != "hardware"),
         *(("hardware", part) for part in HARDWARE),
     ]:
         parts += [f"## elastic {' '.join(words)}", f"```text\n{help_of(*words)}\n```"]

@@ -698,6 +698,9 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["speed", "--num-envs", "2", "--policy", "inptu"],
         ["'inptu'", "input", "oracle"],
     ),
+    "margins policy": (["margins", "--policies", "inptu"], ["'inptu'", "input_output", "foothold"]),
+    "margins ranges": (["margins", "--scenario", "drawn"], ["ranges", "push_n"]),
+    "margins robots": (["margins", "--robots", "65"], ["--robots must be", "<= 64", "65"]),
     "speed rounds": (
         ["speed", "--num-envs", "2", "--steps", "1", "--rounds", "0"],
         ["rounds", "0"],
@@ -778,6 +781,7 @@ NAMES = (
     "export",
     "bench",
     "speed",
+    "margins",
     "play",
     "view",
     "robot",

@@ -11,6 +11,7 @@ from docs.pages.cells import (
     minus,
     page_table,
 )
+from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
 PELVIS = "pelvis_error_rms_rad"
@@ -29,6 +30,11 @@ _NEVER_SHOWN = ("zero", "uncompensated_open")
 _FAST = ("uncompensated", "input_output", "input_wrench", "dynamic", "oracle")
 _PUBLISHED = ("uncompensated", "talos", "thormang")
 _MIXTURE = ("nominal", "soft", "spread", "payload", "sensor")
+
+
+def margins(rows: Rows) -> str:
+    """Worst and median edge of every policy and quantity."""
+    return page_table(*margin_table(rows))
 
 
 def all_scenarios(rows: Rows) -> str:

@@ -84,6 +84,7 @@ TABLES = {
     "servo_coverage": "python -m tests.servo_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
     **dict.fromkeys(("recorded_justin", "recorded_servos"), "python -m train.recorded writes it"),
+    "margins": "copy it from runs/margins/margins.csv after `elastic margins`",
     "step": "python -m docs.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
@@ -211,6 +212,7 @@ PARTS: Mapping[str, Part] = {
         "learned_posture_1100ms",
     ),
     "published controllers": _of_standings(walks.published_controllers),
+    "margins": _of(walks.margins, "margins"),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
     "one arm": _of(arms.one_arm, "gallery"),

@@ -29,7 +29,8 @@ from train.runs.import_path import leave
 from train.runs.progress import say_what_is_compiled
 
 COMMANDS = (
-    "identify evaluate compare train iterate export bench speed play view robot hardware demo"
+    "identify evaluate compare train iterate export bench speed margins play view robot hardware"
+    " demo"
 )
 """Modules of this folder, each with a class of its name: options, and `run` with a console."""
 

@@ -64,6 +64,7 @@ def control_steps(
     seed: Any,
     condition: Condition | None = None,
     watch: Watch | None = None,
+    is_once: bool = False,
 ) -> Iterator[ControlStep]:
     """Play a policy from a reset on, one control step at a time, in one world or in many.
 
@@ -71,12 +72,16 @@ def control_steps(
     each with the next episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads
     the steps stops when there are enough.
 
+    Played once, the worlds of mode `DISABLED` begin no other episode. What a world does after its
+    end means nothing, and the steps end when all have ended.
+
     Args:
         env: The environment.
         policy: Anything with `predict`.
         seed: Of the reset; of a vector environment one for each world, or one for all.
         condition: What is played, for the errors of the policy; None to let them pass.
         watch: Called between the command and the step.
+        is_once: Whether every world of mode `DISABLED` plays one episode.
 
     Raises:
         PolicyFailedError: The policy of the condition failed.
@@ -87,6 +92,7 @@ def control_steps(
     memory: Any = None
     begins = np.ones(env.num_envs if is_vector else (), dtype=np.bool_)
     was_over = np.zeros_like(begins)
+    has_ended = np.zeros_like(begins)
     for number in count():
         with nullcontext() if condition is None else policy_errors(condition, number):
             action, memory = policy.predict(
@@ -100,9 +106,10 @@ def control_steps(
         yield step
         observation = after
         is_over = step.is_over
-        if not is_vector and is_over:
+        has_ended = has_ended | is_over
+        if (is_once or not is_vector) and has_ended.all():
             return
-        if mode is AutoresetMode.DISABLED and is_over.any():
+        if mode is AutoresetMode.DISABLED and is_over.any() and not is_once:
             observation, _ = env.reset(options={"reset_mask": is_over})
         # by itself a world begins anew in the step after its end
         begins = was_over if mode is AutoresetMode.NEXT_STEP else is_over
