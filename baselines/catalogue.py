@@ -227,7 +227,9 @@ _BASE = "input_output"
 _FAST_STEP_S = 2.0
 """Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
 _ZMP_OFFSET_S = 23.0
-QUICK_POSTURE = PostureGains(proportional=3.0, integral=14.0, leak_s=0.6, filter_s=0.008)
+QUICK_POSTURE = PostureGains(
+    proportional=2.7, integral=13.0, derivative=0.09, leak_s=0.6, filter_s=0.008
+)
 """Found on robots of bank 1, with a test of the margin. Without footholds the feet drift more under
 them than under the default."""
 

@@ -35,6 +35,7 @@ KERNELS = (
     "baselines.compensation.compensators",
     "baselines.compensation.contact_torque",
     "baselines.walking.controller",
+    "baselines.walking.dcm_observer",
     "baselines.walking.flat_feet",
     "baselines.walking.foot_tare",
     "baselines.walking.foothold",

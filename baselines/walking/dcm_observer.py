@@ -31,6 +31,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
 from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.zmp_offset import LEAST_LOAD
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -54,10 +55,12 @@ OBSERVER = record_type(
     omega=(),  # of the pendulum [rad/s]
     smooth_share=(),  # of a step in a period [1]
     follow_share=(),  # likewise
-    footholds=(2, 2),  # [m]
     limit_m=(),
 )
 """Assumptions of the observer, and its gains."""
+
+PLANNED = record_type(com=(2,), soles=(2, 2))
+"""Center of mass and soles in the plan's local frame, one row per control step [m]."""
 
 OBSERVED = record_type(
     steps=(),
@@ -93,7 +96,7 @@ class DcmObserver(PolicyAround):
         table = model.observation_table
         self._walk_view = WalkView(table)
         self._attitude = table.group("imu_attitude")
-        self._feet = FlatFeet(model)
+        self._feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
         self._chains = model.biped.chains
         self._sole = np.array([0.0, 0.0, -model.biped.ankle_height])
         period_s = model.control_period_s
@@ -102,9 +105,11 @@ class DcmObserver(PolicyAround):
         self._constants["omega"] = model.plan.omega
         self._constants["smooth_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
         self._constants["follow_share"] = 1.0 - float(np.exp(-period_s / gains.time_constant_s))
-        self._constants["footholds"] = model.biped.footholds
         self._constants["limit_m"] = gains.limit_m
-        self._com = np.ascontiguousarray(model.plan.com)
+        local = model.plan.local
+        self._plan: Any = np.zeros(len(local.com), PLANNED)
+        self._plan["com"] = local.com
+        self._plan["soles"] = local.ankles[..., :2]
         steps = max(round(ramp_s / period_s), 1)
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
 
@@ -122,8 +127,8 @@ class DcmObserver(PolicyAround):
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         links = self.policy.link_angles(rows, inner)
         seen = self._chains.com_and_feet(links, self._sole, rows[:, self._attitude])
-        error = self._feet.zmp_error(rows) - shift
-        observe(self._constants, self._walk_view.fields(rows), self._com, *seen, error, now)
+        error = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0) - shift
+        observe(self._constants, self._walk_view.fields(rows), self._plan, *seen, error, now)
         return action, DcmMemory(now, inner)
 
 
@@ -149,7 +154,7 @@ def meet_disturbance(constants: Any, ramp: Array, memory: Any, shift: Array) -> 
 def observe(
     constants: Any,
     observed: Any,
-    planned: Array,
+    plan: Any,
     com: Array,
     soles: Array,
     zmp_error: Array,
@@ -160,7 +165,7 @@ def observe(
     Args:
         constants: Row of `OBSERVER`, (1,).
         observed: Observations, rows with fields, (n,).
-        planned: Center of mass of the plan, one row per control step, (T, 2) [m].
+        plan: Rows of `PLANNED`.
         com: Center of mass in a level frame, (n, 3) [m].
         soles: Middles of the soles in the same, (n, 2, 3) [m].
         zmp_error: Measured ZMP less the planned one and the shift, (n, 2) [m].
@@ -172,11 +177,12 @@ def observe(
         shown = observed[world]
         right = shown.load_share
         periods = np.rint(shown.clock[0] / own.period_s)
-        row = int(min(max(periods - 1.0, 0.0), len(planned) - 1.0))
+        row = int(min(max(periods - 1.0, 0.0), len(plan) - 1.0))
+        planned = plan[row]
         for i in range(2):
-            on_left = com[world, i] - soles[world, 0, i] + own.footholds[0, i]
-            on_right = com[world, i] - soles[world, 1, i] + own.footholds[1, i]
-            ahead = (1.0 - right) * on_left + right * on_right - planned[row, i]
+            on_left = com[world, i] - soles[world, 0, i] + planned.soles[0, i]
+            on_right = com[world, i] - soles[world, 1, i] + planned.soles[1, i]
+            ahead = (1.0 - right) * on_left + right * on_right - planned.com[i]
             if now.steps == 0.0:
                 now.com[i] = ahead
                 now.dcm[i] = ahead

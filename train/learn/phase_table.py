@@ -22,6 +22,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import tyro
+from rich.console import Console
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
@@ -37,7 +38,6 @@ from baselines.walking.phase_table import (
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
-from train.commands.cli import CONSOLE
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 _PLANES = ((("zmp_x", "hip_pitch"), False), (("zmp_y", "hip_roll"), True))
@@ -189,7 +189,7 @@ def find(search: Search) -> PhaseTable:
         def play(inputs: Harmonics, title: str) -> Harmonics:
             errors, rms = walks.errors(inputs.table(search))
             shares = [f"{name} {1e3 * rms[name]:.2f}" for name in CHANNELS]
-            CONSOLE.print(f"{title}: {', '.join(shares)} mm, mrad rms, {rms['fell']:g} falls")
+            Console().print(f"{title}: {', '.join(shares)} mm, mrad rms, {rms['fell']:g} falls")
             return errors
 
         before = play(none, "without")
@@ -214,7 +214,7 @@ def main(search: Search) -> None:
     file = search.output or FOLDER / name
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, table.model_dump_json(indent=2) + "\n")
-    CONSOLE.print(f"wrote {file}")
+    Console().print(f"wrote {file}")
 
 
 if __name__ == "__main__":
