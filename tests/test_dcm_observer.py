@@ -10,6 +10,7 @@ from baselines.compensation.policy import PolicyInputs
 from baselines.walking.dcm_observer import (
     OBSERVED,
     OBSERVER,
+    PLANNED,
     DcmObserver,
     DcmObserverGains,
     observe,
@@ -34,12 +35,12 @@ def test_the_place_of_a_pendulum_is_found_though_its_sensors_are_off() -> None:
     constants["omega"] = OMEGA
     constants["smooth_share"] = 1.0 - np.exp(-PERIOD_S / FILTER_S)
     constants["follow_share"] = 1.0 - np.exp(-PERIOD_S / FOLLOW_S)
-    constants["footholds"] = [[0.0, 0.1], [0.0, -0.1]]
     observed = np.zeros(1, [("clock", float, 3), ("load_share", float)]).view(np.recarray)
     observed["load_share"] = 0.3
     soles = np.array([[[0.0, 0.1, -0.7], [0.0, -0.1, -0.7]]])
     memory = np.zeros(1, OBSERVED)
-    planned = np.zeros((1, 2))
+    planned: Any = np.zeros(1, PLANNED)
+    planned["soles"] = [[0.0, 0.1], [0.0, -0.1]]
     found = []
     times = np.arange(0.0, 24.0, PERIOD_S)
     for time in times:
