@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.robots.thormang.tables import BLOCKS
 from train.evaluate.episodes import group_by
 from train.report.table_formats import Table, to_markdown
 from train.runs.escaping import write_csv
@@ -54,6 +55,8 @@ _ZMP = ("zmp_deviation_rms_m", "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
 _FEET = ("early_touchdown_mean_s", "frame_error_mean_m", "com_jump_mean_m")
 _ENDS = ("link_error_imu_min_rad", "link_error_imu_max_rad")
 
+_BLOCK_METRICS = (("pelvis_error", "rad"), ("zmp_deviation", "m"))
+
 KEPT: Mapping[str, Kept] = {
     "paper": Kept((*_ATTITUDE, *_ZMP, *_FEET), ("median", "worst")),
     "walker": Kept((*_WALK, *_ATTITUDE, *_ZMP[1:], "early_touchdown_mean_s")),
@@ -66,6 +69,14 @@ KEPT: Mapping[str, Kept] = {
             "scenario": ["nominal", "imu"],
             "policy": ["input_output", "posture", "adaptive_posture"],
         },
+    ),
+    "walks": Kept(
+        (
+            *_WALK,
+            *(f"{name}_{block}_rms_{unit}" for block in BLOCKS for name, unit in _BLOCK_METRICS),
+            "foot_drift_end_m",
+        ),
+        ("mean",),
     ),
     "walker_sensitivity": Kept((*_ATTITUDE[:2], _ATTITUDE[3], _ZMP[2])),
     "testbed": Kept(("link_error_rms_rad",)),

@@ -11,6 +11,7 @@ from docs.pages.cells import (
     minus,
     page_table,
 )
+from elastic_env.robots.thormang.tables import BLOCKS
 from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
@@ -35,6 +36,37 @@ _MIXTURE = ("nominal", "soft", "spread", "payload", "sensor")
 def margins(rows: Rows) -> str:
     """Worst and median edge of every policy and quantity."""
     return page_table(*margin_table(rows))
+
+
+def twenty_steps(rows: Rows) -> str:
+    """Pelvis error and ZMP deviation over all, the first four and the last four steps."""
+    cells = Cells(rows)
+    places = [
+        (reference, scenario, policy)
+        for reference in cells.names("reference")
+        for scenario in cells.names("scenario")
+        for policy in cells.names("policy")
+        if cells.has(policy, reference, scenario)
+    ]
+    spans = [(PELVIS, ZMP)]
+    spans += [(f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS]
+    lines = []
+    for reference, scenario, policy in places:
+        row = cells.row(policy, reference, scenario)
+        fell, episodes = failure_counts(row)
+        lines.append(
+            [
+                reference.removesuffix(" num_steps=20"),
+                f"`{scenario}`",
+                _robot(policy),
+                *(format_metrics(row, span, 2) for span in spans),
+                format_metrics(row, ["foot_drift_end_m"], 1),
+                f"{fell}/{episodes}",
+            ]
+        )
+    blocks = ["all 20 steps", "steps 1 to 4", "steps 17 to 20"]
+    head = ["step", "scenario", "policy", *blocks, "drift at the end", "falls"]
+    return page_table(head, lines, words=3)
 
 
 def all_scenarios(rows: Rows) -> str:
