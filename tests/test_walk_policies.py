@@ -14,7 +14,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.gravity_torque import make_gravity
-from baselines.compensation.oracle import Oracle
+from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
@@ -240,7 +240,7 @@ def test_oracle_takes_no_stiffness(option: dict[str, Any]) -> None:
     """Catches an option of the oracle that would be ignored."""
     with pytest.raises(
         ConfigurationError,
-        match=r"knows the true one; its options are: gains, com_feedback, ramp_s$",
+        match=r"knows the true one; its options are: gains, com_feedback, ramp_s, posture, zmp_offset,",
     ):
         baselines.make("oracle", scalar(), **option)
 
@@ -293,8 +293,8 @@ def test_oracle_knows_the_true_stiffness_and_mass() -> None:
 
 def test_oracle_is_its_composition_with_the_true_model() -> None:
     """Catches a controller inside the oracle that knows the assumed masses and ankles, and
-    friction wound twice."""
-    env = scalar("soft+payload")
+    friction wound twice. Without friction there is no feedback around it."""
+    env = scalar("ideal+soft+payload")
     true = env.unwrapped.truth().model
     assumed = env.unwrapped.assumed_model
     settings = {"friction": False, "integral_gain": 0.0, **AT_ONCE}
@@ -304,6 +304,31 @@ def test_oracle_is_its_composition_with_the_true_model() -> None:
     _, actions = run(baselines.make("oracle", env, **AT_ONCE), env, 20)
     np.testing.assert_array_equal(run(by_hand, env, 20)[1], actions)
     assert np.abs(run(wrong, env, 20)[1] - actions).max() > 1e-4
+
+
+def test_the_sensors_of_the_oracle_show_the_truth() -> None:
+    """Catches noise, a bias or a delay that the oracle sees, and columns of another sensor."""
+    env = scalar("sensor+payload")
+    seen: list[Any] = []
+
+    class Recorder(Zero):
+        def act(self, rows: Any, memory: None, inputs: Any) -> Any:
+            seen.append(rows.copy())
+            return super().act(rows, memory, inputs)
+
+    model = env.unwrapped.assumed_model
+    run(TrueSensors(env, Recorder(model)), env, 20)
+    table = model.observation_table
+    observation, *_ = env.step(np.zeros(12, dtype=np.float32))
+    columns = table.group("imu_attitude")
+    assert np.abs(seen[-1][0, columns] - observation[columns]).max() > 1e-5
+    TrueSensors(env, Recorder(model)).predict(observation, None, np.array([True]))
+    truth = env.unwrapped.truth()
+    np.testing.assert_array_equal(seen[-1][0, columns], truth.attitude[0])
+    np.testing.assert_array_equal(seen[-1][0, table.group("imu_rate")], truth.pelvis_rate[0])
+    np.testing.assert_array_equal(seen[-1][0, table.group("wrench")], truth.wrench[0].ravel())
+    kept = table.group("encoder_angle")
+    np.testing.assert_array_equal(seen[-1][0, kept], observation[kept])
 
 
 def test_unknown_names_are_told_those_of_the_robot() -> None:
