@@ -167,7 +167,7 @@ def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> 
     for one, condition in zip(evaluate_together(cells, num_threads=2), cells, strict=True):
         other = evaluate(condition, num_threads=1)
         assert one.condition == condition
-        assert one.episodes == other.episodes
+        np.testing.assert_equal(one.episodes, other.episodes)  # what fell has no end
         assert {episode["seed"] for episode in one.episodes} == {4, 5}
         assert one.trace.keys() == other.trace.keys()
         for name, values in one.trace.items():

@@ -609,10 +609,10 @@ def test_several_configurations_are_trained_in_one_pool(
     resume of one alone."""
     monkeypatch.chdir(tmp_path)
     pools = list[int]()
-    opened = Executors.open
+    opened = Executors.open_pool
     monkeypatch.setattr(
         Executors,
-        "open",
+        "open_pool",
         lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder),
     )
     configs = {
