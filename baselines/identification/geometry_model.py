@@ -42,7 +42,7 @@ Geometry = Literal["offsets", "dh", "full"]
 parameters of Denavit and Hartenberg; or all lengths and angles.
 """
 
-_MOST_ITERATIONS = 60
+_MOST_ITERATIONS = 600
 _LAST_STEP_RAD = 1e-12
 _FARTHEST_RAD = 1.0
 """Deflection beyond which none is looked for."""
