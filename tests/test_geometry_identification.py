@@ -151,6 +151,34 @@ def test_a_joint_that_gravity_overcomes_is_named(geometry: GeometryModel) -> Non
         geometry.posture(nominal._replace(compliance=compliance), draw(3)[1])
 
 
+def test_a_joint_that_gravity_almost_overcomes_still_rests(geometry: GeometryModel) -> None:
+    """Catches an iteration that gives up while it still comes nearer. A step leaves κ of the way: a
+    turn t = c M grows with the compliance c by dt/dc = M / (1 − κ). From |κ| = 1 on it never ends."""
+    nominal = geometry.nominal_parameters()
+    poses = draw(3, 500)[1]
+    rigid = geometry.moments(geometry.posture(nominal, poses))[:, 1, 2]
+    pose = poses[np.abs(rigid).argsort()[1]]  # almost balanced, so that it may be soft
+
+    def turn(softness: float) -> float:
+        compliance = np.zeros((len(JOINTS), 3))
+        compliance[1, 2] = softness
+        rests = geometry.posture(nominal._replace(compliance=compliance), pose[None])
+        return float(softness * geometry.moments(rests)[0, 1, 2])
+
+    rests, tips = 1e-3, 10.0
+    while tips - rests > 1e-6 * rests:
+        softness = 0.5 * (rests + tips)
+        try:
+            turn(softness)
+            rests = softness
+        except ElasticError:
+            tips = softness
+    near, nearer = 0.998 * rests, 0.999 * rests
+    slope = (turn(nearer) - turn(near)) / (nearer - near)
+    kappa = 1.0 - turn(nearer) / nearer / slope
+    assert 0.8 < abs(kappa) < 1.0
+
+
 def test_the_corrected_model_is_the_identified_arm(tree: Tree, geometry: GeometryModel) -> None:
     """Catches a correction in the frame of another body."""
     generator, theta = draw(3)
