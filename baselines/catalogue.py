@@ -227,6 +227,7 @@ _BASE = "input_output"
 _FAST_STEP_S = 2.0
 """Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
 _ZMP_OFFSET_S = 23.0
+"""Time constant of the ZMP offset of `foothold`, whose standing estimate leaves little [s]."""
 QUICK_POSTURE = PostureGains(
     proportional=2.7, integral=13.0, derivative=0.09, leak_s=0.6, filter_s=0.008
 )

@@ -39,6 +39,8 @@ class ClosedLegs:
         self.table = self.task.observation_table
         self.place = np.zeros((2, 2))
         self.landed: list[Array] = []
+        self.largest_step = 0.0
+        """Of an offset in a control period [m]."""
 
     @property
     def model(self) -> Any:
@@ -61,7 +63,9 @@ class ClosedLegs:
             observed[:, self.table.group("clock")] = clock
             observed[:, self.table.group("load_share")] = self.plan.share[row]
             _, state = self.policy.predict(observed, state, np.array([row == 1]))
+            before = offset
             offset = state.footholds["offset"][0]
+            self.largest_step = max(self.largest_step, float(np.abs(offset - before).max()))
             if timing.single[row - 1] and not timing.single[row]:
                 foot = 1 - int(timing.support[row])
                 aimed = self.place[1 - foot] + state.footholds["target"][0, foot]
@@ -83,6 +87,9 @@ def test_feet_that_land_off_by_a_constant_come_to_their_footholds() -> None:
     left *= 1.0 - GAINS.gain
     np.testing.assert_allclose(legs.landed[4][1], left * LANDING_M[1], atol=1e-12)
     assert np.abs(legs.place).max() < 5e-4
+    # a swing of 200 periods, of which 0.8 move the foot with minimum jerk
+    largest = np.abs(LANDING_M).max()
+    assert 0.0 < legs.largest_step < 3.0 * largest * (15.0 / 8.0) / (0.8 * 200)
 
 
 def test_a_force_sensor_that_is_off_does_not_let_the_feet_walk_away() -> None:

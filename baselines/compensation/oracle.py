@@ -141,13 +141,6 @@ class Oracle(Compensated):
         self.inputs = ()
 
 
-class SensorMemory(NamedTuple):
-    """Control steps since the start of the episode, (num_worlds,), and the memory of the policy."""
-
-    steps: IntArray
-    inner: Any
-
-
 class TrueSensors(PolicyAround):
     """A policy of a walker whose IMU and foot sensors show the truth of the environment at once.
 
@@ -164,14 +157,17 @@ class TrueSensors(PolicyAround):
         self._columns = [(table.group(group), name) for group, name in names.items()]
 
     @override
-    def begin(self, rows: Array) -> SensorMemory:
-        return SensorMemory(np.zeros(len(rows), np.int64), self.policy.begin(rows))
+    def begin(self, rows: Array) -> Any:
+        return self.policy.begin(rows)
 
     @override
-    def act(self, rows: Array, memory: SensorMemory, inputs: PolicyInputs) -> Step:
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         truth = self._env.truth()
         seen = rows.copy()
         for columns, name in self._columns:
             seen[:, columns] = getattr(truth, name).reshape(len(rows), -1)
-        action, inner = self.policy.act(seen, memory.inner, inputs)
-        return action, SensorMemory(memory.steps + 1, inner)
+        return self.policy.act(seen, memory, inputs)
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        return self.policy.link_angles(rows, memory)

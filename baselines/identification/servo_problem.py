@@ -272,7 +272,9 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
 
     The duty is proportional to g (goal − position) until it stays at its limit.
     """
-    rows, duty, highest = [], [], 0.0
+    rows = []
+    duty = []
+    highest = 0.0
     at_limit = 0
     for log in logs:
         if log.pwm is None:
@@ -286,7 +288,8 @@ def duty_per_torque_gain(logs: Sequence[ServoLog]) -> float | None:
             inner = log.enabled & (np.abs(log.pwm) < 0.98 * highest)
             rows.append(log.gain * (log.goal - log.position)[inner])
             duty.append(log.pwm[inner])
-    error, own = np.concatenate(rows), np.concatenate(duty)
+    error = np.concatenate(rows)
+    own = np.concatenate(duty)
     slope = float(error @ own) / float(error @ error)
     correlated = np.corrcoef(error, own)[0, 1] > _PROPORTIONAL
     return highest / slope if slope > 0.0 and correlated else None
@@ -321,7 +324,8 @@ def regress(problem: ServoProblem) -> Array:
         rows.append(np.stack(columns, axis=-1)[moving])
         inertial = (log.load.inertia or 0.0) * a
         right.append((inertial - log.external_torque(log.position))[moving])
-    matrix, target = np.concatenate(rows), np.concatenate(right)
+    matrix = np.concatenate(rows)
+    target = np.concatenate(right)
     if len(target) < 2 * matrix.shape[1]:
         raise ElasticError(
             f"the joint moves in {len(target)} rows only, {2 * matrix.shape[1]} are needed: it"

@@ -117,7 +117,8 @@ def describe_servo(
     registers = _registers(fit.logs)
     supply = registers[0][1] if registers else fit.logs[0].supply
     parameters = tuple(_parameter(fit, name, supply) for name in PARAMETERS)
-    gain, half = fit.value("position_gain"), fit.half("position_gain")
+    gain = fit.value("position_gain")
+    half = fit.half("position_gain")
     return ServoIdentification(
         joint=joint,
         logs=tuple(log.name for log in fit.logs),

@@ -30,8 +30,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
-from baselines.walking.flat_feet import FlatFeet
-from baselines.walking.zmp_offset import LEAST_LOAD
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array

@@ -14,6 +14,9 @@ from elastic_env.core.signals import Array
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
+LEAST_LOAD = 0.05
+"""Share of the weight below which the feet show no ZMP to a slow feedback."""
+
 FEET = record_type(
     com=(2, 3),  # of the feet from their ankles [m]
     weight=(2, 3),  # of the feet [N]

@@ -16,6 +16,7 @@ from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import derivatives
+from elastic_env.rigid.leg_kinematics import turn
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
@@ -80,13 +81,14 @@ class FootTare(PolicyAround):
 def unloaded_wrench(model: WalkerModel) -> Array:
     """Force and moment that feet in the air leave at level ankles by plan, (T, 2, 2, 3).
 
-    Feet, force [N] and moment [N·m], axes.
+    Feet, force [N] and moment [N·m], axes in the frames of the feet.
     """
     biped = model.biped
     sensors = FootSensors.of_biped(biped)
     _, acceleration = derivatives(model.plan.ankles, model.control_period_s)
     mass = biped.rigid.body_mass[biped.feet]
-    force = sensors.weight - mass[:, None] * acceleration
+    in_feet = turn(acceleration, -model.plan.foot_yaw)
+    force = sensors.weight - mass[:, None] * in_feet
     return np.stack([force, np.cross(sensors.com, force)], axis=2)
 
 

@@ -134,21 +134,21 @@ def correct_footholds(gains: Any, plan: Any, observed: Any, memory: Any, coming:
         planned = plan[row]
         coming[world] = row
         progress = shown.clock[1]
-        in_air = 0.0 < progress < 1.0
-        if in_air and own.swing < 0.0:
-            lift(rules, planned, own, 1 - int(shown.clock[2]))
-        if in_air:
-            aim(rules, planned, own, 1 - int(shown.clock[2]))
+        support = int(shown.clock[2])
+        # the foot that swings, and in double support the one that has landed last
+        foot = support if progress <= 0.0 else 1 - support
+        if 0.0 < progress < 1.0:
+            if own.swing < 0.0:
+                lift(rules, planned, own, foot)
+            aim(rules, planned, own, foot)
+            share = blend((progress - rules.begin) / (1.0 - 2.0 * rules.begin))
         else:
             own.swing = -1.0
             feel_landing(rules, planned, shown, own)
-        for foot in range(2):
-            load = shown.load_share if foot == 1 else 1.0 - shown.load_share
-            share = 1.0 - load
-            if in_air and own.swing == foot:
-                share = blend((progress - rules.begin) / (1.0 - 2.0 * rules.begin))
-            for i in range(2):
-                own.offset[foot, i] = share * own.target[foot, i]
+            share = shown.load_share if foot == 0 else 1.0 - shown.load_share
+        for i in range(2):
+            own.offset[1 - foot, i] = 0.0
+            own.offset[foot, i] = share * own.target[foot, i]
 
 
 @compiled

@@ -18,8 +18,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
-from baselines.walking.flat_feet import FlatFeet
-from baselines.walking.zmp_offset import LEAST_LOAD
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk

@@ -18,13 +18,10 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
-from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import WalkerModel
-
-LEAST_LOAD = 0.05
-"""Share of the weight below which the feet show no ZMP."""
 
 
 class ZmpOffsetGains(Model):
