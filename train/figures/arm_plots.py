@@ -39,12 +39,9 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
     if result.held_out is not None:
         draw_errors(panels[count + 1], result.held_out)
         draw_curve(panels[count + 2], result.held_out)
-        for axis in panels[count + 1 : count + 3]:
-            axis.title.set_fontsize(9)
     for axis in panels[count + further :]:
         axis.set_visible(False)
-    figure.supxlabel("predicted deflection θ − q of each joint [mrad]", fontsize=10)
-    figure.supylabel("measured deflection of each joint [mrad]", fontsize=10)
+    figure.suptitle("measured over predicted deflection θ − q of each joint [mrad]", fontsize=10)
     return save(figure, path)
 
 

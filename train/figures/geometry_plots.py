@@ -48,7 +48,8 @@ def draw_errors(axis: Any, held_out: HeldOut) -> None:
     axis.bar_label(bars, [f"{value:.3g}" for value in values], padding=3, fontsize=9)
     axis.set_xlim(0.0, 1.18 * max(values))
     axis.invert_yaxis()
-    axis.set_title(f"rms [{held_out.unit}] at {held_out.held_out} held-out poses")
+    title = f"{held_out.held_out} held-out poses:\nrms [{held_out.unit}]"
+    axis.set_title(title, fontsize=9)
 
 
 def draw_curve(axis: Any, held_out: HeldOut) -> None:
@@ -61,4 +62,4 @@ def draw_curve(axis: Any, held_out: HeldOut) -> None:
     axis.set_yscale("log")
     show_numbers(axis.yaxis)
     axis.set_xlabel("poses that were fitted")
-    axis.set_title(f"identified: rms [{held_out.unit}] over poses")
+    axis.set_title(f"identified, over the number of poses:\nrms [{held_out.unit}]", fontsize=9)
