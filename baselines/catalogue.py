@@ -38,6 +38,7 @@ from baselines.walking.foothold import FootholdCorrection
 from baselines.walking.hip_torque import HipTorque
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
+from baselines.walking.refined_walk import RefinedWalk, refined
 from baselines.walking.stance_roll import StanceRoll
 from baselines.walking.standing_estimate import StandingEstimate
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
@@ -168,39 +169,48 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
             f"{type(env.unwrapped).__name__} does not have"
         )
     ramp_s = options.ramp_s
-    if not isinstance(model, WalkerModel):
-        return Oracle(env, Zero(model), ramp_s)
-    inner = _weighing(_controller)(env, env.unwrapped.truth().model, options)
-    compensated = Oracle(env, inner, ramp_s, friction=False, integral_gain=0.0)
-    if not model.coulomb_friction.any():
+    true_model = env.unwrapped.truth().model
+    if not isinstance(true_model, WalkerModel):
+        return Oracle(env, Zero(model), true_model, ramp_s)
+    further = refined(true_model)
+    options = _with_quick_gains(options)
+    inner = _controller(env, further, options)
+    policy: Any = Oracle(env, inner, further, ramp_s, friction=False, integral_gain=0.0)
+    if model.coulomb_friction.any():
         # springs that nothing damps ring under a feedback, and the true model needs none
-        return compensated
-    gains = _quick_posture(options).posture
-    policy = PostureFeedback(compensated, model, gains, ramp_s)
-    return TrueSensors(env, _with_footholds(policy, model, options))
+        policy = PostureFeedback(policy, further, options.posture, ramp_s)
+        policy = _without_mean_error(policy, further, options)
+        policy = TrueSensors(env, FootholdCorrection(policy, further, options.foothold))
+    return RefinedWalk(policy, true_model, further)
 
 
-def _for_foothold(model: WalkerModel, options: PolicyOptions) -> PolicyOptions:
-    """Options of `adaptive_posture` inside `foothold`, with the better base for the step period."""
-    options = _quick_posture(options).replace(zmp_offset=None)
-    if options.base is None and model.plan.gait.step_period_s < _FAST_STEP_S:
-        return options.replace(base="dynamic", output=options.output or "taylor")
-    return options
+def _on_refined_walk(build: Builder) -> Builder:
+    """With feet that land as planned, along the refined plan, under its full joint torque."""
+
+    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        further = refined(model)
+        options = _with_quick_gains(options)
+        if options.base is None:
+            options = options.replace(base="dynamic", output=options.output or "taylor")
+        policy = build(env, further, options)
+        policy = FootholdCorrection(policy, further, options.foothold)
+        return RefinedWalk(FootTare(policy, further, options.foot_tare), model, further)
+
+    return built
 
 
+@_on_refined_walk
 def _foothold(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """`adaptive_posture` whose feet land as planned, whose ZMP has no mean error."""
-    policy = _adaptive_posture(env, model, _for_foothold(model, options))
-    policy = _with_footholds(policy, model, options)
-    return FootTare(policy, model, options.foot_tare)
+    """`adaptive_posture` whose ZMP has no mean error."""
+    policy = _adaptive_posture(env, model, options.replace(zmp_offset=None))
+    return _without_mean_error(policy, model, options)
 
 
+@_on_refined_walk
 def _dcm_observer(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """`foothold` with an observer in the place of standing estimate and ZMP offset."""
-    policy: Any = _adaptive_posture(env, model, _for_foothold(model, options))
-    policy = DcmObserver(policy, model, options.dcm_observer, options.ramp_s)
-    policy = FootholdCorrection(policy, model, options.foothold)
-    return FootTare(policy, model, options.foot_tare)
+    policy = _adaptive_posture(env, model, options.replace(zmp_offset=None))
+    return DcmObserver(policy, model, options.dcm_observer, options.ramp_s)
 
 
 def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -209,30 +219,34 @@ def _phase_table(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     return PhaseFeedforward(_foothold(env, model, options), model, table)
 
 
-def _quick_posture(options: PolicyOptions) -> PolicyOptions:
-    """With a posture feedback that only feet held to their footholds bear."""
-    given = options.posture.model_dump(exclude_unset=True)
-    return options.replace(posture=QUICK_POSTURE.replace(**given))
+def _with_quick_gains(options: PolicyOptions) -> PolicyOptions:
+    """With feedbacks that only feet held to their footholds bear."""
+    posture = options.posture.model_dump(exclude_unset=True)
+    walking = options.gains.model_dump(exclude_unset=True) if options.gains else {}
+    return options.replace(
+        posture=QUICK_POSTURE.replace(**posture), gains=QUICK_WALKING.replace(**walking)
+    )
 
 
-def _with_footholds(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    """With a ZMP without a mean error, and feet that land as planned."""
+def _without_mean_error(policy: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """With a ZMP without a mean error."""
     gains = options.zmp_offset or ZmpOffsetGains(time_constant_s=_ZMP_OFFSET_S)
-    policy = ZmpOffset(policy, model, gains)
-    policy = StandingEstimate(policy, model, options.standing)
-    return FootholdCorrection(policy, model, options.foothold)
+    return StandingEstimate(ZmpOffset(policy, model, gains), model, options.standing)
 
 
 _BASE = "input_output"
-_FAST_STEP_S = 2.0
-"""Steps shorter than this need the torque of the motion, not that of gravity alone [s]."""
 _ZMP_OFFSET_S = 23.0
 """Time constant of the ZMP offset of `foothold`, whose standing estimate leaves little [s]."""
 QUICK_POSTURE = PostureGains(
-    proportional=2.7, integral=13.0, derivative=0.09, leak_s=0.6, filter_s=0.008
+    proportional=2.7, integral=16.0, derivative=0.09, leak_s=0.6, filter_s=0.008
 )
 """Found on robots of bank 1, with a test of the margin. Without footholds the feet drift more under
 them than under the default."""
+_WEIGHT_FILTER_S = 1.0
+QUICK_WALKING = WalkingGains(
+    dcm=0.5, velocity_filter_s=0.04, zmp_filter_s=0.02, weight_filter_s=_WEIGHT_FILTER_S
+)
+"""Found together with `QUICK_POSTURE`."""
 
 
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
@@ -285,8 +299,6 @@ def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  
 def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return HipTorque(_controller(env, model, options), model, options.hip_torque)
 
-
-_WEIGHT_FILTER_S = 1.0
 
 COMPENSATED: Mapping[str, Builder] = {
     "input": _around(_controller, GravityCompensator, "none"),

@@ -7,16 +7,19 @@ import numpy as np
 import baselines
 
 
-def metrics_of(env: Any, policy: str) -> dict[str, Any]:
-    """Figures of an episode that a policy plays in an environment of one world, without a
-    failure."""
-    player = baselines.make(policy, env)
-    observation, info = env.reset(seed=0)
+def play_to_the_end(env: Any, policy: Any, seed: int = 0) -> dict[str, Any]:
+    """Info of the last step of an episode without a failure."""
+    observation, info = env.reset(seed=seed)
     state = None
     start = np.array(True)
     while "episode_metrics" not in info:
-        action, state = player.predict(observation, state, start)
+        action, state = policy.predict(observation, state, start)
         observation, *_, info = env.step(action)
         start = np.array(False)
     assert info["termination"] == ""
-    return info["episode_metrics"]
+    return info
+
+
+def metrics_of(env: Any, policy: str) -> dict[str, Any]:
+    """Figures of an episode that a named policy plays, without a failure."""
+    return play_to_the_end(env, baselines.make(policy, env))["episode_metrics"]

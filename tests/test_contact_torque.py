@@ -13,9 +13,14 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.compensators import GravityCompensator, taylor_link_angle
+from baselines.compensation.compensators import (
+    DynamicCompensator,
+    GravityCompensator,
+    taylor_link_angle,
+)
 from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, gravity_in_pelvis
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
+from baselines.compensation.policy import Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_names import JointAddresses
@@ -441,30 +446,50 @@ def test_a_hanging_foot_pulls_on_its_sensor_and_is_weighed_once(side: int) -> No
         )
 
 
+def planned_rows(steps: Array) -> Array:
+    """Observations that show the plan at control steps."""
+    plan = model().plan
+    observation = rows(
+        len(steps),
+        reference_angle=plan.q[steps],
+        load_share=plan.share[steps][:, None],
+        zmp_reference=plan.zmp[steps],
+    )
+    observation[:, model().observation_table.names.index("clock.time")] = plan.timing.time[steps]
+    return observation
+
+
 def test_planned_torque_is_that_of_the_control_step() -> None:
     """Catches a row of another time, or of another world: on the reference it is the plan's
     inverse dynamics itself."""
     plan = model().plan
     steps = np.array([1, 400, 777, 1500])
-    observation = rows(4, clock=0.0, reference_angle=plan.q[steps])
-    observation[:, model().observation_table.names.index("clock.time")] = plan.timing.time[steps]
+    observation = planned_rows(steps)
     planned = PlannedTorque(model(), make_gravity(model())).at(observation)
     torque = planned.inverse_dynamics(plan.q[steps], plan.q_dot[steps], plan.q_ddot[steps])
-    np.testing.assert_array_equal(torque, plan.torque[steps])
+    np.testing.assert_allclose(torque, plan.torque[steps], rtol=0.0, atol=1e-10)
     assert np.abs(np.diff(torque, axis=0)).max() > 10.0  # and these rows do differ
+
+
+def test_a_shifted_zmp_loads_the_planned_joints() -> None:
+    """Catches a shift that cancels out of the planned torque: ankles carry the weight by the
+    shift."""
+    steps = np.array([1, 100])
+    observation = planned_rows(steps)
+    zmp = model().observation_table.group("zmp_reference")
+    observation[:, zmp] += [0.02, 0.0]
+    gravity = make_gravity(model(), "com")
+    q = model().plan.q[steps]
+    torque = PlannedTorque(model(), gravity).at(observation).inverse_dynamics(q, q, q)
+    change = (torque - model().plan.torque[steps])[:, [4, 10]].sum(axis=1)
+    np.testing.assert_allclose(np.abs(change), 0.02 * model().biped.weight, rtol=0.01)
 
 
 def test_planned_torque_beside_the_reference_differs_by_the_static_torque() -> None:
     """Catches an offset that is ignored, or whose static difference has the wrong sign."""
     plan = model().plan
     steps = np.array([400, 777])
-    observation = rows(
-        2,
-        reference_angle=plan.q[steps],
-        load_share=plan.share[steps][:, None],
-        zmp_reference=plan.zmp[steps],
-    )
-    observation[:, model().observation_table.names.index("clock.time")] = plan.timing.time[steps]
+    observation = planned_rows(steps)
     gravity = make_gravity(model(), "com")
     planned = PlannedTorque(model(), gravity).at(observation)
     q = plan.q[steps] + np.random.default_rng(11).uniform(-0.02, 0.02, (2, 12))
@@ -474,6 +499,26 @@ def test_planned_torque_beside_the_reference_differs_by_the_static_torque() -> N
     expected = np.einsum("wij,wj->wi", gradient, q - plan.q[steps])
     np.testing.assert_allclose(change, expected, rtol=0.0, atol=0.005)  # third order of the offset
     assert np.abs(expected).max() > 2.0
+
+
+def test_a_tilted_pelvis_bends_the_planned_joints_further() -> None:
+    """Catches a planned deflection that knows nothing of the attitude, and the other sign of it.
+
+    A robot that leans forward hangs forward in its ankles.
+    """
+    steps = np.array([1, 777])
+    level = planned_rows(steps)
+    tilted = level.copy()
+    tilted[:, model().observation_table.group("imu_attitude")] = [0.0, 0.05]
+    compensator = DynamicCompensator(model(), "taylor")
+    theta = model().plan.q[steps]
+    memory = compensator.at(level).begin(Motion(theta, theta, theta))
+    found = [compensator.at(rows).link_angle(theta, memory) for rows in (level, tilted)]
+    np.testing.assert_array_equal(found[0], theta - memory.deflection)
+    static = GravityCompensator(model(), "taylor")
+    eq_12 = [static.at(rows).link_angle(theta) for rows in (level, tilted)]
+    np.testing.assert_allclose(found[1] - found[0], eq_12[1] - eq_12[0], rtol=0.0, atol=1e-15)
+    assert np.abs(found[1] - found[0]).max() > 1e-3
 
 
 def test_output_compensator_finds_the_links_of_the_sagging_robot() -> None:

@@ -32,6 +32,7 @@ from elastic_env.robots.thormang.task import WalkTask, heading_error
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.scenario import make_scenario
+from tests.played import play_to_the_end
 
 PERIOD_S = 0.004
 ROBOT = biped(Thormang())
@@ -420,19 +421,6 @@ def test_the_heading_error_stays_within_half_a_turn() -> None:
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6)
 
 
-def walk_to_the_end(env: Any, policy: Any, seed: int) -> dict[str, Any]:
-    """Info of the last step of a walk without a fall."""
-    observation, info = env.reset(seed=seed)
-    state = None
-    done = False
-    while not done:
-        action, state = policy.predict(observation, state)
-        observation, _, terminated, truncated, info = env.step(action)
-        done = terminated or truncated
-        assert not terminated
-    return info
-
-
 def test_the_end_of_a_walk_is_scored_against_the_plan() -> None:
     """Catches a mean over the walk, and a plan that stays at the start."""
     goes = {"step_length_m": 0.05, "turn_rad": 0.1}
@@ -440,7 +428,7 @@ def test_the_end_of_a_walk_is_scored_against_the_plan() -> None:
         "elastic_env/WalkInPlace-v0", step_period=(0.2, 0.4, 0.2), num_steps=2, gait=goes
     )
     policy = baselines.make("input", env)
-    info = walk_to_the_end(env, policy, seed=1)
+    info = play_to_the_end(env, policy, seed=1)
     truth = env.unwrapped.truth()
     feet = env.unwrapped.task.plan.footholds
     off = truth.ankles[0, :, :2].mean(axis=0) - feet.positions[-1].mean(axis=0)
@@ -495,7 +483,7 @@ def test_the_robot_walks_forward_and_turns(scenario: str, goes: dict[str, float]
         "elastic_env/WalkInPlace-v0", num_steps=12, scenario=scenario, gait=goes
     )
     policy = baselines.make("adaptive_posture", env)
-    info = walk_to_the_end(env, policy, seed=5)
+    info = play_to_the_end(env, policy, seed=5)
     metrics = info["episode_metrics"]
     turned = env.unwrapped.task.plan.heading[-1]
     assert metrics["pelvis_error_rms_rad"] < 4e-3

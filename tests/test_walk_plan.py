@@ -22,6 +22,7 @@ from elastic_env.motion.walk_plan import (
     WalkPlan,
     derivatives,
     plan_walk,
+    refine_plan,
     require_feasible,
     swing_height,
     with_torque,
@@ -240,6 +241,25 @@ def test_the_zmp_of_a_walk_forward_is_near_its_reference(
     plan = plan_walk(make_gait(step_period, num_steps=4, **goes), ROBOT, PERIOD_S)
     error = (plan.zmp_of_motion - plan.zmp)[plan.timing.walking]
     assert np.sqrt((error**2).sum(axis=1).mean()) < bound
+
+
+@pytest.mark.parametrize("step_period", [3.0, 1.6, 1.1])
+def test_a_refined_plan_has_a_fifth_of_the_error_and_the_same_feet(step_period: float) -> None:
+    """Catches a correction of the wrong sign, which doubles the error, and feet that move.
+
+    The motion is one: its center of mass follows from its joints, its rates from its angles.
+    """
+    plan = planned(step_period)
+    refined = refine_plan(plan, ROBOT, PERIOD_S)
+    rms = [np.sqrt(((own.zmp_of_motion - own.zmp) ** 2).mean()) for own in (plan, refined)]
+    assert rms[1] < rms[0] / 5.0
+    np.testing.assert_array_equal(refined.ankles, plan.ankles)
+    np.testing.assert_array_equal(refined.zmp, plan.zmp)
+    com = refined.pelvis + ROBOT.chains.center_of_mass(refined.q)
+    np.testing.assert_allclose(com[:, :2], refined.com, rtol=0.0, atol=1e-9)
+    np.testing.assert_array_equal(refined.q_dot, derivatives(refined.q, PERIOD_S)[0])
+    moved = ROBOT.joint_angles(refined.pelvis, refined.ankles, refined.heading, refined.foot_yaw)
+    np.testing.assert_array_equal(refined.q, moved)
 
 
 @pytest.mark.parametrize(

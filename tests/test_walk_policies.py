@@ -11,13 +11,14 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER, QUICK_WALKING
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
+from baselines.walking.refined_walk import RefinedWalk, refined
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 
@@ -298,8 +299,13 @@ def test_oracle_is_its_composition_with_the_true_model() -> None:
     true = env.unwrapped.truth().model
     assumed = env.unwrapped.assumed_model
     settings = {"friction": False, "integral_gain": 0.0, **AT_ONCE}
+    walked = refined(true)
     by_hand, wrong = (
-        Oracle(env, WalkingController(model, **AT_ONCE), **settings) for model in (true, assumed)
+        RefinedWalk(Oracle(env, controller, walked, **settings), true, walked)
+        for controller in (
+            WalkingController(model, gains=QUICK_WALKING, **AT_ONCE)
+            for model in (walked, refined(assumed))
+        )
     )
     _, actions = run(baselines.make("oracle", env, **AT_ONCE), env, 20)
     np.testing.assert_array_equal(run(by_hand, env, 20)[1], actions)

@@ -212,6 +212,13 @@ class GravityCompensator(Compensator):
         solve = newton_link_angle if self._output == "newton" else taylor_link_angle
         return solve(theta, self.stiffness, self._load)
 
+    def deflection_by_tilt(self, theta: Array) -> Parameter:
+        """What the measured tilt of a walker's pelvis adds to Eq. 12, (num_worlds, n) [rad]."""
+        if self._load is self.gravity or self._output == "wrench":
+            return 0.0
+        tilted = self._load.solve(theta, self.stiffness)
+        return tilted - self.gravity.solve(theta, self.stiffness)
+
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
         """Rate at the estimated link angle, (num_worlds, n) [rad/s].
@@ -343,10 +350,13 @@ class DynamicCompensator(Compensator):
 
     @override
     def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
-        """Link angle by the desired motion's deflection, or by the measured wrenches [rad]."""
+        """Link angle by the desired motion's deflection, or by the measured wrenches [rad].
+
+        The tilt of a walker's pelvis, which is not desired, adds what it bends at rest.
+        """
         if self._measures:
             return self._static.link_angle(theta)
-        return theta - memory.deflection
+        return theta - memory.deflection - self._static.deflection_by_tilt(theta)
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:

@@ -164,7 +164,9 @@ class WrenchTorque:
 
 
 class PlannedTorque:
-    """Torque of the planned motion by inverse dynamics, and the static torque of offsets from it.
+    """Torque of the planned motion by inverse dynamics, and the static torque of changes of it.
+
+    Changes are offsets of the joints, and a ZMP that is shifted.
 
     Args:
         model: Assumed walker.
@@ -172,34 +174,37 @@ class PlannedTorque:
     """
 
     def __init__(self, model: WalkerModel, gravity: ContactGravity) -> None:
-        self._model = model
+        table = model.observation_table
+        plan = model.plan
         self._gravity = gravity
-        self._time = model.observation_table.group("clock")
-        self._reference = model.observation_table.group("reference_angle")
+        self._period_s = model.control_period_s
+        self._time = table.group("clock").start
+        rows = np.zeros((len(plan.q), len(table)))
+        rows[:, self._time] = plan.timing.time
+        rows[:, table.group("zmp_reference")] = plan.zmp
+        rows[:, table.group("load_share")] = plan.share[:, None]
+        self._of_motion = plan.torque - gravity.at(rows).gravity_torque(plan.q)
 
     def at(self, rows: Array, gravity: LegTorque | None = None) -> "BoundPlannedTorque":
         """The torque at the control steps of observations, (num_worlds, m).
 
         `gravity` is the static one, if known.
         """
-        periods = rows[:, self._time][:, 0] / self._model.control_period_s
-        row = np.rint(periods).astype(np.int64)
-        torque = self._model.plan.torque.take(row, axis=0, mode="clip")
-        gravity = gravity or self._gravity.at(rows)
-        return BoundPlannedTorque(torque, rows[:, self._reference], gravity)
+        row = np.rint(rows[:, self._time] / self._period_s).astype(np.int64)
+        of_motion = self._of_motion.take(row, axis=0, mode="clip")
+        return BoundPlannedTorque(of_motion, gravity or self._gravity.at(rows))
 
 
 class BoundPlannedTorque(NamedTuple):
     """Torque of a planned control step; `inverse_dynamics` as that of a `RigidBody`."""
 
-    torque: Array
-    q_ref: Array
+    of_motion: Array
+    """What the planned motion adds to the static torque, (num_worlds, 12) [N·m]."""
     gravity: LegTorque
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002
-        """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
-        planned = self.gravity.gravity_torque(self.q_ref)
-        return self.torque + (self.gravity.gravity_torque(q) - planned)
+        """Torque at joint angles near the plan's, (num_worlds, 12) [rad] to [N·m]."""
+        return self.of_motion + self.gravity.gravity_torque(q)
 
 
 @compiled

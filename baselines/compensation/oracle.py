@@ -20,6 +20,7 @@ from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
+from elastic_env.world.robot_model import RobotModel
 
 _LIMIT_RAD = 0.05
 """Largest correction of the integrator [rad]."""
@@ -48,6 +49,7 @@ class TrueCompensator(DynamicCompensator):
 
     Args:
         env: The environment itself.
+        model: True model of the robot.
         ramp_s: Time after which the integrator begins [s].
         friction: Whether the compensator knows the friction.
         gain: Gain on the true link error [1/s].
@@ -55,14 +57,16 @@ class TrueCompensator(DynamicCompensator):
 
     modelled = 0.0
 
-    def __init__(self, env: Any, ramp_s: float, friction: bool, gain: float) -> None:
+    def __init__(
+        self, env: Any, model: RobotModel, ramp_s: float, friction: bool, gain: float
+    ) -> None:
         self._env = env.unwrapped
-        super().__init__(self._env.truth().model, friction=friction)
+        super().__init__(model, friction=friction)
         self._gain = gain * self._dt
         self._ramp = Ramp(self.model, ramp_s)
         self._truth: Any = None
         table = self.model.observation_table
-        groups = ("encoder_angle", "reference_angle", "last_command")
+        groups = ("encoder_angle", "encoder_rate", "last_command")
         self._known = np.concatenate([np.r_[table.group(name)] for name in groups])
 
     @override
@@ -121,6 +125,7 @@ class Oracle(Compensated):
     Args:
         env: The environment itself, scalar or vector.
         policy: What is compensated: on the walker its controller.
+        model: True model of the robot; of a walker with the plan that it walks.
         ramp_s: Time in which the compensation grows from zero [s].
         friction: Whether the compensator knows the friction; not where the policy does.
         integral_gain: Gain on the true link error [1/s]; 0 where the policy moves links off the
@@ -131,13 +136,13 @@ class Oracle(Compensated):
         self,
         env: Any,
         policy: Policy,
+        model: RobotModel,
         ramp_s: float = STAND_S,
         friction: bool = True,
         integral_gain: float = 1.0,
     ) -> None:
-        compensator = TrueCompensator(env, ramp_s, friction, integral_gain)
+        compensator = TrueCompensator(env, model, ramp_s, friction, integral_gain)
         super().__init__(policy, compensator, ramp_s, corrects_policy=True)
-        self._plan = None
         self.inputs = ()
 
 

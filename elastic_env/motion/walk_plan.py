@@ -3,9 +3,10 @@
 The pelvis stays level at one height, heads where the feet do on average, and moves so that the
 center of mass of the whole robot, not the pelvis, follows the preview control.
 
-Feet that swing forward move the ZMP off that of the cart-table. Where the robot does not walk in
-place, the error of the motion's ZMP passes the preview control once more [Kajita2003], which leaves
-about a sixth of it.
+Legs that swing move the ZMP off that of the cart-table, by 2.5 mm rms in steps of 3 s and by 9 mm
+in steps of 1.1 s. The error of the motion's ZMP can pass the preview control once more
+[Kajita2003], which leaves about a seventh of it. Where the robot does not walk in place, the plan
+is that. Where it does, a policy can walk the refined plan (`baselines.walking.refined_walk`).
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the
@@ -165,18 +166,11 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     pelvis = _pelvis_under(motion.com, start, biped, feet, timing.time)
     q = _angles(biped, pelvis, feet, timing.time)
     dynamics = _dynamics(biped, pelvis, feet.heading, q, control_period_s)
-    if not gait.is_in_place:
-        further = follow_zmp(preview, zmp - dynamics.zmp, np.zeros(2))
-        com_dot = motion.com_dot + further.com_dot
-        motion = replace(motion, com=motion.com + further.com, com_dot=com_dot)
-        pelvis = _pelvis_under(motion.com, pelvis, biped, feet, timing.time)
-        q = _angles(biped, pelvis, feet, timing.time)
-        dynamics = _dynamics(biped, pelvis, feet.heading, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
     offsets = turn(gaits.inward_offsets(gait, footholds.positions[0]), feet.yaw)
     share = load_share(zmp, feet.ankles[..., :2] + offsets)
     torque = _joint_torque(biped, feet, q, dynamics, share)
-    return WalkPlan(
+    plan = WalkPlan(
         gait=gait,
         timing=timing,
         footholds=footholds,
@@ -197,6 +191,42 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         share=share,
         torque=torque,
     )
+    return plan if gait.is_in_place else refine_plan(plan, biped, control_period_s)
+
+
+@lru_cache(maxsize=32)
+def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
+    """The plan after another pass of the preview control, which has less error of the ZMP.
+
+    Feet and ZMP reference stay as they are. Center of mass, pelvis and legs move otherwise.
+
+    Args:
+        plan: A walk.
+        biped: The robot as it is assumed.
+        control_period_s: Time between rows [s].
+
+    Raises:
+        ElasticError: A foot out of reach.
+    """
+    preview = PreviewConfig(
+        com_height_m=plan.com_height, period_s=control_period_s, gravity=plan.gravity
+    )
+    further = follow_zmp(preview, plan.zmp - plan.zmp_of_motion, np.zeros(2))
+    com = plan.com + further.com
+    feet = _Feet(plan.ankles, plan.foot_yaw, plan.heading)
+    pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
+    q = _angles(biped, pelvis, feet, plan.timing.time)
+    q_dot, q_ddot = derivatives(q, control_period_s)
+    moved = replace(
+        plan,
+        q=q,
+        q_dot=q_dot,
+        q_ddot=q_ddot,
+        com=com,
+        com_dot=plan.com_dot + further.com_dot,
+        pelvis=pelvis,
+    )
+    return with_torque(moved, biped, control_period_s)
 
 
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:

@@ -1,0 +1,73 @@
+r"""Refined walk: the policy walks a plan of its own, whose ZMP is nearer to the reference.
+
+The plan that the environment shows puts the center of mass of a cart-table under the reference p of
+the ZMP. Legs that swing move the ZMP of the whole robot off it, which inverse dynamics tells. That
+error passes the preview control once more [Kajita2003], and gives a plan with other joint angles
+(`elastic_env.motion.walk_plan.refine_plan`),
+
+.. math:: q_{ref}' = q_{ref} + \Delta q
+
+The policy inside knows the refined plan alone: it sees q_ref' and its derivatives where the
+observation has q_ref, and the action is Δq + a, with its own action a.
+
+[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
+Zero-Moment Point", ICRA.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from typing_extensions import override
+
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from elastic_env.core.signals import Array
+from elastic_env.motion.walk_plan import refine_plan
+from elastic_env.world.robot_model import WalkerModel
+
+
+def refined(model: WalkerModel) -> WalkerModel:
+    """The assumed walker with its plan refined."""
+    plan = refine_plan(model.plan, model.biped, model.control_period_s)
+    return replace(model, plan=plan)
+
+
+class RefinedWalk(PolicyAround):
+    """A policy for the refined plan of a walker, on the plan that the environment shows.
+
+    Args:
+        policy: What commands the robot along the refined plan.
+        model: Assumed walker, with the plan of the environment.
+        further: The same with the plan that the policy knows.
+    """
+
+    def __init__(self, policy: Any, model: WalkerModel, further: WalkerModel) -> None:
+        super().__init__(policy, model)
+        table = model.observation_table
+        self._rate_hz = 1.0 / model.control_period_s
+        self._time = table.group("clock").start
+        self._angles = further.plan.q - model.plan.q
+        self._changes = (
+            (table.group("reference_angle"), self._angles),
+            (table.group("reference_rate"), further.plan.q_dot - model.plan.q_dot),
+            (table.group("reference_acceleration"), further.plan.q_ddot - model.plan.q_ddot),
+        )
+
+    @override
+    def begin(self, rows: Array) -> Any:
+        return self.policy.begin(rows)
+
+    @override
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
+        """Its memory is that of the policy inside."""
+        periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
+        seen = rows.copy()
+        for columns, change in self._changes:
+            seen[:, columns] += change.take(periods, axis=0, mode="clip")
+        action, memory = self.policy.act(seen, memory, inputs)
+        total = action + self._angles.take(periods, axis=0, mode="clip")
+        return total.astype(np.float32), memory
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        return self.policy.link_angles(rows, memory)
