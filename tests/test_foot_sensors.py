@@ -9,9 +9,11 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import FOOT_ERRORS, RobotRanges, draw_robots
 from elastic_env.core.signals import Array
 from elastic_env.robots.testbed.environment import make as make_testbed
+from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.world.foot_sensors import cross_talk_matrix
 from elastic_env.world.scenario import GROUNDS, TRAINING_RANGES, Scenario, make_scenario
+from train.evaluate.conditions import Condition, PolicySpec
 
 SHORT: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
 PERIOD_S = 0.004
@@ -110,7 +112,8 @@ def test_errors_of_the_feet_change_nothing_else() -> None:
     """Catches a draw between those of before: the robot, its noise and its other sensors are the
     same with errors of the feet and without."""
     seen = []
-    for changes in ({}, {"force_bias_n": 5.0, "cross_talk": 0.01}):
+    exact: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, 0.0)
+    for changes in (exact, {}):
         scenario = make_scenario("sensor").replace(**changes)
         env = walkers(scenario, sensors=["link_encoder", "joint_torque"])
         first, _ = env.reset(seed=3)
@@ -137,7 +140,8 @@ def test_drawn_robots_have_feet_of_their_own_and_are_else_the_same() -> None:
     ranges = TRAINING_RANGES.replace(
         force_bias_n=(-15.0, 15.0), moment_bias_nm=(-0.45, 0.45), cross_talk=(0.0, 0.02)
     )
-    plain, lying = (draw_robots([own], 16, 12, [0]) for own in (TRAINING_RANGES, ranges))
+    exact = ranges.replace(**dict.fromkeys(FOOT_ERRORS, (0.0, 0.0)))
+    plain, lying = (draw_robots([own], 16, 12, [0]) for own in (exact, ranges))
     for robot, other in zip(plain, lying, strict=True):
         same = {name: getattr(robot, name) for name in vars(robot) if name not in FOOT_ERRORS}
         assert same == {name: getattr(other, name) for name in same}
@@ -163,6 +167,36 @@ def test_a_drawn_bias_is_what_the_sensor_shows() -> None:
     robot = env.unwrapped.task._robots[0]
     np.testing.assert_allclose(errors[0, 0, :, :3].ravel(), robot.force_bias_n, atol=1e-12)
     np.testing.assert_allclose(errors[0, 0, :, 3:].ravel(), robot.moment_bias_nm, atol=1e-12)
+
+
+def test_sensor_and_drawn_have_the_errors_of_foot_sensors() -> None:
+    """Catches a half-width that becomes a width or an end, and scenarios whose feet are exact."""
+    half_widths = {name: getattr(FOOT_SCENARIO, name) for name in FOOT_ERRORS}
+    assert all(half_widths.values())
+    assert half_widths == {name: getattr(make_scenario("sensor"), name) for name in FOOT_ERRORS}
+    bank = robot_bank(make_scenario("drawn"), 1)
+    for name, half_width in half_widths.items():
+        assert getattr(TRAINING_RANGES, name) == (-half_width, half_width)
+        drawn = np.array([getattr(robot, name) for robot in bank])
+        # a Latin hypercube of 256 robots: one in the first and the last 256th of every column
+        assert (drawn.min(axis=0) < half_width * (2.0 / 256 - 1.0)).all()
+        assert (drawn.max(axis=0) > half_width * (1.0 - 2.0 / 256)).all()
+        assert np.abs(drawn).max() <= half_width
+
+
+def test_a_robot_that_does_not_walk_has_sensor_without_feet() -> None:
+    """Catches a `sensor` that is refused on the testbed, and a push that is dropped there in
+    silence."""
+    plain = make_scenario("sensor", walks=False)
+    assert not any(getattr(plain, name) for name in FOOT_ERRORS)
+    assert plain.encoder_bias_rad == make_scenario("sensor").encoder_bias_rad
+    joined: Any = make_testbed(scenario="sensor+soft").unwrapped
+    assert joined.task.config.scenario == make_scenario("sensor+soft", walks=False)
+    with pytest.raises(ConfigurationError, match="which only a walker knows"):
+        make_testbed(scenario="sensor+push")
+    swept = Condition(env="testbed", policy=PolicySpec(name="input"), scenario="sensor")
+    swept = swept.replace(swept={"scenario.stiffness_scale": 0.7})
+    assert make_testbed(scenario=swept.scenario_played) is not None
 
 
 def test_the_named_change_is_of_walkers_and_draws() -> None:

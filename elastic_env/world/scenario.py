@@ -180,6 +180,7 @@ _FOOT_ERRORS = {
     "moment_drift_nm_s": 0.0006,
     "cross_talk": 0.01,
 }
+_FOOT_INTERVALS: dict[str, Any] = {name: (-width, width) for name, width in _FOOT_ERRORS.items()}
 # an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
 _HOMING_ERROR_RAD = 2e-3
 
@@ -212,6 +213,7 @@ CHANGES: dict[str, ScenarioChange] = {
         "imu": ground.imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
         "pelvis_imu": ground.pelvis_imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
         "delay_steps": 1,
+        **_FOOT_ERRORS,
     },
     "imu": lambda _: {"inertial": InertialSensor(), "delay_steps": 1},
     "push": lambda _: {"push_n": 50.0},
@@ -238,6 +240,7 @@ TRAINING_RANGES = RobotRanges(
     push_n=(0.0, 50.0),
     push_share=0.5,
     delay_share=0.5,
+    **_FOOT_INTERVALS,
 )
 """Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named
 changes but `stiff`'s on all joints at once."""
@@ -265,9 +268,11 @@ that have one quantity beyond these."""
 WALKER_FIELDS = ("push_n", "slope_rad", "floor_friction", *FOOT_ERRORS)
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(
-    name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS}
+    name
+    for name, change in CHANGES.items()
+    if change(GROUNDS["nominal"]).keys() <= {*WALKER_FIELDS}
 )
-"""Changes that set one of them."""
+"""Changes that set these alone."""
 
 
 def scenario_names(walks: bool = True) -> list[str]:
@@ -283,7 +288,8 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
 
     Args:
         name: Name, or the scenario itself.
-        walks: Whether an unknown name is answered with those of robots that walk, too.
+        walks: Whether the robot walks. One that does not has no feet, so `sensor` leaves them out,
+            and an unknown name is answered without the changes of walkers.
 
     Raises:
         ConfigurationError: A part of the name does not exist, a ground stands behind another part,
@@ -304,6 +310,8 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
             choices = [*scenario_names(walks), *DISTRIBUTIONS]
             raise unknown_name("scenario", change, choices)
         added = known[change](ground)
+        if not walks and change not in WALKER_ONLY:
+            added = {field: value for field, value in added.items() if field not in WALKER_FIELDS}
         twice = sorted(parameters.keys() & added.keys())
         if twice:
             raise ConfigurationError(

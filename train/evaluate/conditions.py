@@ -212,7 +212,7 @@ class Condition(Model):
         fields = {name: v for name, v in swept if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
-        scenario = make_scenario(self.scenario).with_ranges(self.ranges)
+        scenario = make_scenario(self.scenario, self.environment.walks).with_ranges(self.ranges)
         return vary_scenario(scenario, fields)
 
     @property
