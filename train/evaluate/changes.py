@@ -365,7 +365,7 @@ def _seen_as(condition: Condition, trained: Origin) -> str:
     walks = condition.environment.walks
     played = make_scenario(played, walks).replace(name="")
     for name in seen:
-        if make_scenario(name, walks).with_ranges(trained.ranges).replace(name="") == played:
+        if make_scenario(name, walks, trained.ranges).replace(name="") == played:
             return name
     if condition.swept:
         return f"varied {condition.scenario}"
