@@ -137,25 +137,30 @@ class RobotRanges(Model):
             if isinstance(value := getattr(self, name), tuple):
                 yield name, value
 
+    @property
+    def changes(self) -> list[str]:
+        """Quantities that are not those of the assumed robot."""
+        fields = RobotRanges.model_fields
+        return [name for name in fields if getattr(self, name) != fields[name].default]
+
     def fixed(self, name: str) -> float:
         """The value of an interval of one point; that of the assumed robot where robots differ."""
-        low, high = getattr(self, name)
-        return low if low == high else RobotRanges.model_fields[name].default[0]
+        default = RobotRanges.model_fields[name].default
+        return (default if self.draws(name) else getattr(self, name))[0]
+
+    def draws(self, name: str) -> bool:
+        """True if robots differ in a quantity; of a share, if only some robots have it."""
+        value = getattr(self, name)
+        return value[0] < value[1] if isinstance(value, tuple) else 0.0 < value < 1.0
 
     @property
     def is_one_robot(self) -> bool:
         """True if all robots are the same."""
-        shares = (self.push_share if self.push_n[1] > 0.0 else 0.0, self.delay_share)
-        is_shared = any(0.0 < share < 1.0 for share in (*shares, self.inertial_share))
-        differ = [low < high for _, (low, high) in self.intervals()]
         # the floor may rise in any direction
-        return not (is_shared or any(differ) or self.slope_rad[1] > 0.0)
+        return self.slope_rad[1] == 0.0 and not any(map(self.draws, RobotRanges.model_fields))
 
 
-WALKER_FIELDS = (
-    *(*_LOAD, "slope_rad", "push_n", "push_share"),
-    *(*FOOT_ERRORS, "floor_friction"),
-)
+WALKER_FIELDS = (*_LOAD, "slope_rad", "push_n", "push_share", *FOOT_ERRORS, "floor_friction")
 """Quantities of `RobotRanges` that only a robot that walks has."""
 
 
@@ -287,8 +292,8 @@ def _draw(
     drawn = {name: draw(name, *ends) for name, ends in ranges.intervals()}
     drawn["stiffness"] = drawn["stiffness"] * drawn.pop("joint_stiffness")
     drawn["push_n"][~has("push_share")] = 0.0
-    is_level = ranges.slope_rad[1] == 0.0
-    drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=0.0 if is_level else 1.0)
+    turns = float(ranges.slope_rad[1] > 0.0)
+    drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=turns)
     shares = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
     for i in range(number):
         values: dict[str, Any] = {name: bool(share[i]) for name, share in shares.items()}

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import WALKER_FIELDS, RobotRanges
+from elastic_env.core.robot_ranges import WALKER_FIELDS
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
@@ -71,12 +71,8 @@ class JointConfig(TaskConfig):
 
     @model_validator(mode="after")
     def _scenario_acts(self) -> Self:
-        fields = RobotRanges.model_fields
-        acting = [
-            name
-            for name in WALKER_FIELDS
-            if any(getattr(own, name) != fields[name].default for own in self.scenario.parts)
-        ]
+        set_ = {name for own in self.scenario.parts for name in own.changes}
+        acting = [name for name in WALKER_FIELDS if name in set_]
         if acting:
             raise ValueError(
                 f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"

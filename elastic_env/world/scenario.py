@@ -60,12 +60,10 @@ class Scenario(RobotRanges):
 
     @model_validator(mode="after")
     def _mixture_says_all_that_differs(self) -> Self:
-        fields = RobotRanges.model_fields
-        own = [name for name in fields if getattr(self, name) != fields[name].default]
-        if self.mixture and own:
+        if self.mixture and self.changes:
             raise ValueError(
-                f"mixture says in what robots differ; leave out {', '.join(own)}, or give it to the"
-                " ranges of the mixture"
+                f"mixture says in what robots differ; leave out {', '.join(self.changes)}, or give"
+                " it to the ranges of the mixture"
             )
         return self
 
@@ -82,9 +80,7 @@ class Scenario(RobotRanges):
     @property
     def shoulder_load_kg(self) -> float:
         """Load that all robots have on their shoulders, part of the true model [kg]."""
-        fields = RobotRanges.model_fields
-        places = [getattr(self, name) == fields[name].default for name in LOAD_PLACE]
-        return self.fixed("load_kg") if all(places) else 0.0
+        return 0.0 if {*LOAD_PLACE} & {*self.changes} else self.fixed("load_kg")
 
     @property
     def places_loads(self) -> bool:

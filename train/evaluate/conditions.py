@@ -11,6 +11,7 @@ from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.config_problems import meaning_of
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.world.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import (
     ENVIRONMENTS,
@@ -247,7 +248,7 @@ def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
     Of `scenario.mounting_rad.half_width` the value is half the width of an interval about 0.
 
     Raises:
-        ConfigurationError: A value is beyond the bounds of its field.
+        ConfigurationError: A value is beyond the bounds of its field, or robots differ in it.
     """
     for path, value in fields.items():
         first, _, inner = path.removeprefix(SCENARIO).partition(".")
@@ -256,6 +257,10 @@ def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
             new = (-value, value)
         elif inner:
             new = getattr(scenario, first).replace(**{inner: value})
+        elif first in RobotRanges.model_fields and scenario.draws(first):
+            raise ConfigurationError(
+                f"scenario {scenario.name!r} draws {first} from ranges; vary it in another one"
+            )
         scenario = scenario.replace(**{first: new})
     return scenario
 
