@@ -264,7 +264,7 @@ def test_a_missing_file_lists_those_beside_it(tmp_path: Path) -> None:
 def test_a_configuration_of_the_testbed_survives_its_own_dump() -> None:
     """Catches a resolved configuration, stored beside results, that cannot be read back."""
     config = TestbedConfig(
-        reference={"kind": "multisine", "seed": 4}, scenario={"name": "own", "stiffness_scale": 0.5}
+        reference={"kind": "multisine", "seed": 4}, scenario={"name": "own", "stiffness": 0.5}
     )
     assert TestbedConfig(**config.model_dump()) == config
 

@@ -14,7 +14,6 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.dry_friction import DEAD_ZONE_RAD, FrictionCompensation, FrictionMemory
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Array
 from elastic_env.joint.friction import dry_friction
 from elastic_env.world.scenario import make_scenario
@@ -164,9 +163,7 @@ def test_policies_that_know_constant_friction_alone_refuse_another() -> None:
     )
     with pytest.raises(ConfigurationError, match=r"observer knows constant dry friction only"):
         baselines.make("disturbance_observer", env)
-    drawn = make_scenario("ideal").replace(
-        name="rough", friction_scale=1.0, ranges=(RobotRanges(friction=(1.0, 4.0)),)
-    )
+    drawn = make_scenario("ideal").replace(name="rough", friction_scale=1.0, friction=(1.0, 4.0))
     with pytest.raises(ConfigurationError, match=r"draws up to 4 times .* load_friction = 0\.3"):
         gymnasium.make_vec("elastic_env/Testbed-v0", num_envs=1, scenario=drawn, **SMALL)
 

@@ -215,7 +215,9 @@ def test_what_moves_the_pelvis_disturbs_the_attitude() -> None:
     steps = 400
     env = make_vector(
         num_envs=1,
-        scenario=make_scenario("ideal").replace(inertial=EXACT.replace(time_constant_s=tau)),
+        scenario=make_scenario("ideal").replace(
+            inertial_share=1.0, inertial=EXACT.replace(time_constant_s=tau)
+        ),
         **SHORT,
     )
     env.reset(seed=0)
@@ -239,7 +241,10 @@ def test_without_errors_a_robot_at_rest_shows_its_attitude() -> None:
     """Catches an offset that is not drawn, a filter that starts elsewhere, and gravity of
     another size."""
     shown, true, _ = shown_and_true(
-        1, 10, scenario=make_scenario("ideal").replace(inertial=EXACT), step_period=3.0
+        1,
+        10,
+        scenario=make_scenario("ideal").replace(inertial_share=1.0, inertial=EXACT),
+        step_period=3.0,
     )
     np.testing.assert_allclose(shown, true, atol=1e-6)
     assert abs(true[0, 0, 1]) > 0.02  # pitched by its own weight
@@ -248,7 +253,7 @@ def test_without_errors_a_robot_at_rest_shows_its_attitude() -> None:
 def test_a_slower_imu_holds_what_a_faster_one_shows() -> None:
     """Catches a filter that pauses with the output: the device filters on, and shows every fifth
     step."""
-    fast = make_scenario("nominal").replace(inertial=InertialSensor())
+    fast = make_scenario("nominal").replace(inertial_share=1.0, inertial=InertialSensor())
     slow = fast.replace(pelvis_imu=AttitudeSensor(rate_hz=50.0))
     (all_shown, *_), (held, *_) = (
         shown_and_true(2, 52, scenario=scenario) for scenario in (fast, slow)
@@ -260,7 +265,7 @@ def test_a_slower_imu_holds_what_a_faster_one_shows() -> None:
 def test_its_rate_has_bias_and_noise_of_the_gyroscope() -> None:
     """Catches the noise of `nominal` in its place, and a rate that is not shown."""
     sensor = InertialSensor(gyro_bias_rad_s=0.02, time_constant_s=1e-3)
-    scenario = make_scenario("ideal").replace(inertial=sensor)
+    scenario = make_scenario("ideal").replace(inertial_share=1.0, inertial=sensor)
     steps = 12
     worlds = 128
     env = make_vector(num_envs=worlds, scenario=scenario)
@@ -292,7 +297,7 @@ def test_its_attitude_has_bias_and_noise_of_the_accelerometer() -> None:
     steps = 12
     worlds = 128
     shown, true, env = shown_and_true(
-        worlds, steps, scenario=make_scenario("ideal").replace(inertial=sensor)
+        worlds, steps, scenario=make_scenario("ideal").replace(inertial_share=1.0, inertial=sensor)
     )
     bias = env.unwrapped.task._bias
     force = bias["specific_force"]
@@ -325,10 +330,10 @@ def test_the_scenario_has_the_age_of_sensor() -> None:
     """Catches measurements that are new where the issue asks for old ones, and robots taken for
     one and the same."""
     scenario = make_scenario("imu")
-    assert scenario.delay_steps == make_scenario("sensor").delay_steps == 1
+    assert scenario.delay_share == make_scenario("sensor").delay_share == 1.0
     assert scenario.draws_robots
     assert scenario.is_random
-    assert make_scenario("soft+imu").inertial == InertialSensor()
+    assert make_scenario("soft+imu").inertial_share == 1.0
 
 
 def test_the_default_has_the_data_sheets_error_at_rest() -> None:
@@ -373,7 +378,7 @@ def test_the_links_accelerometer_is_that_of_mujoco() -> None:
     control period, half of one older.
     """
     fast = make_scenario("ideal").replace(
-        inertial=EXACT.replace(time_constant_s=1e-3, bandwidth_hz=1.0)
+        inertial_share=1.0, inertial=EXACT.replace(time_constant_s=1e-3, bandwidth_hz=1.0)
     )
     fast = fast.replace(imu=AttitudeSensor(rate_hz=250.0))
     seen, infos = played(pendulum(fast, reference=SWING), 900)
@@ -391,7 +396,9 @@ def test_the_links_filter_without_errors_shows_the_link() -> None:
     """Catches a gyroscope of the wrong sign or scale: with a long time constant the rate alone
     counts."""
     slow = make_scenario("ideal").replace(
-        inertial=EXACT.replace(time_constant_s=1e6), imu=AttitudeSensor(rate_hz=250.0)
+        inertial_share=1.0,
+        inertial=EXACT.replace(time_constant_s=1e6),
+        imu=AttitudeSensor(rate_hz=250.0),
     )
     seen, infos = played(pendulum(slow, reference=SWING), 900)
     q = np.array([info["link_angle"] for info in infos])
@@ -403,7 +410,7 @@ def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
     """Catches biases drawn twice or not at all, and a filter that has not settled when the
     episode begins."""
     quiet = InertialSensor(gyro_noise_density=0.0, accelerometer_noise_density=0.0)
-    scenario = make_scenario("ideal").replace(inertial=quiet)
+    scenario = make_scenario("ideal").replace(inertial_share=1.0, inertial=quiet)
     env = gymnasium.make_vec(
         "elastic_env/Testbed-v0",
         num_envs=256,

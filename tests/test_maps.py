@@ -31,9 +31,10 @@ from train.report.write import write_report
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-K = "scenario.stiffness_scale"
-LOAD = "scenario.torso_load_kg"
-OFFSET = "scenario.pelvis_imu.bias_spread_rad"
+K = "scenario.stiffness"
+LOAD = "scenario.load_kg"
+OFFSET = "scenario.mounting_rad.half_width"
+NOISE = "scenario.pelvis_imu.noise_rad"
 AXES: dict[str, Any] = {
     "x": {"what": K, "values": [0.7, 1]},
     "y": {"what": LOAD, "values": [0, 5, 10]},
@@ -69,7 +70,7 @@ def test_a_map_plays_every_pair_of_values_in_the_environment() -> None:
         (k, m) for k in (0.7, 1.0) for m in (0.0, 5.0, 10.0)
     ]
     played = conditions[1].arguments["scenario"]
-    assert played == make_scenario("sensor").replace(stiffness_scale=0.7, torso_load_kg=5.0)
+    assert played == make_scenario("sensor").replace(stiffness=0.7, load_kg=5.0)
     assert conditions[1].policy_options == {}
     worlds = make_vector_env(conditions[1], 1).unwrapped
     np.testing.assert_allclose(worlds.truth().model.stiffness, 0.7 * worlds.assumed_model.stiffness)
@@ -78,12 +79,22 @@ def test_a_map_plays_every_pair_of_values_in_the_environment() -> None:
 def test_a_field_within_a_sensor_is_varied_and_the_others_stay() -> None:
     """Catches an axis that sets a sensor back to its defaults."""
     nominal = make_scenario("nominal")
-    found = vary_scenario(nominal, {OFFSET: 0.002})
-    assert found == nominal.replace(pelvis_imu=nominal.pelvis_imu.replace(bias_spread_rad=0.002))
-    assert scenario_fields()[OFFSET] == ("half-width of a further offset, drawn per episode", "rad")
+    found = vary_scenario(nominal, {NOISE: 0.002})
+    assert found == nominal.replace(pelvis_imu=nominal.pelvis_imu.replace(noise_rad=0.002))
+    assert scenario_fields()[NOISE] == ("standard deviation of the white noise", "rad")
     assert (
         not {"scenario.name", "scenario.encoder_counts", "scenario.imu"} & scenario_fields().keys()
     )
+
+
+def test_a_half_width_is_varied_to_both_sides() -> None:
+    """Catches an error of the same sign in all robots, and one that fields without a sign have."""
+    found = vary_scenario(make_scenario("nominal"), {OFFSET: 0.002})
+    assert found == make_scenario("nominal").replace(mounting_rad=(-0.002, 0.002))
+    description, unit = scenario_fields()[OFFSET]
+    assert description.startswith("half-width: error of the IMU")
+    assert unit == "rad"
+    assert "scenario.load_kg.half_width" not in scenario_fields()
 
 
 def test_an_axis_of_the_motion_gives_the_references() -> None:
@@ -117,11 +128,11 @@ def test_an_axis_of_the_motion_gives_the_references() -> None:
         ({"what": "scenario.slope", "values": [0, 0.1]}, "Did you mean 'scenario.slope_rad'"),
         (
             {"what": "reference", "values": [0, 1]},
-            "choose one of: step_period, scenario.stiffness_scale",
+            "choose one of: step_period, scenario.stiffness",
         ),
         (
             {"what": "scenario.slope_rad", "values": [0, 0.6]},
-            r"slope_rad must be a finite number >= 0 and < 0.5 \[rad",
+            r"slope_rad must be a number or \[lowest, highest\] within 0 to 0.5 \[rad",
         ),
         ({"what": LOAD, "values": [0, "heavy"]}, "values of map.y must be numbers, got 'heavy'"),
         ({"what": LOAD, "values": [0, True]}, "values of map.y must be numbers, got True"),

@@ -90,7 +90,7 @@ def records_of(edges: dict[str, list[float]]) -> tuple[list[dict[str, Any]], lis
 
 def test_margins_are_those_of_the_worst_robot_and_the_median() -> None:
     """Catches a quantity whose worst edge is the largest one, and robots that are mixed up."""
-    edges = {"push_n": [200.0, 100.0, 150.0], "stiffness_scale": [0.4, 0.3, 0.5]}
+    edges = {"push_n": [200.0, 100.0, 150.0], "stiffness": [0.4, 0.3, 0.5]}
     (push, softest), played = records_of(edges)
     np.testing.assert_allclose([push["worst"], push["median"]], [100.0, 150.0], atol=0.5)
     np.testing.assert_allclose([softest["worst"], softest["median"]], [0.5, 0.4], atol=0.001)
@@ -102,7 +102,7 @@ def test_margins_are_those_of_the_worst_robot_and_the_median() -> None:
     expected = 1.0 - CHECKED_SHARE * (1.0 - softest["worst"])
     assert last == {
         (("scenario.push_n", CHECKED_SHARE * push["worst"]),),
-        (("scenario.stiffness_scale", expected),),
+        (("scenario.stiffness", expected),),
     }
 
 
@@ -110,10 +110,9 @@ def test_every_quantity_begins_at_the_scenario_itself() -> None:
     """Catches a first value that is a change already, and one that no scenario can have."""
     plain = make_scenario("spread")
     for own in QUANTITIES:
-        value = getattr(plain, own.field)
-        assert own.harmless == (1.0 if value is None else value)
+        assert own.harmless == plain.fixed(own.field)
         middle = (own.harmless + own.fatal) / 2.0
-        assert getattr(plain.replace(**{own.field: middle}), own.field) == middle
+        assert plain.replace(**{own.field: middle}).fixed(own.field) == middle
 
 
 @pytest.mark.slow
@@ -132,7 +131,7 @@ def test_the_default_robots_differ_and_are_the_same_at_every_value() -> None:
 def test_causes_are_those_of_every_world_alone() -> None:
     """Catches a robot that cannot stand and ends the others, and a world that is taken for
     another."""
-    values = [("push_n", 0.0), ("stiffness_scale", 0.2), ("push_n", 900.0), ("slope_rad", 0.12)]
+    values = [("push_n", 0.0), ("stiffness", 0.2), ("push_n", 900.0), ("slope_rad", 0.12)]
     conditions = [walk(swept={f"scenario.{name}": value}) for name, value in values]
     together = failure_causes(conditions, 1)
     assert together.tolist() == ["", NO_REST, "fell", NO_REST]
@@ -185,7 +184,7 @@ def test_foothold_keeps_a_margin_of_its_gains() -> None:
         episodes=4,
         seed=9000,
     )
-    assert make_scenario("imu").delay_steps == 1
+    assert make_scenario("imu").delay_share == 1.0
     found = gain_margin(condition, QUICK_POSTURE, 1.25)
     assert found.failed == (0, 0)
     assert found.ratio <= 1.1

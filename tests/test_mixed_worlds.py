@@ -205,7 +205,7 @@ def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> Non
 def test_a_map_of_a_scenario_shares_worlds_and_varied_options_do_not() -> None:
     """Catches a policy that plays cells of another value of its option."""
     cells = [
-        cell("input", "nominal", swept={"scenario.stiffness_scale": value})
+        cell("input", "nominal", swept={"scenario.stiffness": value})
         for value in (0.8, 0.9, 1.0, 1.1)
     ]
     assert in_batches(cells, cores=1) == [[0, 1], [2, 3]]

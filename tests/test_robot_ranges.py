@@ -33,7 +33,6 @@ from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
 from elastic_env.world.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
-from elastic_env.world.sensors import InertialSensor
 from tests.three_joints import ARM
 
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
@@ -58,7 +57,7 @@ NAMES = [name for name, _ in RobotRanges().intervals()]
 
 def with_ranges(*ranges: RobotRanges, ground: str = "nominal") -> Scenario:
     """A scenario that draws from some ranges."""
-    return make_scenario(ground).replace(ranges=ranges, name="own")
+    return make_scenario(ground).replace(mixture=ranges, name="own")
 
 
 def robot_of(env: Any, world: int = 0) -> DrawnRobot:
@@ -146,7 +145,7 @@ def test_a_latin_hypercube_has_one_value_in_each_interval(
 def test_the_bank_of_drawn_fills_its_ranges_evenly_and_its_quantities_are_independent() -> None:
     """Catches a quantity that is drawn once for all robots, or along with another one."""
     bank = robot_bank(make_scenario("drawn"))
-    assert len(bank) == walk_config.RANGES_BANK_SIZE == 256
+    assert len(bank) == walk_config.BANK_SIZE == 256
     columns = np.array(
         [
             [
@@ -241,11 +240,11 @@ def test_several_ranges_have_equal_shares() -> None:
     [
         (
             {"load_kg": (4.0, 2.0)},
-            r"load_kg must be \[lowest, highest\] within 0 to 100 \[kg\], got \[4, 2\]",
+            r"load_kg must be a number or \[lowest, highest\] within 0 to 100 \[kg\], got \[4, 2\]",
         ),
         (
             {"friction": (-1.0, 2.0)},
-            r"friction must be \[lowest, highest\] within 0 to 100 \[1\], got \[-1, 2\]",
+            r"friction must be a number or \[lowest, highest\] within 0 to 100 \[1\], got \[-1, 2\]",
         ),
         ({"load": (0.0, 2.0)}, "load"),
         ({"delay_share": 1.5}, "delay_share"),
@@ -257,16 +256,66 @@ def test_ranges_that_are_none_are_refused(given_: dict[str, Any], message: str) 
         RobotRanges(**given_)
 
 
-def test_what_ranges_draw_is_not_said_twice() -> None:
-    """Catches a slope by the scenario and another one by its ranges, of which one would be lost."""
-    with pytest.raises(ConfigurationError, match="ranges say what is drawn; leave out slope_rad"):
+def test_what_is_drawn_is_not_said_twice() -> None:
+    """Catches a slope by one change and another one by `drawn`, of which one would be lost."""
+    with pytest.raises(ConfigurationError, match="'drawn' sets slope_rad a second time"):
         make_scenario("slope+drawn")
-    with pytest.raises(ConfigurationError, match="leave out encoder_bias_rad, delay_steps"):
+    with pytest.raises(ConfigurationError, match=r"'drawn' sets .*delay_share, .*homing_rad"):
         make_scenario("sensor+drawn")
-    with pytest.raises(ConfigurationError, match="sets ranges a second time"):
-        make_scenario("drawn+drawn_beyond")
-    assert make_scenario("soft+drawn").stiffness_scale == 0.7
-    assert make_scenario("drawn").draws_robots
+    with pytest.raises(ConfigurationError, match="'drawn' sets stiffness a second time"):
+        make_scenario("soft+drawn")
+    with pytest.raises(ConfigurationError, match=r"mixture says in what.* leave out stiffness"):
+        make_scenario("soft+drawn_beyond")
+    assert make_scenario("slip+drawn").floor_friction == (0.3, 0.3)
+    assert make_scenario("slip+drawn").draws_robots
+
+
+def test_a_number_is_an_interval_of_one_point_that_every_robot_has() -> None:
+    """Catches a number that becomes a half-width, and rounding: `soft` is 0.7 and nothing else."""
+    ends = {"stiffness": 0.7, "backlash_rad": 1.75e-3, "homing_rad": np.float32(0.1), "load_kg": 5}
+    ranges = RobotRanges(**ends, cross_talk=-0.3)
+    assert ranges.stiffness == (0.7, 0.7)
+    assert ranges.homing_rad == (0.1, 0.1)
+    assert ranges.is_one_robot
+    for robot in draw_robots([ranges], 3, 2, [5]):
+        assert robot.stiffness == (0.7, 0.7)
+        assert robot.backlash_rad == 1.75e-3
+        assert robot.homing_rad == (0.1, 0.1)
+        assert robot.load_kg == 5.0
+        assert set(robot.cross_talk) == {-0.3}
+    assert make_scenario("soft").fixed("stiffness") == 0.7
+    assert make_scenario("drawn").fixed("stiffness") == 1.0
+    with pytest.raises(ModelError, match="stiffness"):
+        RobotRanges(stiffness=True)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "push_share", "delay_share", "inertial_share"])
+def test_a_quantity_reaches_its_ends_and_leaves_all_others_as_they_are(name: str) -> None:
+    """Catches a quantity that is drawn along with another one, or by its stream."""
+    others = TRAINING_RANGES.replace(inertial_share=0.5, floor_friction=(0.2, 1.0))
+    field = RobotRanges.model_fields[name]
+    if name.endswith("share"):
+        changes = [{name: 0.0}, {name: 1.0}]
+    else:
+        low, high = field.json_schema_extra["bounds"]  # type: ignore[index,call-overload]
+        middle = (low + high) / 2.0 + 0.1 * (high - low)
+        changes = [{name: middle}, {name: (middle, high)}, {name: (low, high)}]
+    banks = [draw_robots([others.replace(**own)], 64, 3, [1]) for own in changes]
+    own_names = {"delay_share": "is_delayed", "inertial_share": "is_inertial"}
+    own_names |= {"push_share": "push_n", "joint_stiffness": "stiffness"}
+    own = own_names.get(name, name)
+    values = [np.array([getattr(robot, own) for robot in bank]) for bank in banks]
+    for bank in banks:
+        for robot, first in zip(bank, banks[0], strict=True):
+            assert dataclasses.replace(robot, **{own: getattr(first, own)}) == first
+    if name.endswith("share"):
+        assert not values[0].any()
+        assert values[1].all()
+    elif "stiffness" not in name and name != "push_n":
+        low, high = changes[-1][name]
+        assert values[-1].min() < low + 2.0 * (high - low) / 64
+        assert values[-1].max() > high - 2.0 * (high - low) / 64
+        assert (values[0] == middle).all()
 
 
 # The plant.
@@ -398,11 +447,11 @@ def test_an_episode_of_a_drawn_robot_starts_at_rest(ground: str) -> None:
 def test_a_drawn_robot_that_cannot_stand_is_an_error_with_its_values() -> None:
     """Catches an error that leaves open which of the ranges is too wide."""
     env = make_walk(
-        **SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 90.0), load_x_m=(0.9, 0.9)))
+        **SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 91.0), load_x_m=(0.9, 0.91)))
     )
     with pytest.raises(
         ConfigurationError,
-        match=r"load_kg=90\.0, load_x_m=0\.9.* does not stand.*narrow the ran",
+        match=r"load_kg=90\..*, load_x_m=0\.90.* does not stand.*narrow the ran",
     ):
         env.reset(seed=0)
 
@@ -499,30 +548,29 @@ def test_measurements_are_old_in_the_worlds_of_delayed_robots_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ranges", "fixed"),
+    "numbers",
     [
-        (
-            {"inertial_share": 1.0, "delay_share": 1.0},
-            {"inertial": InertialSensor(), "delay_steps": 1},
-        ),
-        ({"push_n": (50.0, 50.0)}, {"push_n": 50.0}),
-        ({"delay_share": 1.0}, {"delay_steps": 1}),
+        {"inertial_share": 1.0, "delay_share": 1.0},
+        {"push_n": 50.0},
+        {"stiffness": 0.7, "joint_stiffness": 1.1, "damping": 2.0},
+        {"backlash_rad": 1e-3, "friction": 1.2},
+        {"load_kg": 5.0},
+        {"load_kg": 5.0, "load_z_m": -0.1},
+        {"floor_friction": 0.3},
     ],
+    ids=lambda numbers: "-".join(numbers),
 )
-def test_a_range_of_one_value_is_the_condition_of_that_value(
-    monkeypatch: pytest.MonkeyPatch, ranges: dict[str, Any], fixed: dict[str, Any]
-) -> None:
-    """Catches a second mechanism beside that of the named scenarios: the same numbers must come
-    out."""
-    monkeypatch.setattr(walk_config, "RANGES_BANK_SIZE", 1)
+def test_a_robot_that_is_compiled_walks_as_one_that_is_changed(numbers: dict[str, Any]) -> None:
+    """Catches a quantity that is compiled into the plant of all robots and that its robots have
+    once more, or not at all."""
     nominal = make_scenario("nominal")
     seen = []
-    for scenario in (nominal.replace(ranges=[RobotRanges(**ranges)]), nominal.replace(**fixed)):
+    for scenario in (nominal.replace(mixture=[RobotRanges(**numbers)]), nominal.replace(**numbers)):
         env = make_walk(**SHORT, scenario=scenario)
         rows = [env.reset(seed=3)[0]]
         rows += [env.step(np.full(12, 1e-3, np.float32))[0] for _ in range(400)]
         seen.append(np.array(rows))
-    np.testing.assert_allclose(*seen, rtol=0.0, atol=1e-6 if "push_n" not in ranges else 1e-5)
+    np.testing.assert_allclose(*seen, rtol=0.0, atol=1e-5)
 
 
 def test_robots_with_and_without_an_inertial_imu_walk_side_by_side() -> None:

@@ -202,10 +202,13 @@ def test_a_configuration_names_ranges_for_training_and_evaluation() -> None:
     trained, nominal = learned_from.task._kinds
     (scored,) = evaluated.task._kinds
     for kind in (trained, scored):
-        assert kind.config.scenario.ranges == (TRAINING_RANGES.replace(load_kg=(0.0, 2.0)),)
+        own = kind.config.scenario
+        expected = TRAINING_RANGES.replace(load_kg=(0.0, 2.0))
+        assert dict(own.intervals()) == dict(expected.intervals())
+        assert own.delay_share == expected.delay_share
         assert max(robot.load_kg for robot in kind.bank) <= 2.0
     assert not set(trained.bank) & set(scored.bank)
-    assert not nominal.config.scenario.ranges
+    assert nominal.config.scenario == make_scenario("nominal")
     again = TrainConfig(**config.model_dump(mode="json"))
     assert (
         again.condition("drawn", "input").scenario_played
@@ -219,8 +222,8 @@ def test_a_comparison_plays_its_ranges_and_keeps_those_of_held_out_robots() -> N
         name="x", env="walker", scenarios=["drawn", "drawn_beyond"], policies=["zero"], ranges=OWN
     )
     drawn, beyond = (make_scenario(condition.scenario_played) for condition in config.conditions())
-    assert drawn.ranges[0].load_kg == (0.0, 2.0)
-    assert beyond.ranges == make_scenario("drawn_beyond").ranges
+    assert drawn.load_kg == (0.0, 2.0)
+    assert beyond.mixture == make_scenario("drawn_beyond").mixture
 
 
 def test_several_ranges_keep_combinations_out_of_training() -> None:

@@ -9,7 +9,7 @@ import pytest
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.world.scenario import Scenario, make_scenario
-from elastic_env.world.sensors import AttitudeSensor, InertialSensor
+from elastic_env.world.sensors import AttitudeSensor
 
 
 @pytest.mark.parametrize(
@@ -35,20 +35,25 @@ def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) 
     "alone",
     [
         {"pelvis_imu": AttitudeSensor(noise_rad=1e-3)},
-        {"pelvis_imu": AttitudeSensor(bias_spread_rad=1e-3)},
+        {"mounting_rad": (0.0, 1e-3)},
         {"gyro_noise_rad_s": 1e-3},
         {"force_noise_n": 1.0},
         {"moment_noise_nm": 0.1},
+        {"force_bias_n": (0.0, 5.0)},
+        {"moment_drift_nm_s": (0.0, 0.1)},
+        {"cross_talk": (0.0, 0.01)},
         {"force_bias_n": 5.0},
-        {"moment_drift_nm_s": 0.1},
-        {"cross_talk": 0.01},
+        {"mounting_rad": 1e-3},
         {"floor_friction": 0.3},
-        {"encoder_bias_rad": 1e-3},
-        {"stiffness_spread": 0.3},
+        {"homing_rad": (-1e-3, 1e-3)},
+        {"joint_stiffness": (0.7, 1.3)},
+        {"floor_friction": (0.3, 1.0)},
+        {"load_kg": (1.0, 2.0)},
+        {"delay_share": 0.5},
         {"slope_rad": 0.01},
-        {"delay_steps": 1},
+        {"delay_share": 1.0},
         {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)},
-        {"inertial": InertialSensor()},
+        {"inertial_share": 1.0},
     ],
     ids=lambda alone: "-".join(alone),
 )

@@ -652,7 +652,7 @@ def test_in_sensor_measurements_are_one_control_step_old_and_homed_with_an_error
     step = 2.0 * np.pi / ENCODER_COUNTS_PER_TURN
     bias = observations[1:, 0] - theta[:-1]
     assert np.ptp(bias) <= step * (1 + 1e-9)
-    assert 1e-5 < abs(bias.mean()) <= make_scenario("sensor").encoder_bias_rad
+    assert 1e-5 < abs(bias.mean()) <= make_scenario("sensor").homing_rad[1]
     assert np.ptp(observations[:, 0] - theta) > 5 * step  # without the delay it would not fit
     np.testing.assert_allclose(
         observations[1:, 1], np.diff(observations[:, 0]) / PERIOD_S, rtol=0.0, atol=1e-12
@@ -667,8 +667,8 @@ def test_biases_of_the_worlds_are_spread_over_their_interval() -> None:
     encoder = observation[:, 0] - (info["link_angle"] + info["deflection"])
     imu = observation[:, 6] - info["link_angle"] - scenario.imu.bias_rad
     for bias, width, noise in [
-        (encoder, scenario.encoder_bias_rad, 1e-5),
-        (imu, scenario.imu.bias_spread_rad, 4 * scenario.imu.noise_rad),
+        (encoder, scenario.homing_rad[1], 1e-5),
+        (imu, scenario.mounting_rad[1], 4 * scenario.imu.noise_rad),
     ]:
         assert np.abs(bias).max() <= width + noise
         assert bias.max() > 0.9 * width

@@ -22,6 +22,7 @@ from elastic_env.joint.motor import Motor, terminal_speed
 from elastic_env.joint.varying_friction import VaryingFriction
 from elastic_env.world.drawn_robot import set_joints
 from elastic_env.world.physics import ManyWorlds, SingleWorld, simulate
+from elastic_env.world.scenario import Scenario
 
 MOTOR = Motor(torque_constant=0.4, back_emf=0.5, resistance=3.0, voltage=5.0, pwm_limit=0.9)
 SERVO = Servo(position_gain=20.0, velocity_gain=0.2, torque_limit=2.0, speed_limit=9.0)
@@ -290,7 +291,7 @@ def test_a_drawn_robot_has_its_own_varying_friction() -> None:
     many = ManyWorlds(model, 2)
     drawn = draw_robot([RobotRanges(friction=(0.5, 0.5))], 1, np.random.default_rng(1))
     links = np.array([model.joint("q").dofadr[0]])
-    set_joints(lambda name: many.vary(name)[1], model, np.array([0]), links, drawn)
+    set_joints(lambda name: many.vary(name)[1], model, np.array([0]), links, drawn, Scenario())
     friction = VaryingFriction(model)
     limits = friction.limits(many._field, many.bind)[:, 0]
     np.testing.assert_allclose(limits, [0.08, 0.04])

@@ -1,25 +1,34 @@
-"""Ranges that robots are drawn from: domain randomisation, one closed interval per quantity.
+"""What differs on a robot: one closed interval per quantity, and the robots drawn from them.
 
-A bank of robots is a Latin hypercube of the ranges [McKay1979]: every quantity takes one value in
-each of n intervals of equal width, so that few robots cover all of them. Every quantity has
-generators of its own. So a range that is changed leaves the draws of the others as they are.
+A number is an interval of one point, which every robot has exactly. A bank of robots is a Latin
+hypercube of the ranges [McKay1979]: every quantity takes one value in each of n intervals of equal
+width, so that few robots cover all of them. Every quantity has generators of its own. So a range
+that is changed leaves the draws of the others as they are.
 
 [McKay1979] M. D. McKay, R. J. Beckman, W. J. Conover, "A Comparison of Three Methods for Selecting
 Values of Input Variables in the Analysis of Output from a Computer Code", Technometrics 21(2).
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Self, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.config import Model, plain_numbers, quantity
+from elastic_env.core.signals import Array, BoolArray
 
-Interval: TypeAlias = tuple[float, float]
-"""Lowest and highest value, both included."""
+
+def _ends(value: Any) -> Any:
+    """A number as the interval of this one point."""
+    plain = plain_numbers(value)
+    is_number = isinstance(plain, int | float) and not isinstance(plain, bool)
+    return (plain, plain) if is_number else value
+
+
+Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_ends)]
+"""Lowest and highest value, both included; given as two numbers, or as one for a single point."""
 
 FOOT_ERRORS = (
     "force_bias_n",
@@ -31,6 +40,9 @@ FOOT_ERRORS = (
 """Errors of the feet's force-torque sensors, see `elastic_env.world.foot_sensors`."""
 CROSS_TALK_ENTRIES = 30
 """Of a foot's sensor: six axes on the five others."""
+LOAD_PLACE = ("load_x_m", "load_y_m", "load_z_m")
+"""Place of the load from the torso's center of mass."""
+_LOAD = ("load_kg", *LOAD_PLACE)
 _OF_BOTH_FEET = dict.fromkeys(FOOT_ERRORS, 6) | {"cross_talk": 2 * CROSS_TALK_ENTRIES}
 
 
@@ -46,10 +58,14 @@ def interval(unit: str, nominal: float, bounds: Interval) -> Any:
     return Field((nominal, nominal), json_schema_extra=extra)
 
 
+_SHOULDERS_M = (0.0056, 0.1595)
+"""Place of a load on the shoulders before and above the torso's center of mass [m]."""
+
+
 class RobotRanges(Model):
     """Intervals of the quantities in which robots differ from the assumed one; by default none.
 
-    The draws depend on the order of these fields, see `draw_robots`.
+    The draws depend on the order of these fields: a new one stands last.
     """
 
     stiffness: Interval = interval("1", 1.0, bounds=(0.05, 20))
@@ -61,15 +77,15 @@ class RobotRanges(Model):
     friction: Interval = interval("1", 1.0, bounds=(0, 100))
     """Factor on dry and viscous friction, of all joints together [1]."""
     backlash_rad: Interval = interval("rad", 0.0, bounds=(0, 0.1))
-    """Further dead band, of all joints together [rad]."""
+    """Further dead band of every joint, the same in all [rad]."""
     load_kg: Interval = interval("kg", 0.0, bounds=(0, 100))
     """Load on the torso [kg]."""
-    load_x_m: Interval = interval("m", 0.0, bounds=(-1, 1))
-    """Place of the load before the torso's center of mass [m]."""
+    load_x_m: Interval = interval("m", _SHOULDERS_M[0], bounds=(-1, 1))
+    """Place of the load before the torso's center of mass; by default on the shoulders [m]."""
     load_y_m: Interval = interval("m", 0.0, bounds=(-1, 1))
     """The same, to the left of it [m]."""
-    load_z_m: Interval = interval("m", 0.0, bounds=(-1, 1))
-    """The same, above it [m]."""
+    load_z_m: Interval = interval("m", _SHOULDERS_M[1], bounds=(-1, 1))
+    """The same, above it; by default on the shoulders [m]."""
     homing_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
     """Error of the encoders, of every joint its own [rad]."""
     mounting_rad: Interval = interval("rad", 0.0, bounds=(-0.1, 0.1))
@@ -95,6 +111,8 @@ class RobotRanges(Model):
     cross_talk: Interval = interval("1", 0.0, bounds=(-1, 1))
     """Share of the full scale of an axis that shows on another one, of every foot and pair of axes
     its own [1]."""
+    floor_friction: Interval = interval("1", 1.0, bounds=(0, 10))
+    """Factor on the friction of soles and floor [1]."""
 
     @model_validator(mode="after")
     def _intervals_are_in_order(self) -> Self:
@@ -103,28 +121,52 @@ class RobotRanges(Model):
             lowest, highest = extra["bounds"]
             if not lowest <= low <= high <= highest:
                 raise ValueError(
-                    f"{name} must be [lowest, highest] within {lowest:g} to {highest:g} "
-                    f"[{extra['unit']}], got [{low:g}, {high:g}]"
+                    f"{name} must be a number or [lowest, highest] within {lowest:g} to"
+                    f" {highest:g} [{extra['unit']}], got [{low:g}, {high:g}]"
                 )
         return self
 
     def on_fixed_base(self) -> Self:
-        """The same without what only a walker has: load, push, floor, its IMU and its feet."""
-        of_walkers = ("load_", "slope_rad", "push_n", "inertial_share", *FOOT_ERRORS)
-        fields = type(self).model_fields
-        left_out = [name for name in fields if name.startswith(of_walkers)]
-        return self.replace(**{name: fields[name].default for name in left_out})
+        """The same without `WALKER_FIELDS`."""
+        fields = RobotRanges.model_fields
+        return self.replace(**{name: fields[name].default for name in WALKER_FIELDS})
 
     def intervals(self) -> Iterator[tuple[str, Interval]]:
         """Quantities with an interval, by name."""
-        for name, value in self:
-            if isinstance(value, tuple):
+        for name in RobotRanges.model_fields:
+            if isinstance(value := getattr(self, name), tuple):
                 yield name, value
+
+    @property
+    def changes(self) -> list[str]:
+        """Quantities that are not those of the assumed robot."""
+        fields = RobotRanges.model_fields
+        return [name for name in fields if getattr(self, name) != fields[name].default]
+
+    def fixed(self, name: str) -> float:
+        """The value of an interval of one point; that of the assumed robot where robots differ."""
+        default = RobotRanges.model_fields[name].default
+        return (default if self.draws(name) else getattr(self, name))[0]
+
+    def draws(self, name: str) -> bool:
+        """True if robots differ in a quantity; of a share, if only some robots have it."""
+        value = getattr(self, name)
+        return value[0] < value[1] if isinstance(value, tuple) else 0.0 < value < 1.0
+
+    @property
+    def is_one_robot(self) -> bool:
+        """True if all robots are the same."""
+        # the floor may rise in any direction
+        return self.slope_rad[1] == 0.0 and not any(map(self.draws, RobotRanges.model_fields))
+
+
+WALKER_FIELDS = (*_LOAD, "slope_rad", "push_n", "push_share", *FOOT_ERRORS, "floor_friction")
+"""Quantities of `RobotRanges` that only a robot that walks has."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnRobot:
-    """A value for every quantity of `RobotRanges`, under its name, on top of the scenario's plant.
+    """A value for every quantity of `RobotRanges`, under its name.
 
     Attributes:
         stiffness: Factor on K of every joint [1].
@@ -139,48 +181,53 @@ class DrawnRobot:
     """
 
     stiffness: tuple[float, ...]
-    damping: float = 1.0
-    friction: float = 1.0
-    backlash_rad: float = 0.0
-    load_kg: float = 0.0
-    load_x_m: float = 0.0
-    load_y_m: float = 0.0
-    load_z_m: float = 0.0
+    damping: float
+    friction: float
+    backlash_rad: float
+    load_kg: float
+    load_x_m: float
+    load_y_m: float
+    load_z_m: float
     homing_rad: tuple[float, ...]
-    mounting_rad: tuple[float, float] = (0.0, 0.0)
-    slope_rad: float = 0.0
-    slope_direction_rad: float = 0.0
-    push_n: float = 0.0
-    is_delayed: bool = False
-    is_inertial: bool = False
-    force_bias_n: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["force_bias_n"]
-    moment_bias_nm: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["moment_bias_nm"]
-    force_drift_n_s: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["force_drift_n_s"]
-    moment_drift_nm_s: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["moment_drift_nm_s"]
-    cross_talk: tuple[float, ...] = (0.0,) * _OF_BOTH_FEET["cross_talk"]
+    mounting_rad: tuple[float, float]
+    slope_rad: float
+    slope_direction_rad: float
+    push_n: float
+    is_delayed: bool
+    is_inertial: bool
+    force_bias_n: tuple[float, ...]
+    moment_bias_nm: tuple[float, ...]
+    force_drift_n_s: tuple[float, ...]
+    moment_drift_nm_s: tuple[float, ...]
+    cross_talk: tuple[float, ...]
+    floor_friction: float
+
+    def with_exact_sensors(self) -> "DrawnRobot":
+        """The robot without push and errors of IMU and feet, which stands as this one does."""
+        feet: dict[str, Any] = dict.fromkeys(FOOT_ERRORS, (0.0,))
+        others = {"push_n": 0.0, "is_delayed": False, "is_inertial": False}
+        return replace(self, mounting_rad=(0.0, 0.0), **others, **feet)
 
     def record(self) -> dict[str, float]:
         """The robot in figures, by name with unit, for the records of episodes."""
         roll, pitch = self.mounting_rad
-        rms = {
-            name: np.sqrt(np.mean(np.square(getattr(self, name))))
-            for name in ("homing_rad", *FOOT_ERRORS)
-        }
-        of_several = {
-            "stiffness": {"stiffness": np.mean(self.stiffness)},
-            "homing_rad": {"homing_rms_rad": rms["homing_rad"]},
-            "force_bias_n": {"force_bias_rms_n": rms["force_bias_n"]},
-            "moment_bias_nm": {"moment_bias_rms_nm": rms["moment_bias_nm"]},
-            "force_drift_n_s": {"force_drift_rms_n_s": rms["force_drift_n_s"]},
-            "moment_drift_nm_s": {"moment_drift_rms_nm_s": rms["moment_drift_nm_s"]},
-            "cross_talk": {"cross_talk_rms": rms["cross_talk"]},
-            "mounting_rad": {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch},
-        }
-        return {
-            f"robot_{name}": float(figure)
-            for quantity_, value in vars(self).items()
-            for name, figure in of_several.get(quantity_, {quantity_: value}).items()
-        }
+        figures = vars(self) | {"stiffness": np.mean(self.stiffness)}
+        figures |= {"mounting_roll_rad": roll, "mounting_pitch_rad": pitch}
+        del figures["mounting_rad"]
+        for name, title in _RMS_OF.items():
+            figures[title] = np.sqrt(np.mean(np.square(figures.pop(name))))
+        return {f"robot_{name}": float(figure) for name, figure in figures.items()}
+
+
+_RMS_OF = {
+    "homing_rad": "homing_rms_rad",
+    "force_bias_n": "force_bias_rms_n",
+    "moment_bias_nm": "moment_bias_rms_nm",
+    "force_drift_n_s": "force_drift_rms_n_s",
+    "moment_drift_nm_s": "moment_drift_rms_nm_s",
+    "cross_talk": "cross_talk_rms",
+}
+"""Quantities of several values, and the figure that records have of them."""
 
 
 def draw_robots(
@@ -217,9 +264,9 @@ def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -
     return (strata + generator.random((columns, number))).T / number
 
 
-_LOAD = ("load_kg", "load_x_m", "load_y_m", "load_z_m")
-_OF_ONE = ("damping", "friction", "backlash_rad", *_LOAD, "slope_rad")
-"""Quantities of which a robot has one value, under the name of their range."""
+_OF_SEVERAL = ("stiffness", "homing_rad", "mounting_rad", *FOOT_ERRORS)
+"""Quantities of which a robot has several values."""
+_DIRECTION = "slope_direction"
 
 
 def _draw(
@@ -227,31 +274,30 @@ def _draw(
 ) -> Iterator[DrawnRobot]:
     """Robots of one set of ranges."""
     width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2, **_OF_BOTH_FEET}
-    names = [name for name in RobotRanges.model_fields if name not in FOOT_ERRORS]
+    names = list(RobotRanges.model_fields)
     # in this order, so that the draws of the first stay as they were
-    names += ["slope_direction", *FOOT_ERRORS]
-    unit: dict[str, Array] = {}
-    for index, name in enumerate(names):
-        generator = np.random.default_rng([*seed, index])
-        unit[name] = latin_hypercube(number, width.get(name, 1), generator)
-    # not low + u (high - low), which may end beyond high by rounding
-    drawn = {
-        name: np.clip(low + unit[name] * (high - low), low, high)
-        for name, (low, high) in ranges.intervals()
-    }
-    stiffness = drawn["stiffness"] * drawn["joint_stiffness"]
+    names.insert(names.index(FOOT_ERRORS[0]), _DIRECTION)
+
+    def draw(name: str, low: float = 0.0, high: float = 1.0) -> Array:
+        shape = (number, width.get(name, 1))
+        if low == high:
+            return np.full(shape, low)
+        unit = latin_hypercube(*shape, np.random.default_rng([*seed, names.index(name)]))
+        # not low + u (high - low), which may end beyond high by rounding
+        return np.clip(low + unit * (high - low), low, high)
+
+    def has(share: str) -> BoolArray:
+        return draw(share)[:, 0] < getattr(ranges, share)
+
+    drawn = {name: draw(name, *ends) for name, ends in ranges.intervals()}
+    drawn["stiffness"] = drawn["stiffness"] * drawn.pop("joint_stiffness")
+    drawn["push_n"][~has("push_share")] = 0.0
+    turns = float(ranges.slope_rad[1] > 0.0)
+    drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=turns)
+    shares = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
     for i in range(number):
-        is_pushed = unit["push_share"][i, 0] < ranges.push_share
-        roll, pitch = drawn["mounting_rad"][i].tolist()
-        feet: dict[str, Any] = {name: tuple(drawn[name][i].tolist()) for name in FOOT_ERRORS}
-        yield DrawnRobot(
-            stiffness=tuple(stiffness[i].tolist()),
-            homing_rad=tuple(drawn["homing_rad"][i].tolist()),
-            mounting_rad=(roll, pitch),
-            slope_direction_rad=float(2.0 * np.pi * unit["slope_direction"][i, 0]),
-            push_n=float(drawn["push_n"][i, 0]) if is_pushed else 0.0,
-            is_delayed=bool(unit["delay_share"][i, 0] < ranges.delay_share),
-            is_inertial=bool(unit["inertial_share"][i, 0] < ranges.inertial_share),
-            **{name: float(drawn[name][i, 0]) for name in _OF_ONE},
-            **feet,
-        )
+        values: dict[str, Any] = {name: bool(share[i]) for name, share in shares.items()}
+        for name, of_robots in drawn.items():
+            each = tuple(of_robots[i].tolist())
+            values[name] = each if name in _OF_SEVERAL else each[0]
+        yield DrawnRobot(**values)

@@ -35,7 +35,7 @@ from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import deviations
 from elastic_env.world import robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
+from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights, require_torque
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointPlant, JointTask
 from elastic_env.world.robot_model import RobotModel, joint_ranges
@@ -47,7 +47,6 @@ _SPARE = 0.8
 """Share of the servos' torque that poses may need at rest."""
 _POINT = 1e-4
 """Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
-_FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ class JointRobotConfig(JointConfig):
         """Joints as a compensator knows them: without friction where the scenario has none."""
         if self.scenario.friction_scale > 0.0:
             return self.joints
-        none = dict.fromkeys(_FRICTIONS, 0.0)
+        none = dict.fromkeys(FRICTIONS, 0.0)
         return {name: one.replace(**none) for name, one in self.joints.items()}
 
     def plant(self) -> JointPlant:

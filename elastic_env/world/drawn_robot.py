@@ -27,19 +27,23 @@ def set_joints(
     springs: IntArray,
     links: IntArray,
     robot: DrawnRobot,
+    scenario: Scenario,
 ) -> None:
     """Give a plant the joints of a drawn robot.
 
     Args:
         field: The plant's own array of a field of its model.
-        model: The plant, what is drawn aside.
+        model: The plant with what is fixed in the scenario.
         springs: As of `spring_ids`.
         links: Degrees of freedom of the links, (n,).
         robot: As it was drawn.
+        scenario: It.
     """
     if len(springs):
-        ends = robot.backlash_rad * np.array([-0.5, 0.5])
-        K = model.tendon_stiffness[springs] * robot.stiffness
+        further = robot.backlash_rad - scenario.fixed("backlash_rad")
+        ends = further * np.array([-0.5, 0.5])
+        factor = np.array(robot.stiffness) / scenario.fixed("stiffness")
+        K = model.tendon_stiffness[springs] * factor
         field("tendon_lengthspring")[springs] = model.tendon_lengthspring[springs] + ends
         field("tendon_stiffness")[springs] = K
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
@@ -50,13 +54,20 @@ def set_joints(
         field("numeric_data")[terms] = model.numeric_data[terms] * robot.friction
 
 
+def joints_differ(scenario: Scenario) -> bool:
+    """True if robots have other joints than the plant with what is fixed in the scenario."""
+    factors = (scenario.joint_stiffness, scenario.damping, scenario.friction)
+    is_wide = scenario.draws("stiffness") or scenario.draws("backlash_rad")
+    return is_wide or any(own != (1.0, 1.0) for own in factors) or bool(scenario.mixture)
+
+
 def require_passing(robot: RobotModel, scenario: Scenario) -> None:
     """Refuse a scenario whose draws let a joint pass no torque at all.
 
     Raises:
         ConfigurationError: Friction takes the whole load of a joint.
     """
-    factor = max((own.friction[1] for own in scenario.ranges), default=1.0)
+    factor = max(own.friction[1] for own in scenario.parts)
     worst = int(robot.load_friction.argmax())
     share = float(robot.load_friction[worst])
     if factor * share >= 1.0:
@@ -69,12 +80,8 @@ def require_passing(robot: RobotModel, scenario: Scenario) -> None:
 
 def stiffest_plant(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
     """A plant with the stiffest springs and strongest dampers that a scenario draws."""
-    stiffest = 1.0 + scenario.stiffness_spread
-    strongest = 1.0
-    for own in scenario.ranges:
-        stiffest = max(stiffest, own.stiffness[1] * own.joint_stiffness[1])
-        strongest = max(strongest, own.damping[1])
+    stiffest = max(own.stiffness[1] * own.joint_stiffness[1] for own in scenario.parts)
     plant = copy.copy(model)
-    plant.tendon_stiffness[:] *= stiffest
-    plant.tendon_damping[:] *= strongest
+    plant.tendon_stiffness[:] *= stiffest / scenario.fixed("stiffness")
+    plant.tendon_damping[:] *= max(own.damping[1] for own in scenario.parts)
     return plant

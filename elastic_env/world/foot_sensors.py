@@ -14,10 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
 from elastic_env.core.signals import Array
-from elastic_env.world.scenario import Scenario
 
 _RANGE_RATIO_M = 0.04
 """Range of the moments over that of the forces [m]: 8 N·m over 200 N of a six-axis sensor as it is
@@ -39,23 +37,9 @@ def cross_talk_matrix(shares: Array) -> Array:
     return matrix * ranges[:, None] / ranges
 
 
-def foot_errors(scenario: Scenario, robot: DrawnRobot, random: EpisodeRandom) -> dict[str, Any]:
-    """Errors of both feet's sensors in an episode: the robot's, and those the scenario draws.
-
-    Args:
-        scenario: Its half-widths.
-        robot: What it was drawn with.
-        random: Of the episode; all other draws stay as they are.
-
-    Returns:
-        Fields of the walker's record `BIAS`.
-    """
+def foot_errors(robot: DrawnRobot) -> dict[str, Any]:
+    """Errors of both feet's sensors, as fields of the walker's record `BIAS`."""
     drawn = {name: np.array(getattr(robot, name)) for name in FOOT_ERRORS}
-    widths = {name: getattr(scenario, name) for name in FOOT_ERRORS}
-    if any(widths.values()):
-        generator = random.fork()
-        for name, width in widths.items():
-            drawn[name] += width * generator.uniform(-1.0, 1.0, len(drawn[name]))
     force, moment, force_rate, moment_rate = (
         drawn[name].reshape(2, 3) for name in FOOT_ERRORS if name != "cross_talk"
     )

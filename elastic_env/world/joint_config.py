@@ -7,12 +7,16 @@ from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.robot_ranges import WALKER_FIELDS
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
 from elastic_env.world import scenario as scenarios
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.scenario import Scenario, make_scenario
+
+FRICTIONS = ("coulomb_friction", "viscous_friction", "load_friction", "static_friction")
+"""Parameters of an `ElasticJoint` that are friction."""
 
 
 class RewardWeights(Model):
@@ -37,6 +41,23 @@ class TaskConfig(Model):
     control_period_s: float = quantity("s", 0.004, gt=0)
     """Time between commands [s]."""
 
+    def as_built(self, joint: ElasticJoint) -> ElasticJoint:
+        """A known joint as the plant of the scenario has it.
+
+        Raises:
+            ConfigurationError: With more friction it passes no torque at all.
+        """
+        scenario = self.scenario
+        return self.with_friction_of_ground(joint).replace(
+            stiffness=joint.stiffness * scenario.fixed("stiffness"),
+            backlash=joint.backlash + scenario.fixed("backlash_rad"),
+        )
+
+    def with_friction_of_ground(self, joint: ElasticJoint) -> ElasticJoint:
+        """A known joint with the share of its friction that acts."""
+        scale = self.scenario.friction_scale
+        return joint.replace(**{name: scale * getattr(joint, name) for name in FRICTIONS})
+
 
 class JointConfig(TaskConfig):
     """Parameters of all tasks of elastic joints on a fixed base."""
@@ -50,7 +71,8 @@ class JointConfig(TaskConfig):
 
     @model_validator(mode="after")
     def _scenario_acts(self) -> Self:
-        acting = [name for name in scenarios.WALKER_FIELDS if getattr(self.scenario, name)]
+        set_ = {name for own in self.scenario.parts for name in own.changes}
+        acting = [name for name in WALKER_FIELDS if name in set_]
         if acting:
             raise ValueError(
                 f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"
@@ -65,22 +87,6 @@ class JointConfig(TaskConfig):
             ConfigurationError: Its servos are too weak for the reference, or a sensor has no place.
         """
         raise NotImplementedError
-
-    def as_built(self, joint: ElasticJoint) -> ElasticJoint:
-        """A known joint as the plant of the scenario has it.
-
-        Raises:
-            ConfigurationError: With more friction it passes no torque at all.
-        """
-        scenario = self.scenario
-        return joint.replace(
-            stiffness=joint.stiffness * scenario.stiffness_scale,
-            coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
-            viscous_friction=joint.viscous_friction * scenario.friction_scale,
-            load_friction=joint.load_friction * scenario.friction_scale,
-            static_friction=joint.static_friction * scenario.friction_scale,
-            backlash=joint.backlash + scenario.backlash_rad,
-        )
 
 
 def require_torque(reference: Reference, needed: Array, limits: Array) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.robot_ranges import draw_robot
+from elastic_env.core.robot_ranges import draw_robot, draw_robots
 from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
 from elastic_env.joint.elasticity import static_link_angle
 from elastic_env.joint.time_step import require_stable
@@ -25,6 +25,7 @@ from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world import rows as records
 from elastic_env.world.drawn_robot import (
+    joints_differ,
     require_passing,
     set_joints,
     spring_ids,
@@ -228,6 +229,9 @@ class JointTask(Task):
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
         self._springs = spring_ids(self.model, joints, config.form)
+        self._joints_differ = joints_differ(scenario)
+        is_one = scenario.has_one_robot
+        self._robot = draw_robots(scenario.parts, 1, len(joints), [0])[0] if is_one else None
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes, also for the watch over windows at rest."""
@@ -263,24 +267,17 @@ class JointTask(Task):
         )
 
     def _draw(self, world: int, random: EpisodeRandom) -> None:
-        scenario = self.config.scenario
         generator = random.robot
         n = len(self._joint_names)
         self._reference.draw(world, generator)
-        homing = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
-        mounting = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
+        parts = self.config.scenario.parts
+        robot = self._robot or draw_robot(parts, n, random.fork())
+        self._take_robot(world, robot)
+        generator.random(n + 1)  # not used: noise follows what has always been drawn here
         self._noise.restart(world, random.noise())
-        if self._imu is not None:
-            mounting += self._imu.draw(world, generator, random.noise())
-        factor = np.ones(n)
-        if scenario.stiffness_spread > 0.0:
-            factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
-        robot = scenario.make_robot(factor, homing, mounting_rad=(float(mounting), 0.0))
-        if scenario.ranges:
-            ranges = [own.on_fixed_base() for own in scenario.ranges]
-            robot = draw_robot(ranges, n, generator)
-        self._take_robot(world, robot, self._true_model)
         self._imu_bias[world] = robot.mounting_rad[0]
+        if self._imu is not None:
+            self._imu_bias[world] += self._imu.draw(world, generator, random.noise())
         self._kind[world] = int(robot.is_delayed)
 
     def _place(self, worlds: BoolArray) -> None:
@@ -291,7 +288,7 @@ class JointTask(Task):
         model = self._true_model
         truth = self._joints[self._row]["truth"][worlds]
         begun = np.flatnonzero(worlds).tolist()
-        if scenario.ranges or scenario.stiffness_spread > 0.0:
+        if self._joints_differ:
             for world in begun:
 
                 def field(name: str, world: int = world) -> Array:
@@ -299,10 +296,10 @@ class JointTask(Task):
 
                 links = at["q_dot"]
                 robot = self._robots[world]
-                set_joints(field, self.model, self._springs, links, robot)
+                set_joints(field, self.model, self._springs, links, robot, scenario)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
         command = q_ref - truth["homing"]
-        factor = np.array([self._robots[world].stiffness for world in begun])
+        factor = truth["stiffness"] / model.stiffness
         q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
         theta = command - model.servo_compliance * torque
@@ -414,14 +411,19 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
     Raises:
         ConfigurationError: The robot has no place for it.
     """
-    sensor = config.scenario.inertial
-    if sensor is None:
+    scenario = config.scenario
+    if all(own.inertial_share == 0.0 for own in scenario.parts):
         return None
+    if any(own.inertial_share < 1.0 for own in scenario.parts):
+        raise ConfigurationError(
+            f"scenario {scenario.name!r} has an inertial IMU in a share of the robots, which only a"
+            " walker knows; here inertial_share must be 0 or 1"
+        )
     if plant.imu_arm_m is None:
         raise ConfigurationError(
-            f"scenario {config.scenario.name!r} is about the IMU on a link, which {plant.name} does"
+            f"scenario {scenario.name!r} is about the IMU on a link, which {plant.name} does"
             " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
     period_s = config.control_period_s
-    return PendulumImu(sensor, plant.imu_arm_m, gravity, period_s, num_worlds)
+    return PendulumImu(scenario.inertial, plant.imu_arm_m, gravity, period_s, num_worlds)

@@ -10,15 +10,14 @@ Sensors 19(24), 5521.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.config import Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.robot_ranges import FOOT_ERRORS, DrawnRobot, RobotRanges
-from elastic_env.core.signals import Array
+from elastic_env.core.robot_ranges import LOAD_PLACE, WALKER_FIELDS, RobotRanges
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
@@ -26,111 +25,67 @@ MOST_RANGES = 100
 """Ranges that the robots of a scenario come from."""
 
 
-class Scenario(Model):
-    """Difference between the true plant and the assumed model, and the quality of the sensors."""
+class Scenario(RobotRanges):
+    """Difference between the true plant and the assumed model, and the quality of the sensors.
+
+    The intervals of `RobotRanges` say in what robots differ; a number is what all of them have.
+    """
 
     name: Title = "custom"
-    stiffness_scale: float = quantity("1", 1.0, gt=0)
-    """True over assumed stiffness of every joint [1]."""
     friction_scale: float = quantity("1", 1.0, ge=0)
-    """Share of the joints' friction that acts, 0 for none [1]."""
-    backlash_rad: float = quantity("rad", 0.0, ge=0)
-    """Dead band of every joint, unknown to the compensator [rad]."""
-    stiffness_spread: float = quantity("1", 0.0, ge=0, lt=1)
-    """Half-width of a further factor on every joint's stiffness, drawn per robot [1]."""
+    """Share of the joints' friction that acts, 0 for none; policies know it [1]."""
     pendulum_mass_scale: float = quantity("1", 1.0, gt=0)
     """Testbed: true over assumed mass of pendulum [1]."""
-    torso_load_kg: float = quantity("kg", 0.0, ge=0)
-    """Walker: mass on the torso, not in the model [kg]."""
-    push_n: float = quantity("N", 0.0, ge=0)
-    """Walker: force of a push on the torso, anywhere in the walk [N]."""
     push_s: float = quantity("s", 0.1, gt=0, le=600)
     """Walker: duration of the push [s]."""
-    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5)
-    """Walker: slope of the floor, direction drawn [rad]."""
-    floor_friction: float | None = quantity("1", None, gt=0)
-    """Walker: friction of soles and floor, None for that of the robot [1]."""
     encoder_counts: bool = True
     """True if the encoders have whole counts."""
-    encoder_bias_rad: float = quantity("rad", 0.0, ge=0)
-    """Half-width of the encoders' homing error [rad]."""
     imu: AttitudeSensor = AttitudeSensor()
     """IMU on the link of the testbed."""
     pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
     """IMU in the pelvis of the walker, the same for roll and pitch."""
-    inertial: InertialSensor | None = None
-    """IMU in the walker's pelvis or on the testbed's link that computes its attitude; None for one
-    that shows the true one with the noise of `pelvis_imu` or `imu`. Other errors of these are then
-    those of the mounting."""
+    inertial: InertialSensor = InertialSensor()
+    """IMU of robots whose IMU computes its attitude, see `inertial_share`. Other errors of
+    `pelvis_imu` or `imu` are then those of the mounting, without their noise."""
     gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0)
     """Walker: standard deviation of the gyroscope [rad/s]."""
     force_noise_n: float = quantity("N", 0.0, ge=0)
     """Walker: standard deviation of the foot forces [N]."""
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0)
     """Walker: standard deviation of the foot moments [N·m]."""
-    force_bias_n: float = quantity("N", 0.0, ge=0)
-    """Walker: half-width of a bias of the foot forces, of every foot and axis its own [N]."""
-    moment_bias_nm: float = quantity("N·m", 0.0, ge=0)
-    """Walker: the same of the foot moments [N·m]."""
-    force_drift_n_s: float = quantity("N/s", 0.0, ge=0)
-    """Walker: half-width of the rate at which the bias of the forces changes [N/s]."""
-    moment_drift_nm_s: float = quantity("N·m/s", 0.0, ge=0)
-    """Walker: the same of the moments [N·m/s]."""
-    cross_talk: float = quantity("1", 0.0, ge=0, le=1)
-    """Walker: half-width of the share of the full scale of an axis of a foot sensor that shows on
-    another one [1]."""
     sensor_noise: float = quantity("1", 0.0, ge=0)
     """Factor on the errors of further sensors [1]."""
-    delay_steps: int = quantity("control steps", 0, ge=0, le=1)
-    """Age of the measurements [control steps]."""
-    ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
-    """Ranges that every episode's robot is drawn from, in equal shares where there are several;
-    none for the robot that the other fields describe. What is drawn comes on top of what they
-    say."""
+    mixture: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
+    """Ranges in place of the scenario's own, each of an equal share of the robots."""
 
     @model_validator(mode="after")
-    def _ranges_say_all_that_is_drawn(self) -> Self:
-        fixed = [name for name in _LEFT_TO_RANGES if getattr(self, name)]
-        if self.imu.bias_spread_rad + self.pelvis_imu.bias_spread_rad > 0.0 and not fixed:
-            fixed = ["bias_spread_rad of pelvis_imu"]
-        if self.ranges and fixed:
+    def _mixture_says_all_that_differs(self) -> Self:
+        if self.mixture and self.changes:
             raise ValueError(
-                f"ranges say what is drawn; leave out {', '.join(fixed)}, or give the ranges an"
-                " interval for it"
+                f"mixture says in what robots differ; leave out {', '.join(self.changes)}, or give"
+                " it to the ranges of the mixture"
             )
         return self
 
-    def with_ranges(self, changes: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Self:
-        """The scenario with other intervals.
+    @property
+    def parts(self) -> tuple[RobotRanges, ...]:
+        """Ranges that have equal shares of the robots."""
+        return self.mixture or (self,)
 
-        One that draws from none, or from several ranges, stays as it is.
+    @property
+    def has_one_robot(self) -> bool:
+        """True if episodes differ in noise and in what an inertial IMU draws alone."""
+        return len(self.parts) == 1 and self.parts[0].is_one_robot
 
-        Args:
-            changes: Fields of `RobotRanges` that differ from the scenario's; of several such
-                mappings each makes ranges of its own, which have equal shares of the robots.
-        """
-        if not changes or len(self.ranges) != 1:
-            return self
-        each = [changes] if isinstance(changes, Mapping) else changes
-        return self.replace(ranges=[self.ranges[0].replace(**own) for own in each])
+    @property
+    def shoulder_load_kg(self) -> float:
+        """Load that all robots have on their shoulders, part of the true model [kg]."""
+        return 0.0 if {*LOAD_PLACE} & {*self.changes} else self.fixed("load_kg")
 
-    def make_robot(self, stiffness: Array, homing_rad: Array, **drawn: Any) -> DrawnRobot:
-        """A robot of the scenario without its ranges.
-
-        Args:
-            stiffness: Factor on K of every joint, (n,) [1].
-            homing_rad: Error of the encoder of every joint, (n,) [rad].
-            **drawn: Other quantities that were drawn.
-        """
-        return DrawnRobot(
-            stiffness=tuple(stiffness.tolist()),
-            homing_rad=tuple(homing_rad.tolist()),
-            slope_rad=self.slope_rad,
-            push_n=self.push_n,
-            is_delayed=self.delay_steps > 0,
-            is_inertial=self.inertial is not None,
-            **drawn,
-        )
+    @property
+    def places_loads(self) -> bool:
+        """True if robots carry other loads than that of all of them on the shoulders."""
+        return self.shoulder_load_kg == 0.0 and max(own.load_kg[1] for own in self.parts) > 0.0
 
     @property
     def draws_robots(self) -> bool:
@@ -138,27 +93,21 @@ class Scenario(Model):
 
         That is in joints, offsets of sensors, push or slope.
         """
-        spreads = (self.imu.bias_spread_rad, self.pelvis_imu.bias_spread_rad)
-        drawn = [getattr(self, name) for name in _DRAWN]
-        return bool(self.ranges) or self.inertial is not None or any([*drawn, *spreads])
+        acts = [own.push_n[1] + own.inertial_share > 0.0 for own in self.parts]
+        return not self.has_one_robot or any(acts)
 
     @property
     def is_random(self) -> bool:
         """True if episodes of the same motion differ, be it by noise alone."""
         noise = (self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm)
-        imus = (self.imu.is_random, self.pelvis_imu.is_random)
+        imus = (self.imu.noise_rad, self.pelvis_imu.noise_rad)
         return self.draws_robots or any(noise + imus)
 
     @property
     def homing_width_rad(self) -> float:
-        """Half-width of the homing error of link encoders; of ranges their largest error."""
-        drawn = [abs(end) for own in self.ranges for end in own.homing_rad]
-        return max([self.encoder_bias_rad, *drawn])
+        """Largest homing error of encoders [rad]."""
+        return max(abs(end) for own in self.parts for end in own.homing_rad)
 
-
-_DRAWN = ("stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad", *FOOT_ERRORS)
-_LEFT_TO_RANGES = (*_DRAWN, "inertial", "delay_steps")
-"""Parameters that `RobotRanges` has, too, for each robot its own."""
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
 # the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs
@@ -173,15 +122,16 @@ _MOMENT_NOISE_NM = 0.05
 # is 4 N and 0.16 N·m. THORMANG3 tares its feet in the air (thormang3_feet_ft_module), and from then
 # on the temperature of strain gauges makes them drift [AndradeChavez2019]: 1.2 N a minute. Good
 # sensors have up to 2 % of the full scale in cross-talk
-_FOOT_ERRORS = {
-    "force_bias_n": 5.0,
-    "moment_bias_nm": 0.15,
-    "force_drift_n_s": 0.02,
-    "moment_drift_nm_s": 0.0006,
-    "cross_talk": 0.01,
+_FOOT_ERRORS: dict[str, Any] = {
+    "force_bias_n": (-5.0, 5.0),
+    "moment_bias_nm": (-0.15, 0.15),
+    "force_drift_n_s": (-0.02, 0.02),
+    "moment_drift_nm_s": (-0.0006, 0.0006),
+    "cross_talk": (-0.01, 0.01),
 }
 # an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
 _HOMING_ERROR_RAD = 2e-3
+_HOMING = (-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD)
 
 GROUNDS: dict[str, Scenario] = {
     "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
@@ -199,25 +149,23 @@ GROUNDS: dict[str, Scenario] = {
 _LONGEST_JOINED = 1000
 """Characters of a joined name that are looked at."""
 
-ScenarioChange = Callable[[Scenario], dict[str, Any]]
-
-CHANGES: dict[str, ScenarioChange] = {
-    "soft": lambda _: {"stiffness_scale": 0.7},
-    "stiff": lambda _: {"stiffness_scale": 1.3},
-    "spread": lambda _: {"stiffness_spread": 0.3},
-    "payload": lambda _: {"pendulum_mass_scale": 1.2, "torso_load_kg": 5.0},
-    "backlash": lambda _: {"backlash_rad": BACKLASH_BOUND_RAD},
-    "sensor": lambda ground: {
-        "encoder_bias_rad": _HOMING_ERROR_RAD,
-        "imu": ground.imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
-        "pelvis_imu": ground.pelvis_imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
-        "delay_steps": 1,
+CHANGES: dict[str, dict[str, Any]] = {
+    "soft": {"stiffness": 0.7},
+    "stiff": {"stiffness": 1.3},
+    "spread": {"joint_stiffness": (0.7, 1.3)},
+    "payload": {"pendulum_mass_scale": 1.2, "load_kg": 5.0},
+    "backlash": {"backlash_rad": BACKLASH_BOUND_RAD},
+    "sensor": {
+        "homing_rad": _HOMING,
+        "mounting_rad": _HOMING,
+        "delay_share": 1.0,
+        **_FOOT_ERRORS,
     },
-    "imu": lambda _: {"inertial": InertialSensor(), "delay_steps": 1},
-    "push": lambda _: {"push_n": 50.0},
-    "slope": lambda _: {"slope_rad": math.radians(1.0)},
-    "foot_sensors": lambda _: _FOOT_ERRORS,
-    "slip": lambda _: {"floor_friction": 0.3},
+    "imu": {"inertial_share": 1.0, "delay_share": 1.0},
+    "push": {"push_n": 50.0},
+    "slope": {"slope_rad": math.radians(1.0)},
+    "foot_sensors": _FOOT_ERRORS,
+    "slip": {"floor_friction": 0.3},
 }
 """Parameters that a change sets on its ground."""
 
@@ -232,12 +180,13 @@ TRAINING_RANGES = RobotRanges(
     load_x_m=(-0.1, 0.1),
     load_y_m=(-0.1, 0.1),
     load_z_m=(-0.15, 0.15),
-    homing_rad=(-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD),
-    mounting_rad=(-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD),
+    homing_rad=_HOMING,
+    mounting_rad=_HOMING,
     slope_rad=(0.0, math.radians(1.5)),
     push_n=(0.0, 50.0),
     push_share=0.5,
     delay_share=0.5,
+    **_FOOT_ERRORS,
 )
 """Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named
 changes but `stiff`'s on all joints at once."""
@@ -254,20 +203,33 @@ _BEYOND: tuple[dict[str, Any], ...] = (
 )
 """Intervals beyond those of `drawn`, each of a ninth of the robots of `drawn_beyond`."""
 
-DISTRIBUTIONS: dict[str, ScenarioChange] = {
-    "drawn": lambda _: {"ranges": [TRAINING_RANGES]},
-    "drawn_beyond": lambda _: {"ranges": [TRAINING_RANGES.replace(**own) for own in _BEYOND]},
-}
+DISTRIBUTIONS = ("drawn", "drawn_beyond")
 """Changes that draw every episode's robot from ranges: those to learn from, and for tests robots
 that have one quantity beyond these."""
+WALKER_ONLY = tuple(name for name, own in CHANGES.items() if own.keys() <= {*WALKER_FIELDS})
+"""Changes that set quantities of walkers alone."""
+
+RangeChanges = Mapping[str, Any] | Sequence[Mapping[str, Any]]
+"""Intervals of `drawn` that differ from `TRAINING_RANGES`; of several such mappings each makes
+ranges of its own, which have equal shares of the robots."""
 
 
-WALKER_FIELDS = ("push_n", "slope_rad", "floor_friction", *FOOT_ERRORS)
-"""Parameters that only a robot that walks knows."""
-WALKER_ONLY = tuple(
-    name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS}
-)
-"""Changes that set one of them."""
+def _distribution(name: str, ranges: RangeChanges) -> dict[str, Any]:
+    """Parameters of one of `DISTRIBUTIONS`."""
+    each = _BEYOND if name == "drawn_beyond" else ranges
+    if not isinstance(each, Mapping):
+        return {"mixture": [TRAINING_RANGES.replace(**own) for own in each]}
+    named = TRAINING_RANGES.model_fields_set | each.keys()
+    drawn = TRAINING_RANGES.replace(**each)
+    return {field: getattr(drawn, field) for field in named}
+
+
+def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Parameters of a change for a robot that does not walk."""
+    kept = {field: value for field, value in parameters.items() if field not in WALKER_FIELDS}
+    if "mixture" in kept:
+        kept["mixture"] = [own.on_fixed_base() for own in kept["mixture"]]
+    return kept
 
 
 def scenario_names(walks: bool = True) -> list[str]:
@@ -278,12 +240,16 @@ def scenario_names(walks: bool = True) -> list[str]:
     return [*GROUNDS, *(name for name in CHANGES if walks or name not in WALKER_ONLY)]
 
 
-def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
+def make_scenario(
+    name: "str | Scenario", walks: bool = True, ranges: RangeChanges | None = None
+) -> Scenario:
     """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
 
     Args:
         name: Name, or the scenario itself.
-        walks: Whether an unknown name is answered with those of robots that walk, too.
+        walks: Whether the robot walks. For one that does not, changes leave out what only a walker
+            has, and an unknown name is answered without the changes of walkers.
+        ranges: Intervals in place of those of `drawn`; other changes stay as they are.
 
     Raises:
         ConfigurationError: A part of the name does not exist, a ground stands behind another part,
@@ -293,17 +259,18 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
         return name
     changes = str(name)[:_LONGEST_JOINED].split("+")
     ground = GROUNDS[changes.pop(0) if changes[0] in GROUNDS else "nominal"]
-    known = CHANGES | DISTRIBUTIONS
     parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
             raise ConfigurationError(
                 f"scenario {name!r}: {change!r} is a ground and can only stand first"
             )
-        if change not in known:
+        if change not in CHANGES and change not in DISTRIBUTIONS:
             choices = [*scenario_names(walks), *DISTRIBUTIONS]
             raise unknown_name("scenario", change, choices)
-        added = known[change](ground)
+        added = CHANGES.get(change) or _distribution(change, ranges or {})
+        if not walks and change not in WALKER_ONLY:
+            added = _without_walking(added)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
             raise ConfigurationError(

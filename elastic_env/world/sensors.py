@@ -24,17 +24,10 @@ class AttitudeSensor(Model):
     """Standard deviation of the white noise [rad]."""
     bias_rad: float = quantity("rad", 0.0)
     """Constant offset [rad]."""
-    bias_spread_rad: float = quantity("rad", 0.0, ge=0)
-    """Half-width of a further offset, drawn per episode [rad]."""
     sine_error_rad: float = quantity("rad", 0.0)
     """Amplitude of an error proportional to sin(angle) [rad]."""
     rate_hz: float = quantity("Hz", 100.0, gt=0)
     """Sample rate; the value is held in between [Hz]."""
-
-    @property
-    def is_random(self) -> bool:
-        """True if it measures the same motion differently from episode to episode."""
-        return self.noise_rad > 0.0 or self.bias_spread_rad > 0.0
 
 
 _G = 9.80665

@@ -299,8 +299,8 @@ class Task(ABC):
         """Rows that count in the metrics, "scored", and the parts of them that the metrics name."""
 
     def robot_record(self, world: int) -> dict[str, float]:
-        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        return self._robots[world].record() if self._scenarios[world].ranges else {}
+        """The robot of a world in figures, where robots differ; else nothing."""
+        return {} if self._scenarios[world].has_one_robot else self._robots[world].record()
 
     @abstractmethod
     def truth(self) -> Any:
@@ -332,20 +332,15 @@ class Task(ABC):
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
 
-    def _take_robot(self, world: int, robot: DrawnRobot, true: RobotModel) -> None:
-        """Keep the robot of a world, and write what is true of its joints.
-
-        Args:
-            world: Number of the world.
-            robot: As it was drawn.
-            true: The true robot, what is drawn aside.
-        """
+    def _take_robot(self, world: int, robot: DrawnRobot) -> None:
+        """Keep the robot of a world, and write what is true of its joints."""
         self._robots[world] = robot
         truth = self._joints[self._row, world]["truth"]
         truth["homing"] = robot.homing_rad
-        truth["stiffness"] = true.stiffness * np.array(robot.stiffness)
-        truth["damping"] = true.damping * robot.damping
-        truth["backlash"] = true.backlash + robot.backlash_rad
+        assumed = self.assumed_model
+        truth["stiffness"] = assumed.stiffness * np.array(robot.stiffness)
+        truth["damping"] = assumed.damping * robot.damping
+        truth["backlash"] = assumed.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
         """Apply what acts on the robot from outside during the coming control period."""

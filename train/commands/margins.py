@@ -28,7 +28,7 @@ from train.runs.progress import show_progress
 
 _MOST_ROBOTS = 64
 
-Field = Literal["push_n", "stiffness_scale", "slope_rad", "torso_load_kg", "floor_friction"]
+Field = Literal["push_n", "stiffness", "slope_rad", "load_kg", "floor_friction"]
 
 
 class Margins(Model):
@@ -48,9 +48,9 @@ class Margins(Model):
     """Baselines, residual:PATH, "FILE.py:function" or "module:function"."""
     quantities: Entries[Field] = [
         "push_n",
-        "stiffness_scale",
+        "stiffness",
         "slope_rad",
-        "torso_load_kg",
+        "load_kg",
         "floor_friction",
     ]
     """Fields of the scenario that are varied, one at a time."""

@@ -362,9 +362,10 @@ def _seen_as(condition: Condition, trained: Origin) -> str:
     seen = trained.scenarios or ()
     if isinstance(played, str) and not trained.ranges:
         return played
-    played = make_scenario(played).replace(name="")
+    walks = condition.environment.walks
+    played = make_scenario(played, walks).replace(name="")
     for name in seen:
-        if make_scenario(name).with_ranges(trained.ranges).replace(name="") == played:
+        if make_scenario(name, walks, trained.ranges).replace(name="") == played:
             return name
     if condition.swept:
         return f"varied {condition.scenario}"

@@ -28,7 +28,8 @@ Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
 """Seed of the first episode; others follow."""
 """Episodes of a cell."""
 SCENARIO = "scenario."
-"""Prefix of a field of the scenario that is varied, such as scenario.stiffness_scale."""
+"""Prefix of a field of the scenario that is varied, such as scenario.stiffness."""
+_HALF_WIDTH = "half_width"
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
@@ -66,8 +67,7 @@ GivenReference = Annotated[Any, AfterValidator(_reference)]
 
 
 def _ranges(value: Any) -> Any:
-    for own in value if isinstance(value, list) else [value]:
-        RobotRanges(**own)
+    make_scenario("drawn", ranges=value)
     return value
 
 
@@ -83,9 +83,9 @@ def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     """Refuse ranges that no scenario uses.
 
     Raises:
-        ConfigurationError: There are ranges, and no scenario draws robots from one set of them.
+        ConfigurationError: There are ranges, and no scenario is `drawn` or joined with it.
     """
-    if ranges and not any(len(make_scenario(name).ranges) == 1 for name in scenarios):
+    if ranges and not any("drawn" in name.split("+") for name in scenarios):
         raise ConfigurationError(
             "ranges need a scenario whose robots are drawn from them, such as 'drawn', got"
             f" {quote(list(scenarios))}"
@@ -212,7 +212,7 @@ class Condition(Model):
         fields = {name: v for name, v in swept if name.startswith(SCENARIO)}
         if not fields and not self.ranges:
             return self.scenario
-        scenario = make_scenario(self.scenario).with_ranges(self.ranges)
+        scenario = make_scenario(self.scenario, self.environment.walks, self.ranges)
         return vary_scenario(scenario, fields)
 
     @property
@@ -243,14 +243,24 @@ def cell_of(options: Any, policy: PolicySpec) -> Condition:
 
 
 def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
-    """A scenario with other values of some fields, such as `scenario.stiffness_scale` [SI].
+    """A scenario with other values of some fields, such as `scenario.stiffness` [SI].
+
+    Of `scenario.mounting_rad.half_width` the value is half the width of an interval about 0.
 
     Raises:
-        ConfigurationError: A value is beyond the bounds of its field.
+        ConfigurationError: A value is beyond the bounds of its field, or robots differ in it.
     """
     for path, value in fields.items():
         first, _, inner = path.removeprefix(SCENARIO).partition(".")
-        new = getattr(scenario, first).replace(**{inner: value}) if inner else value
+        new: Any = value
+        if inner == _HALF_WIDTH:
+            new = (-value, value)
+        elif inner:
+            new = getattr(scenario, first).replace(**{inner: value})
+        elif first in RobotRanges.model_fields and scenario.draws(first):
+            raise ConfigurationError(
+                f"scenario {scenario.name!r} draws {first} from ranges; vary it in another one"
+            )
         scenario = scenario.replace(**{first: new})
     return scenario
 
@@ -268,6 +278,9 @@ def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
         if isinstance(field.annotation, type) and issubclass(field.annotation, Model):
             found |= _numbers_of(field.annotation, f"{before}{name}.")
         elif isinstance(extra, dict):
-            unit = str(extra["unit"])
-            found[f"{before}{name}"] = meaning_of(field) or name, unit
+            known = meaning_of(field) or name, str(extra["unit"])
+            found[f"{before}{name}"] = known
+            bounds: Any = extra.get("bounds", (0.0, 1.0))
+            if bounds[0] == -bounds[1]:
+                found[f"{before}{name}.{_HALF_WIDTH}"] = f"half-width: {known[0]}", known[1]
     return found

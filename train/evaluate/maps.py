@@ -30,8 +30,8 @@ class Axis(Model):
     """An axis of a map."""
 
     what: Title
-    """A field of the scenario, such as scenario.stiffness_scale or
-    scenario.pelvis_imu.bias_spread_rad, or the motion: step_period on the walker, reference on the
+    """A field of the scenario, such as scenario.stiffness or
+    scenario.mounting_rad.half_width, or the motion: step_period on the walker, reference on the
     testbed."""
     values: Annotated[list[Any], Once] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""

@@ -59,9 +59,9 @@ class Quantity:
 
 QUANTITIES = (
     Quantity("push_n", "largest push [N]", 0.0, 512.0),
-    Quantity("stiffness_scale", "softest K [1]", 1.0, 0.0),
+    Quantity("stiffness", "softest K [1]", 1.0, 0.0),
     Quantity("slope_rad", "largest slope [mrad]", 0.0, 0.128, 1e3),
-    Quantity("torso_load_kg", "largest load [kg]", 0.0, 64.0),
+    Quantity("load_kg", "largest load [kg]", 0.0, 64.0),
     Quantity("floor_friction", "least friction [1]", 1.0, 0.0),
 )
 """Quantities that a walker survives up to an edge."""

@@ -104,45 +104,31 @@ class WalkConfig(TaskConfig):
     @property
     def loads(self) -> int:
         """Bodies that loads on the torso are."""
-        return (self.true_robot.torso_load_kg > 0.0) + bool(self.scenario.ranges)
+        return (self.true_robot.torso_load_kg > 0.0) + self.scenario.places_loads
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
         """The joints as a policy may know them, with the ground's friction."""
-        scale = self.scenario.friction_scale
-        return {
-            name: joint.replace(
-                coulomb_friction=joint.coulomb_friction * scale,
-                viscous_friction=joint.viscous_friction * scale,
-            )
-            for name, joint in zip(LEG_JOINTS, self.joints, strict=True)
-        }
+        each = zip(LEG_JOINTS, self.joints, strict=True)
+        return {name: self.with_friction_of_ground(joint) for name, joint in each}
 
     @property
     def true_joints(self) -> dict[str, ElasticJoint]:
-        """The joints as the plant has them, a spread of their stiffness aside."""
-        scenario = self.scenario
-        return {
-            name: joint.replace(
-                stiffness=joint.stiffness * scenario.stiffness_scale,
-                backlash=joint.backlash + scenario.backlash_rad,
-            )
-            for name, joint in self.assumed_joints.items()
-        }
+        """The joints as the plant has them, what is drawn aside."""
+        each = zip(LEG_JOINTS, self.joints, strict=True)
+        return {name: self.as_built(joint) for name, joint in each}
 
     @property
     def true_robot(self) -> Thormang:
-        """The robot as the plant has it."""
-        scenario = self.scenario
-        load_kg = self.robot.torso_load_kg + scenario.torso_load_kg
-        friction = scenario.floor_friction or self.robot.friction
-        return self.robot.replace(torso_load_kg=load_kg, friction=friction)
+        """The robot as the plant has it, what is drawn aside."""
+        load_kg = self.robot.torso_load_kg + self.scenario.shoulder_load_kg
+        return self.robot.replace(torso_load_kg=load_kg)
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
         joints = self.true_joints
         spec = thormang.elastic_spec(self.true_robot, joints, self.form, self.timestep_s)
-        if self.scenario.ranges:
+        if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):
             thormang.add_load(spec, f"spare_{number}", 0.0, np.zeros(3))
@@ -151,9 +137,8 @@ class WalkConfig(TaskConfig):
         return spec.compile()
 
 
-BANK_SIZE = 64
-RANGES_BANK_SIZE = 256
-"""Robots in the bank of a scenario that draws them: of a named one, and of one with ranges."""
+BANK_SIZE = 256
+"""Robots in the bank of a scenario whose robots differ."""
 _SETTLED = 2048
 """Robots that are kept with their state at rest, of 50 kB each."""
 
@@ -178,7 +163,7 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel,
     try:
         return model, settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
     except ElasticError as error:
-        if not config.scenario.ranges:
+        if config.scenario.has_one_robot:
             raise
         raise ConfigurationError(
             f"the drawn robot {robot} cannot walk: {error}; narrow the ranges"
@@ -191,9 +176,11 @@ def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
     springs = spring_ids(undrawn, LEG_JOINTS, config.form)
     links = JointAddresses.of(undrawn, LEG_JOINTS).q_dot
     model = copy.copy(undrawn)
-    set_joints(partial(getattr, model), undrawn, springs, links, robot)
+    set_joints(partial(getattr, model), undrawn, springs, links, robot, config.scenario)
+    for side in thormang.SIDES:
+        model.geom(f"{side}_sole").friction[0] *= robot.floor_friction
     model.body("floor").quat[:] = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
-    if config.scenario.ranges:
+    if config.scenario.places_loads:
         place = np.array([robot.load_x_m, robot.load_y_m, robot.load_z_m])
         thormang.place_load(model, robot.load_kg, place)
     return model
@@ -217,22 +204,8 @@ def robot_bank(scenario: Scenario, number: int = 0) -> list[DrawnRobot]:
 
     Banks of other numbers have other robots.
     """
-    n = len(LEG_JOINTS)
-    if scenario.ranges:
-        return draw_robots(scenario.ranges, RANGES_BANK_SIZE, n, (_BANK_SEED, number))
-    spread = scenario.stiffness_spread
-    width_rad = scenario.encoder_bias_rad
-    if spread == width_rad == scenario.slope_rad == 0.0:
-        return [scenario.make_robot(np.ones(n), np.zeros(n))]
-    uniform = np.random.default_rng(_BANK_SEED + number).uniform
-    return [
-        scenario.make_robot(
-            stiffness=1.0 + spread * uniform(-1.0, 1.0, n),
-            homing_rad=width_rad * uniform(-1.0, 1.0, n),
-            slope_direction_rad=float(uniform(0.0, 2.0 * np.pi)),
-        )
-        for _ in range(BANK_SIZE)
-    ]
+    size = 1 if scenario.has_one_robot else BANK_SIZE
+    return draw_robots(scenario.parts, size, len(LEG_JOINTS), (_BANK_SEED, number))
 
 
 _BANK_SEED = 20150

@@ -70,14 +70,13 @@ MEASURED = ("imu_attitude", "imu_rate", "wrench")
 """Groups with the noise of `sensor_noise`."""
 
 
-def sensor_noise(scenario: Scenario) -> dict[str, Parameter]:
+def sensor_noise(scenario: Scenario, is_inertial: bool) -> dict[str, Parameter]:
     """Standard deviations of the groups in `MEASURED`; in an inertial IMU before its filter."""
-    imu = scenario.inertial
     attitude_rad = scenario.pelvis_imu.noise_rad
     rate_rad_s = scenario.gyro_noise_rad_s
-    if imu is not None:
-        attitude_rad = imu.accelerometer_noise_rad
-        rate_rad_s = imu.gyro_noise_rad_s
+    if is_inertial:
+        attitude_rad = scenario.inertial.accelerometer_noise_rad
+        rate_rad_s = scenario.inertial.gyro_noise_rad_s
     wrench = np.array([[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3])
     return {"imu_attitude": attitude_rad, "imu_rate": rate_rad_s, "wrench": wrench}
 

@@ -95,7 +95,7 @@ from elastic_env.world.foot_sensors import foot_errors
 from elastic_env.world.ground_contact import FootSensors, foot_drift
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
-from elastic_env.world.sensors import InertialSensor, is_due
+from elastic_env.world.sensors import is_due
 from elastic_env.world.task import Task, spring_torque
 
 UNLOADED_SHARE = 0.05
@@ -130,11 +130,6 @@ class _Kind:
         joints = config.true_joints
         model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
         return _Kind(config, bank, config.true_model(), model)
-
-    @property
-    def inertial(self) -> InertialSensor:
-        """The inertial IMU of robots that have one, by default that of the data sheet."""
-        return self.config.scenario.inertial or InertialSensor()
 
     @property
     def encoder_counts(self) -> int | None:
@@ -236,20 +231,17 @@ class WalkTask(Task):
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         generator = random.robot
         kind = self._kind_of_world[world]
-        bias = self._bias
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
-        self._take_robot(world, robot, kind.true_model)
-        spread = kind.config.scenario.pelvis_imu.bias_spread_rad
-        mounting = spread * generator.uniform(-1.0, 1.0, 2)
-        bias["imu_attitude"][world] = mounting + np.array(robot.mounting_rad)
+        self._take_robot(world, robot)
+        self._bias["imu_attitude"][world] = robot.mounting_rad
+        generator.random(2)  # not used: the trial follows what has always been drawn here
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
         fit = (kind, robot.is_delayed, robot.is_inertial)
         self._kind[world] = self._fits.index(fit)
         self._draw_imu(world, generator)
-        errors = foot_errors(kind.config.scenario, robot, random)
-        for name, values in errors.items():
-            bias[name][world] = values
+        for name, values in foot_errors(robot).items():
+            self._bias[name][world] = values
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
         """Time and direction of the push, in the steps that are scored."""
@@ -263,7 +255,7 @@ class WalkTask(Task):
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
         bias = self._bias
-        sensor = self._kind_of_world[world].inertial
+        sensor = self._kind_of_world[world].config.scenario.inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
         if self._robots[world].is_inertial:
             normal = generator.standard_normal
@@ -278,7 +270,8 @@ class WalkTask(Task):
         simulation.bind("xfrc_applied")[worlds] = 0.0
         for world in np.flatnonzero(worlds).tolist():
             config = self._kind_of_world[world].config
-            model, rest = placed_robot(config, self._robots[world])  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+            robot = self._robots[world].with_exact_sensors()
+            model, rest = placed_robot(config, robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
             simulation.take(world, model)
             simulation.qpos[world] = rest.qpos
             simulation.qvel[world] = 0.0
@@ -441,10 +434,8 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
     """
     config = kind.config
     scenario = config.scenario
-    if is_inertial:
-        scenario = scenario.replace(ranges=(), inertial=kind.inertial)
     noise = np.zeros(1, records.NOISE)
-    for group, deviation in tables.sensor_noise(scenario).items():
+    for group, deviation in tables.sensor_noise(scenario, is_inertial).items():
         noise[group] = deviation
     model = kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
@@ -476,7 +467,7 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
         return None
     rows = np.zeros(len(fits), records.INERTIAL)
     rows["is_fitted"] = [is_inertial for _, _, is_inertial in fits]
-    rows["time_constant_s"] = [kind.inertial.time_constant_s for kind, _, _ in fits]
+    rows["time_constant_s"] = [kind.config.scenario.inertial.time_constant_s for kind, _, _ in fits]
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
 
