@@ -23,7 +23,9 @@ from baselines.walking.phase_table import (
 )
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.scenario import make_scenario
 from train.learn.phase_table import Harmonics, Search, Walks, corrected, find, probe
 
 PERIOD_S = 1.1
@@ -106,6 +108,15 @@ def test_a_gait_without_a_table_is_refused_by_a_sentence(tmp_path: Path) -> None
     assert load_phase_table(PERIOD_S, other) == TABLE
     with pytest.raises(ConfigurationError, match="no phase table at"):
         load_phase_table(3.0, tmp_path / "none.json")
+
+
+def test_a_table_is_found_on_robots_that_no_evaluation_plays() -> None:
+    """Catches a search that sees the robots of the evaluation."""
+    walks = Walks(Search(step_period=PERIOD_S, robots=2, strides=1))
+    bank = set(walks.env.unwrapped.task._kinds[0].bank)
+    assert bank == set(robot_bank(make_scenario("drawn"), 1))
+    assert not bank & set(robot_bank(make_scenario("drawn")))
+    walks.env.close()
 
 
 def test_shipped_tables_are_small_and_say_what_they_are_for() -> None:

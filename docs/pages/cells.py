@@ -78,6 +78,7 @@ KEPT: Mapping[str, Kept] = {
         ),
         ("mean",),
     ),
+    "footholds": Kept((*_WALK, "end_position_error_m", "end_heading_error_rad"), ("mean",)),
     "walker_sensitivity": Kept((*_ATTITUDE[:2], _ATTITUDE[3], _ZMP[2])),
     "testbed": Kept(("link_error_rms_rad",)),
     "testbed_damping": Kept(("link_error_rms_rad", *_ENDS)),

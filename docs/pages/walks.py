@@ -23,6 +23,7 @@ _ROLL, _PITCH = (
 )
 _ZMPS = (ZMP, "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
 _EARLY = "early_touchdown_mean_s"
+_END = ("end_position_error_m", "end_heading_error_rad")
 _FRAME = "frame_error_mean_m"
 _JUMP = "com_jump_mean_m"
 _LARGE = 19.95
@@ -66,6 +67,30 @@ def twenty_steps(rows: Rows) -> str:
         )
     blocks = ["all 20 steps", "steps 1 to 4", "steps 17 to 20"]
     head = ["step", "scenario", "policy", *blocks, "drift at the end", "falls"]
+    return page_table(head, lines, words=3)
+
+
+def forty_steps(rows: Rows) -> str:
+    """Errors of the walk, and of place and heading at its end, of every policy."""
+    cells = Cells(rows)
+    lines = []
+    for reference in cells.names("reference"):
+        walk = "full turn" if "turn_rad" in reference else "forward"
+        for scenario in cells.names("scenario"):
+            for policy in cells.names("policy"):
+                row = cells.row(policy, reference, scenario)
+                fell, episodes = failure_counts(row)
+                lines.append(
+                    [
+                        walk,
+                        f"`{scenario}`",
+                        _robot(policy),
+                        format_metrics(row, [PELVIS], 1),
+                        *(format_metrics(row, [metric], 0) for metric in (ZMP, *_END)),
+                        f"{fell}/{episodes}",
+                    ]
+                )
+    head = ["walk", "scenario", "policy", "pelvis", "ZMP", "place", "heading", "falls"]
     return page_table(head, lines, words=3)
 
 

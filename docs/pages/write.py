@@ -214,6 +214,7 @@ PARTS: Mapping[str, Part] = {
     "published controllers": _of_standings(walks.published_controllers),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
+    "forty steps": _of(walks.forty_steps, "footholds"),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
     "one arm": _of(arms.one_arm, "gallery"),
