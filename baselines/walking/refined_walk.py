@@ -46,12 +46,11 @@ class RefinedWalk(PolicyAround):
         table = model.observation_table
         self._rate_hz = 1.0 / model.control_period_s
         self._time = table.group("clock").start
-        self._angles = further.plan.q - model.plan.q
-        self._changes = (
-            (table.group("reference_angle"), self._angles),
-            (table.group("reference_rate"), further.plan.q_dot - model.plan.q_dot),
-            (table.group("reference_acceleration"), further.plan.q_ddot - model.plan.q_ddot),
-        )
+        # angles, rates and accelerations stand side by side
+        first = table.group("reference_angle").start
+        self._columns = slice(first, table.group("reference_acceleration").stop)
+        motions = [np.hstack([p.q, p.q_dot, p.q_ddot]) for p in (model.plan, further.plan)]
+        self._change = motions[1] - motions[0]
 
     @override
     def begin(self, rows: Array) -> Any:
@@ -61,11 +60,11 @@ class RefinedWalk(PolicyAround):
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """Its memory is that of the policy inside."""
         periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
+        change = self._change.take(periods, axis=0, mode="clip")
         seen = rows.copy()
-        for columns, change in self._changes:
-            seen[:, columns] += change.take(periods, axis=0, mode="clip")
+        seen[:, self._columns] += change
         action, memory = self.policy.act(seen, memory, inputs)
-        total = action + self._angles.take(periods, axis=0, mode="clip")
+        total = action + change[:, : self.view.num_joints]
         return total.astype(np.float32), memory
 
     @override
