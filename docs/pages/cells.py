@@ -191,7 +191,8 @@ def format_metrics(
     """Metrics side by side with so many decimals, - where there is none."""
     values = (in_table_unit(row, metric) for metric in metrics)
     return between.join(
-        "-" if math.isnan(value) else minus(f"{value:.{decimals}f}") for value in values
+        "-" if math.isnan(value) else minus(f"{round(value, decimals) + 0.0:.{decimals}f}")
+        for value in values
     )
 
 
