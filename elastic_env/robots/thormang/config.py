@@ -38,7 +38,11 @@ class WalkRewardWeights(Model):
     tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6)
     """Per rad of pelvis error: 1 at 0.01 rad [1/rad]."""
     zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6)
-    """Per m of ZMP deviation: 1 at 0.03 m [1/m]."""
+    """Per m of ZMP deviation in the plan's world frame: 1 at 0.03 m [1/m]."""
+    zmp_in_feet: float = quantity("1/m", 0.0, ge=0, le=1e6)
+    """Per m of ZMP deviation, were the feet where they are planned [1/m]."""
+    foot_drift: float = quantity("1/m", 0.0, ge=0, le=1e6)
+    """Per m of the displacement of the standing feet against the plan [1/m]."""
     effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6)
     """Per N·m of servo torque, rms over the joints [1/(N·m)]."""
     smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6)
@@ -46,7 +50,7 @@ class WalkRewardWeights(Model):
     fall: float = quantity("1", 200.0, ge=0, le=1e6)
     """Once, at a fall or where the simulation diverges [1]."""
     standing: float = quantity("1", 1.0, ge=0, le=1e6)
-    """Factor of tilt and zmp before and after the walk, which is not scored [1]."""
+    """Factor of tilt, ZMP and drift before and after the walk, which is not scored [1]."""
 
 
 class WalkConfig(TaskConfig):

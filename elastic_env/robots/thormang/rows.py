@@ -27,6 +27,7 @@ TRUTH = record_type(
     ("wrench", REAL, _FEET_WRENCH),
     ("force", REAL, 2),  # vertical force of the ground on the feet [N]
     ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
+    ("drift", REAL, 2),  # of the feet that stand, against the plan [m], nan likewise
     # step of the first touch in the second half of the swing, -1 before it
     ("contact_since", WHOLE),
 )
@@ -61,7 +62,7 @@ BIAS = record_type(
 )
 """Errors that are drawn per episode."""
 
-_TERMS = ("tilt", "zmp", "effort", "smoothness", "fall")
+_TERMS = ("tilt", "zmp", "zmp_in_feet", "foot_drift", "effort", "smoothness", "fall")
 SCORES = record_type(*((term, REAL) for term in _TERMS))
 """Weighted terms of the reward."""
 
@@ -72,6 +73,7 @@ ROW_OF_PLAN = record_type(
     ("clock", REAL, 3),
     ("share", REAL),
     ("zmp", REAL, 2),  # time, swing, support; μ; [m]
+    ("ankles", REAL, (2, 3)),  # [m]
     ("half_of_swing", WHOLE),
     ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_),

@@ -92,7 +92,7 @@ from elastic_env.robots.thormang.config import (
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import foot_errors
-from elastic_env.world.ground_contact import FootSensors, foot_drift
+from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.sensors import InertialSensor, is_due
@@ -325,8 +325,7 @@ class WalkTask(Task):
         deflection = joints["theta"] - joints["q"]
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
-        drift = foot_drift(truth["force"], truth["ankles"], plan.ankles[row])
-        drift[np.isnan(deviation)] = np.nan
+        drift = truth["drift"]
         in_feet = deviation - drift
         middle = truth["ankles"][:, :, :2].mean(axis=1)
         return {
@@ -346,8 +345,8 @@ class WalkTask(Task):
             "zmp_in_feet_x": in_feet[:, 0],
             "zmp_in_feet_y": in_feet[:, 1],
             "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
-            "foot_drift_x": drift[:, 0],
-            "foot_drift_y": drift[:, 1],
+            "foot_drift_x": drift[:, 0].copy(),
+            "foot_drift_y": drift[:, 1].copy(),
             "link_error": rms(error),
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
@@ -409,6 +408,7 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
     rows["share"] = plan.share
     rows["zmp"] = plan.zmp
+    rows["ankles"] = plan.ankles
     rows["half_of_swing"] = np.where(timing.single, halves, 0)
     rows["swing_foot"] = RIGHT - timing.support
     rows["imu_is_due"] = is_due(steps, imu_hz, config.control_period_s)
