@@ -202,14 +202,14 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their length, in random order.
+        """Cut the first episodes at decisions spread evenly over their fewest, in random order.
 
         Call it after `reset`. From the end of the first whole episode on the worlds are all over
         it; learning that saw all worlds in the same phase would see one phase at a time. What is
         cut counts as truncated, and has no metrics.
         """
         env: Any = self.env.unwrapped
-        length = -(-env.task.num_steps // self.settings.decision_period)
+        length = -(-env.task.fewest_control_steps // self.settings.decision_period)
         order = generator.permutation(np.arange(1, self.num_envs + 1))
         self._decisions = 0
         self._cut_at = -(-order * length // self.num_envs)

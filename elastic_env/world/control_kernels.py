@@ -355,7 +355,7 @@ class Walker(NamedTuple):
     Attributes:
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
         plan: One record per control step.
-        bias: Errors of mounting, and of an inertial IMU, (num_worlds,).
+        bias: What is drawn per episode, (num_worlds,).
         inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an
             IMU: its filter is then not even compiled. It is therefore an argument of its own.
         columns: Where the observation has what they show, (1,).
@@ -412,6 +412,8 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
     for world in range(len(diverged)):
         rules = walker.constants[step.kind[world]]
         truth = step.worlds[world].truth
+        if truth.step == rules.skips_at:
+            truth.step += walker.bias[world].skipped
         planned = row_of(walker.plan, truth.step)
         if not diverged[world]:
             read_body(physics, walker, step, world)

@@ -71,6 +71,9 @@ class WalkConfig(TaskConfig):
     reward: WalkRewardWeights = WalkRewardWeights()
     bank: int = quantity("1", 0, ge=0)
     """Bank of robots that a scenario draws from [1]."""
+    fewest_steps: int | None = quantity("1", None, ge=4)
+    """Fewest steps of a walk in place, whose number is then drawn per episode; None for those of
+    the gait [1]."""
     spare_bodies: int = quantity("1", 0, ge=0)
     """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
 
@@ -82,6 +85,27 @@ class WalkConfig(TaskConfig):
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
             )
         return self
+
+    @model_validator(mode="after")
+    def _walks_can_be_shorter(self) -> Self:
+        fewest = self.fewest_steps
+        if fewest is None:
+            return self
+        if not self.gait.is_in_place:
+            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
+        most = self.gait.num_steps
+        if fewest > most or (most - fewest) % 2:
+            raise ValueError(
+                f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
+                f" {fewest}"
+            )
+        return self
+
+    @property
+    def numbers_of_steps(self) -> range:
+        """Numbers of steps that a walk can have."""
+        most = self.gait.num_steps
+        return range(most if self.fewest_steps is None else self.fewest_steps, most + 1, 2)
 
     @model_validator(mode="after")
     def _worlds_know_the_same(self) -> Self:

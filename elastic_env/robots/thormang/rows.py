@@ -59,8 +59,9 @@ BIAS = record_type(
     ("wrench", REAL, _FEET_WRENCH),  # [N], [N·m]
     ("wrench_rate", REAL, _FEET_WRENCH),  # [N/s], [N·m/s]
     ("cross_talk", REAL, (2, 6, 6)),
+    ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
 )
-"""Errors that are drawn per episode."""
+"""Errors of the sensors and length of the walk, which are drawn per episode."""
 
 _TERMS = ("tilt", "zmp", "zmp_in_feet", "foot_drift", "effort", "smoothness", "fall")
 SCORES = record_type(*((term, REAL) for term in _TERMS))
@@ -98,6 +99,7 @@ CONSTANTS = record_type(
     ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP
+    ("skips_at", WHOLE),  # control step from which a shorter walk goes on further behind
     ("weights", SCORES),
 )
 """Constants of a kind of world: feet, quality of the sensors, and rules."""

@@ -33,7 +33,7 @@ positions are in the plan's world frame, x forward at the start, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
-| `time_s` | s | since the start of the episode |
+| `time_s` | s | since the start of the plan, of which a walk of fewer steps leaves out strides |
 | `pelvis_roll`, `pelvis_pitch` | rad | attitude of the pelvis, positive to the right and forward down |
 | `pelvis_error` | rad | angle between its z axis and the vertical, never negative |
 | `pelvis_height` | m | of the pelvis' origin |
@@ -77,7 +77,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.motion.gait import LEFT, RIGHT
-from elastic_env.motion.trajectory import Motion, Plan
+from elastic_env.motion.trajectory import STAND_S, Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 from elastic_env.robots.thormang import NAME, tables
 from elastic_env.robots.thormang import rows as records
@@ -98,6 +98,9 @@ from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.sensors import InertialSensor, is_due
 from elastic_env.world.task import Task, spring_torque
 
+_STEPS_BEFORE_SKIP = 2
+"""Steps after which one stride of a walk in place is as the next: the preview control has
+forgotten the start, and does not see the end yet."""
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
@@ -195,6 +198,10 @@ class WalkTask(Task):
         self._torso = self.model.body("upper_body").id
         self._phases = _phase_rows(plan)
         self._bias = np.zeros(num_worlds, records.BIAS)
+        of_step = round(plan.gait.step_period_s / period_s)
+        most = plan.gait.num_steps
+        self._skips = [of_step * (most - number) for number in config.numbers_of_steps]
+        self.fewest_control_steps = self.num_steps - max(self._skips)
         self._walk_constants = np.concatenate([_constants_of(*fit) for fit in self._fits])
         self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(plan, config)
@@ -250,6 +257,9 @@ class WalkTask(Task):
         errors = foot_errors(kind.config.scenario, robot, random)
         for name, values in errors.items():
             bias[name][world] = values
+        if len(self._skips) > 1:
+            number = random.draw_trial(lambda own: int(own.integers(len(self._skips))))
+            bias["skipped"][world] = self._skips[number]
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
         """Time and direction of the push, in the steps that are scored."""
@@ -441,6 +451,7 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
     """
     config = kind.config
     scenario = config.scenario
+    period_s = config.control_period_s
     if is_inertial:
         scenario = scenario.replace(ranges=(), inertial=kind.inertial)
     noise = np.zeros(1, records.NOISE)
@@ -467,6 +478,7 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
         # sensors that carry nothing stand for a ground that carries the feet
         zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,
         weights=one(records.SCORES, **weights),
+        skips_at=round((STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s) / period_s),
     )
 
 
