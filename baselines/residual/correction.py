@@ -109,10 +109,14 @@ class Corrected:
             action = (action + offset).astype(np.float32)
         return action, CorrectedMemory(values, inner)
 
+    def base_memory(self, rows: Array, state: Any, episode_start: Any) -> Any:
+        """Memory of the base before it acts on observations, for the state of the last step."""
+        inner = None if state is None else state.inner
+        return resume_memory(self.base, rows, inner, episode_start)
+
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        inner = None if state is None else state.inner
-        memory = resume_memory(self.base, rows, inner, episode_start)
+        memory = self.base_memory(rows, state, episode_start)
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:

@@ -9,6 +9,8 @@
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
+| `phase` | walker: the first two harmonics of the phase of a step [1] |
+| `standing`, `zmp_offset`, `feet`, `landing`, `shear` | what a base such as `foothold` has learned of the robot, from its memory |
 | `base_action` | what the base alone would command now [rad] |
 """  # noqa: E501
 
@@ -17,14 +19,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import put_rows, select_rows
+from baselines.compensation.policy import BatchPolicy, put_rows, select_rows
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, Signal, rename_group
+from elastic_env.core.signals import (
+    Array,
+    BoolArray,
+    Mirrored,
+    Signal,
+    SignalGroup,
+    rename_group,
+)
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
@@ -59,7 +69,8 @@ class Features:
         self._corrected = corrected
         period_s = settings.decision_period * model.control_period_s
         names = _source_names(settings.observe, model)
-        self._sources = [_source(name, model, period_s) for name in names]
+        self._sources = [_source(name, corrected, period_s) for name in names]
+        self._reads_base = any(isinstance(source, _Estimate) for source in self._sources)
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
@@ -99,7 +110,12 @@ class Features:
             fresh = np.ones_like(fresh)
         else:
             kept = put_rows(memory, fresh, select_rows(kept, fresh))
-        pairs = zip(self._sources, kept.sources, strict=True)
+        memories = kept.sources
+        if self._reads_base:
+            base = self._corrected.base_memory(rows, state, episode_start)
+            pairs = zip(self._sources, memories, strict=True)
+            memories = [base if isinstance(one, _Estimate) else own for one, own in pairs]
+        pairs = zip(self._sources, memories, strict=True)
         observed = [source.observe(rows, own) for source, own in pairs]
         values = [values for values, _ in observed]
         seen = np.hstack([np.zeros((len(rows), 0)), *values])
@@ -149,12 +165,15 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     return [name for name in names if name != BASE_ACTION]
 
 
-def _source(name: str, model: RobotModel, period_s: float) -> Any:
+def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     """A source of features.
 
     It has `signals`, `begin(num_worlds)` makes its memory, and `observe(rows, memory)` returns
     features and the new memory.
     """
+    model = corrected.model
+    if name in corrected.base.estimates:
+        return _Estimate(corrected.base, name)
     table = model.observation_table
     groups = _groups(model)
     if name in groups or name in table.names:
@@ -168,10 +187,12 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
     if isinstance(model, WalkerModel):
         if name == "bending":
             return BendingObserver(model)
+        if name == "phase":
+            return _phase(model)
         timed = {"contact_error": _ContactError, "level": GroundLevel}
         if name in timed:
             return timed[name](model, period_s)
-        further += [*timed, "bending"]
+        further += [*timed, "bending", "phase", *corrected.base.estimates]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 
@@ -189,6 +210,41 @@ class _Instant:
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
         return self._function(rows), memory
 
+
+class _Estimate:
+    """A source that the base has in its memory, see `BatchPolicy.estimate`."""
+
+    def __init__(self, base: BatchPolicy, name: str) -> None:
+        self.signals = base.estimates[name]
+        self._base = base
+        self._name = name
+
+    def begin(self, num_worlds: int) -> Array:
+        return np.zeros((num_worlds, 0))
+
+    def observe(self, rows: Array, memory: Any) -> tuple[Array, Array]:
+        """Values from the memory of the base; nothing is kept beside it."""
+        return self._base.estimate(self._name, rows, memory), self.begin(len(rows))
+
+
+def _phase(model: WalkerModel) -> _Instant:
+    """Harmonics of the phase of a step, which runs on before and after the walk."""
+    plan = model.plan
+    psi = stride_angle(plan.timing, plan.gait.step_period_s)
+    table = harmonics(psi, _PHASE_HARMONICS, is_odd=False)
+    time = model.observation_table.columns("clock.time")
+    parts = [f"{kind}_{k + 1}" for k in range(_PHASE_HARMONICS) for kind in ("cosine", "sine")]
+    mirrored: dict[str, Mirrored | None] = dict.fromkeys(parts, "same")
+    signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", mirrored, None).signals
+
+    def observe(rows: Array) -> Array:
+        row = np.rint(rows[:, time][:, 0] / model.control_period_s).astype(np.int64)
+        return table.take(row, axis=0, mode="clip")
+
+    return _Instant(signals, observe)
+
+
+_PHASE_HARMONICS = 2
 
 _ERRORS = {
     "encoder_error": ("encoder_angle", "reference_angle"),

@@ -51,6 +51,8 @@ class TrainConfig(CodeNamingModel):
     """Intervals that the robots of `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
+    training_options: dict[str, Any] = {}
+    """The same for the worlds that are learned from alone, such as a longer physics step."""
     base: Title = "input_output"
     """Policy that is corrected: a baseline by name, since an exported residual plays without
     code of its own.
@@ -90,6 +92,12 @@ class TrainConfig(CodeNamingModel):
     def _scenarios_fit(self) -> Self:
         require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
+        motion = self.reference if isinstance(self.reference, dict) else {}
+        if twice := sorted(motion.keys() & self.training_options.keys()):
+            raise ValueError(
+                f"training_options must not say what the reference does: {', '.join(twice)}; name"
+                " in the reference what trainings and evaluations have in common"
+            )
         return self
 
     @field_validator("algorithm_options")
@@ -178,7 +186,7 @@ def training_worlds(
     """
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
-    apart = {**environment(config.env).learned_from, **config.env_options}
+    apart = environment(config.env).learned_from | config.env_options | config.training_options
     conditions = [condition.replace(env_options=apart) for condition in conditions]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
     sizes = [count for _, count in shares]
