@@ -153,7 +153,8 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         has = f"the environment's has {', '.join(joints)}"
         raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
-    return ResidualPolicy(Corrected(base, model, description.settings), network)
+    truth = getattr(env.unwrapped, "truth", None)
+    return ResidualPolicy(Corrected(base, model, description.settings, truth), network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:

@@ -40,7 +40,9 @@ class _Deciding:
                 f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}"
             )
         policy = make(base, env) if isinstance(base, str) else base
-        self.corrected = Corrected(policy, env.unwrapped.assumed_model, self.settings)
+        own = env.unwrapped
+        truth = getattr(own, "truth", None)
+        self.corrected = Corrected(policy, own.assumed_model, self.settings, truth)
         self.features = Features(self.corrected)
         seen = (self.features.width,)
         decided = (self.corrected.num_residuals,)

@@ -6,6 +6,7 @@ pair of joints. It is decided from the features of `baselines.residual.features`
 becomes an input of the base (`baselines.compensation.inputs`).
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -42,13 +43,20 @@ class Corrected:
         base: Any policy that has the inputs; every policy has `command`.
         model: What may be known of the robot.
         settings: How the residual acts.
+        truth: What a teacher sees by: `truth` of the environment; None where there is none.
 
     Raises:
         ConfigurationError: An input that the base does not have, a joint that the robot has not, or
             caution without a walker.
     """
 
-    def __init__(self, base: Any, model: RobotModel, settings: ResidualSettings) -> None:
+    def __init__(
+        self,
+        base: Any,
+        model: RobotModel,
+        settings: ResidualSettings,
+        truth: Callable[[], Any] | None = None,
+    ) -> None:
         has = named_inputs.inputs_of(base)
         if lacking := [name for name in settings.acts_on if name not in has]:
             raise ConfigurationError(
@@ -63,6 +71,7 @@ class Corrected:
         self.base = as_batch_policy(base, model)
         self.settings = settings
         self.model = model
+        self.truth = truth
         self.view = self.base.view
         self.channels = Channels(model, settings)
         turns = settings.cutoff_hz * model.control_period_s

@@ -24,6 +24,7 @@ from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
+from baselines.residual.true_robot import TrueRobot
 from baselines.walking.flat_feet import FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
@@ -54,7 +55,7 @@ class FeaturesMemory(NamedTuple):
 class Features:
     """Features that decide a residual, in the order of the settings.
 
-    The base's action and earlier measurements last.
+    What a teacher sees behind them; the base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -70,6 +71,8 @@ class Features:
         period_s = settings.decision_period * model.control_period_s
         names = _source_names(settings.observe, model)
         self._sources = [_source(name, corrected, period_s) for name in names]
+        if settings.privileged:
+            self._sources.append(TrueRobot(settings.privileged, model, corrected.truth))
         self._reads_base = any(isinstance(source, _Estimate) for source in self._sources)
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]

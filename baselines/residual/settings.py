@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
+from baselines.residual.true_robot import QUANTITIES
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.errors import quote, require_known
 
@@ -53,6 +54,9 @@ class ResidualSettings(Model):
     and what `baselines.residual.features` makes of it and of the plan."""
     history: int = quantity("1", 0, ge=0, le=1000)
     """Earlier decisions whose measurements it sees as well [1]."""
+    privileged: tuple[Title, ...] = Field(default=(), max_length=MOST_ENTRIES)
+    """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
+    that a robot can play. For a walker in simulation."""
 
     @model_validator(mode="before")
     @classmethod
@@ -73,6 +77,7 @@ class ResidualSettings(Model):
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:
         require_known("input", self.acts_on, INPUTS)
+        require_known("quantity that a teacher sees", self.privileged, QUANTITIES)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
             whole = kind.default if bound is None else bound

@@ -130,9 +130,14 @@ def export_zip(
         trust_pickle: Both are pickles, and loading a pickle runs code from it.
 
     Raises:
-        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the
-            configuration.
+        ConfigurationError: A teacher, pickles that are not trusted, no model, or one that does not
+            fit the configuration.
     """
+    if config.settings.privileged:
+        raise ConfigurationError(
+            f"a teacher, which sees the true {', '.join(config.settings.privileged)}, is no"
+            " residual for a robot and is not exported; leave privileged out"
+        )
     if not trust_pickle:
         raise ConfigurationError(
             f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if"

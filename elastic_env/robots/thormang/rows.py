@@ -60,8 +60,13 @@ BIAS = record_type(
     ("wrench_rate", REAL, _FEET_WRENCH),  # [N/s], [N·m/s]
     ("cross_talk", REAL, (2, 6, 6)),
     ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
+    # of the robot, where nothing measures them: load [kg] and its moments [kg·m], slope of the
+    # ground forward and to the left [rad], friction over the assumed one [1]
+    ("load", REAL, 3),
+    ("slope", REAL, 2),
+    ("friction", REAL),
 )
-"""Errors of the sensors and length of the walk, which are drawn per episode."""
+"""Errors of the sensors, length of the walk, and more that is drawn per episode."""
 
 _TERMS = ("tilt", "zmp", "zmp_in_feet", "foot_drift", "effort", "smoothness", "fall")
 SCORES = record_type(*((term, REAL) for term in _TERMS))
@@ -124,6 +129,11 @@ class WalkTruth:
             2, 3) [N], [N·m].
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
+        backlash: True dead bands, (num_worlds, 12) [rad].
+        load: Load on the torso beyond the assumed robot [kg], and its moments about the torso
+            forward and to the left [kg·m], (num_worlds, 3).
+        slope: Slope of the ground, forward and to the left, (num_worlds, 2) [rad].
+        friction: True over assumed friction of the joints, (num_worlds,) [1].
         models: The true joints and masses of the worlds of each scenario, what is drawn aside.
     """
 
@@ -138,6 +148,10 @@ class WalkTruth:
     wrench: Array
     ankles: Array
     stiffness: Array
+    backlash: Array
+    load: Array
+    slope: Array
+    friction: Array
     models: tuple[WalkerModel, ...]
 
     @property

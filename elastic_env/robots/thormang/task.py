@@ -231,6 +231,10 @@ class WalkTask(Task):
             q=joints["q"].copy(),
             q_dot=joints["q_dot"].copy(),
             stiffness=joints["stiffness"].copy(),
+            backlash=joints["backlash"].copy(),
+            load=self._bias["load"].copy(),
+            slope=self._bias["slope"].copy(),
+            friction=self._bias["friction"].copy(),
             pelvis=body["pelvis"].copy(),
             ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
@@ -246,6 +250,12 @@ class WalkTask(Task):
         bias = self._bias
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot, kind.true_model)
+        kg = robot.load_kg
+        moments = (kg * robot.load_x_m, kg * robot.load_y_m)
+        bias["load"][world] = kg + kind.config.scenario.torso_load_kg, *moments
+        direction = robot.slope_direction_rad
+        bias["slope"][world] = robot.slope_rad * np.array([np.cos(direction), np.sin(direction)])
+        bias["friction"][world] = robot.friction
         spread = kind.config.scenario.pelvis_imu.bias_spread_rad
         mounting = spread * generator.uniform(-1.0, 1.0, 2)
         bias["imu_attitude"][world] = mounting + np.array(robot.mounting_rad)

@@ -1,0 +1,73 @@
+"""What a teacher sees beside a residual's features: the true robot, in simulation alone.
+
+No robot knows it. What such a residual gains says how much there is to gain by knowing the robot,
+and so bounds what estimates of it can bring.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, Mirrored, Signal
+from elastic_env.world.robot_model import RobotModel, WalkerModel
+
+QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction")
+"""Names of what a teacher can see."""
+
+_PARTS: dict[str, tuple[str, dict[str, Mirrored]]] = {
+    "load": ("kg", {"mass": "same", "forward": "same", "left": "opposite"}),
+    "slope": ("rad", {"forward": "same", "left": "opposite"}),
+    "friction": ("1", {"factor": "same"}),
+}
+
+
+class TrueRobot:
+    """A source of features that are the truth, see `baselines.residual.features`.
+
+    Args:
+        names: Of `QUANTITIES`.
+        model: Assumed robot.
+        truth: Noise-free state and true parameters of all worlds, as of `env.truth`.
+
+    Raises:
+        ConfigurationError: There is no truth to see, or the robot is no walker.
+    """
+
+    def __init__(
+        self, names: Sequence[str], model: RobotModel, truth: Callable[[], Any] | None
+    ) -> None:
+        if truth is None or not isinstance(model, WalkerModel):
+            raise ConfigurationError(
+                f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
+                " knows: it is no residual for a robot; train one with privileged: []"
+            )
+        self._names = names
+        self._truth = truth
+        self._stiffness = model.stiffness
+        signals: list[Signal] = []
+        for name in names:
+            joints: dict[str, Mirrored] = dict.fromkeys(model.joint_names, "same")
+            unit, parts = _PARTS.get(name, ("1", joints))
+            signals += [
+                Signal(f"true_{name}.{part}", unit, f"true {name}, {part}", mirrored=mirrored)
+                for part, mirrored in parts.items()
+            ]
+        self.signals = tuple(signals)
+
+    def begin(self, num_worlds: int) -> Array:
+        """It has no memory."""
+        return np.zeros((num_worlds, 0))
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:  # noqa: ARG002
+        """The truth of all worlds, (num_worlds, columns)."""
+        truth = self._truth()
+        values = {
+            "stiffness": truth.stiffness / self._stiffness - 1.0,
+            "backlash": truth.backlash,
+            "load": truth.load,
+            "slope": truth.slope,
+            "friction": truth.friction[:, None],
+        }
+        return np.hstack([values[name] for name in self._names]), memory
