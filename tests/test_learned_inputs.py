@@ -21,8 +21,8 @@ from tests.test_residual import random_network
 
 WALKER = "elastic_env/WalkInPlace-v0"
 QUICK: dict[str, Any] = {"step_period": [0.3, 0.4, 0.3], "num_steps": 4, "scenario": "drawn"}
-MEMORY = ["standing", "zmp_offset", "feet", "landing", "shear", "phase"]
-WIDTHS = [5, 2, 4, 4, 2, 4]
+MEMORY = ["standing", "zmp_offset", "feet", "landing", "shear", "phase", "zmp_of_steps"]
+WIDTHS = [5, 2, 4, 4, 2, 4, 4]
 
 
 def walkers(n: int, **options: Any) -> Any:
@@ -153,6 +153,45 @@ def test_the_phase_repeats_with_every_step_and_tells_its_parts_apart() -> None:
     np.testing.assert_allclose(
         of_step[:, 2:], np.column_stack([np.cos(2 * angle), np.sin(2 * angle)]), atol=1e-12
     )
+
+
+def test_the_zmp_error_is_that_of_flat_feet() -> None:
+    """Catches an error on level ground, which `contact_error` has, and one of the other sign."""
+    env, base, observations, states = walked(3, 400)
+    feet = FlatFeet(
+        env.unwrapped.assumed_model, LEAST_LOAD * env.unwrapped.assumed_model.biped.weight
+    )
+    features = Features(corrected(env, base, "zmp_error"))
+    for k in (1, 200, 399):
+        inner = type("State", (), {"inner": states[k]})
+        fresh = np.zeros(3, np.bool_)
+        found, _ = features.at(observations[k], features.begin(3), fresh, inner, None)
+        np.testing.assert_array_equal(found, feet.zmp_error(observations[k]))
+
+
+def test_the_zmp_of_steps_is_the_mean_of_each_step_until_the_next_on_that_foot() -> None:
+    """Catches a mean over standing, a foot's mean under the other one's name, and a mean that goes
+    on into the next step."""
+    env, base, observations, states = walked(2, 1250)
+    features = Features(corrected(env, base, "zmp_of_steps"))
+    errors = Features(corrected(env, base, "zmp_error"))
+    memory: Any = None
+    fresh = np.ones(2, np.bool_)
+    seen = []
+    shown = []
+    for k in range(0, 1250, 25):
+        inner = None if states[k] is None else type("State", (), {"inner": states[k]})
+        found, memory = features.at(observations[k], memory, fresh, inner, fresh)
+        shown.append(errors.at(observations[k], None, fresh, inner, fresh)[0])
+        seen.append(found.reshape(2, 2, 2))
+        fresh = np.zeros(2, np.bool_)
+    steps = np.array(shown)[10:].reshape(4, 10, 2, 2).mean(axis=1)  # ten decisions a step
+    for number in range(4):
+        now = seen[10 + 10 * number + 5]
+        left = steps[number - 1 - (number - 1) % 2] if number >= 1 else np.zeros((2, 2))
+        right = steps[number - 1 - number % 2] if number >= 2 else np.zeros((2, 2))
+        np.testing.assert_allclose(now[:, 0], left, atol=1e-15)
+        np.testing.assert_allclose(now[:, 1], right, atol=1e-15)
 
 
 def test_inputs_of_many_worlds_are_those_of_each_alone_and_of_the_exported_policy() -> None:

@@ -7,6 +7,8 @@
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
 | `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
+| `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |
+| `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
 | `phase` | walker: the first two harmonics of the phase of a step [1] |
@@ -25,7 +27,7 @@ from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import TrueRobot
-from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import (
@@ -36,6 +38,7 @@ from elastic_env.core.signals import (
     SignalGroup,
     rename_group,
 )
+from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
@@ -192,10 +195,21 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
             return BendingObserver(model)
         if name == "phase":
             return _phase(model)
+        if name == "zmp_error":
+            return _zmp_error(model)
+        if name == "zmp_of_steps":
+            return _ZmpOfSteps(model)
         timed = {"contact_error": _ContactError, "level": GroundLevel}
         if name in timed:
             return timed[name](model, period_s)
-        further += [*timed, "bending", "phase", *corrected.base.estimates]
+        further += [
+            *timed,
+            "bending",
+            "phase",
+            "zmp_error",
+            "zmp_of_steps",
+            *corrected.base.estimates,
+        ]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 
@@ -228,6 +242,70 @@ class _Estimate:
     def observe(self, rows: Array, memory: Any) -> tuple[Array, Array]:
         """Values from the memory of the base; nothing is kept beside it."""
         return self._base.estimate(self._name, rows, memory), self.begin(len(rows))
+
+
+def _zmp_error(model: WalkerModel) -> _Instant:
+    """ZMP of flat feet less the planned one; zero where the feet carry too little."""
+    feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
+    mirrored: dict[str, Mirrored | None] = {"x": "same", "y": "opposite"}
+    meaning = "{part} of the ZMP of flat feet less the planned one"
+    signals = SignalGroup.of("zmp_error", "m", meaning, mirrored, None).signals
+    return _Instant(signals, lambda rows: np.nan_to_num(feet.zmp_error(rows), nan=0.0))
+
+
+class _StepMemory(NamedTuple):
+    """Memory of `_ZmpOfSteps`.
+
+    Attributes:
+        total: Sum of the errors in this step, (num_worlds, 2) [m].
+        number: Measurements in it, (num_worlds,).
+        support: Support foot of this step, (num_worlds,).
+        means: Of the last steps on both feet, (num_worlds, 2, 2) [m].
+    """
+
+    total: Array
+    number: Array
+    support: Array
+    means: Array
+
+
+class _ZmpOfSteps:
+    """Mean error of the ZMP in the last step on the left foot, and on the right; zero before it.
+
+    What alternates with the steps, a slow integral of the error does not see.
+    """
+
+    def __init__(self, model: WalkerModel) -> None:
+        of_feet: dict[str, Mirrored | None] = {
+            "l_x": "same",
+            "l_y": "opposite",
+            "r_x": "same",
+            "r_y": "opposite",
+        }
+        meaning = "mean ZMP error {part} in the last step on a foot"
+        self.signals = SignalGroup.of("zmp_of_steps", "m", meaning, of_feet, None).signals
+        self._error = _zmp_error(model)
+        self._time, self._support = (
+            model.observation_table.columns(f"clock.{name}") for name in ("time", "support")
+        )
+
+    def begin(self, num_worlds: int) -> _StepMemory:
+        total = np.zeros((num_worlds, 2))
+        means = np.zeros((num_worlds, 2, 2))
+        return _StepMemory(total, np.zeros(num_worlds), np.zeros(num_worlds), means)
+
+    def observe(self, rows: Array, memory: _StepMemory) -> tuple[Array, _StepMemory]:
+        error, _ = self._error.observe(rows, memory.total)
+        support = rows[:, self._support][:, 0]
+        is_new = support != memory.support
+        mean = memory.total / np.maximum(memory.number, 1.0)[:, None]
+        feet = np.arange(2) == memory.support[:, None]
+        ended = (is_new[:, None] & feet)[:, :, None]
+        means = np.where(ended, mean[:, None], memory.means)
+        walks = rows[:, self._time][:, 0] > STAND_S
+        total = np.where(is_new[:, None], 0.0, memory.total) + walks[:, None] * error
+        number = np.where(is_new, 0.0, memory.number) + walks
+        return means.reshape(len(rows), 4), _StepMemory(total, number, support, means)
 
 
 def _phase(model: WalkerModel) -> _Instant:
