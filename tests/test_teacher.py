@@ -6,26 +6,31 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 
 import baselines
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
-from baselines.residual.residual_policy import save_residual
-from baselines.residual.settings import ResidualDescription, ResidualSettings
-from baselines.residual.true_robot import QUANTITIES
+from baselines.residual.residual_policy import load_residual, save_residual
+from baselines.residual.settings import (
+    TRUE_QUANTITIES,
+    ResidualDescription,
+    ResidualSettings,
+)
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.environment import make as make_walk
 from train.learn.export import export_zip
 from train.learn.train_config import TrainConfig, training_worlds
+from train.learn.training import Training
 
 QUICK: dict[str, Any] = {"step_period": [0.3, 0.4, 0.3], "num_steps": 2}
 
 
 def teacher(**settings: Any) -> ResidualSettings:
     """A teacher that sees all there is."""
-    return ResidualSettings(observe=("clock.swing",), privileged=QUANTITIES, **settings)
+    return ResidualSettings(observe=("clock.swing",), privileged=TRUE_QUANTITIES, **settings)
 
 
 def test_a_teacher_sees_the_robot_that_was_drawn() -> None:
@@ -124,3 +129,72 @@ def test_a_teacher_is_played_in_simulation_to_know_the_ceiling(tmp_path: Path) -
     observation, _ = env.reset(seed=0)
     _, state = policy.predict(observation)
     np.testing.assert_allclose(state.residual, [[0.5]])
+
+
+CRITIC: dict[str, Any] = {
+    "env": "walker",
+    "reference": [0.3, 0.4, 0.3],
+    "scenarios": ["drawn"],
+    "base": "foothold",
+    "worlds": 4,
+    "decisions": 32,
+    "evaluate_every": 32,
+    "checkpoint_every": 32,
+    "evaluation_episodes": 1,
+    "env_options": {"num_steps": 1},
+    "settings": {"observe": ["clock.swing", "standing", "landing"], "mirror": True},
+    "critic_sees": ["load", "mounting"],
+    "algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2},
+}
+
+
+def test_the_truth_that_a_critic_sees_is_none_of_the_residual(tmp_path: Path) -> None:
+    """Catches an actor that reads the truth, an export of other columns, and a critic that does
+    not see it."""
+    training = Training(TrainConfig(**CRITIC), 0, tmp_path, threads=1)
+    training.run()
+    policy = training.model.policy
+    seen = np.random.default_rng(0).normal(size=(5, 10 + 5)).astype(np.float32)
+    other = seen.copy()
+    other[:, 10:] += 1.0
+    with torch.no_grad():
+        actions, values = (
+            [call(torch.as_tensor(rows)) for rows in (seen, other)]
+            for call in (lambda rows: policy.get_distribution(rows).mode(), policy.predict_values)
+        )
+    assert torch.equal(*actions)
+    assert not torch.allclose(*values)
+    description, network = load_residual(tmp_path / "last")
+    assert network.num_features == 10
+    assert description.settings.privileged == ()
+    statistics = training.model.get_vec_normalize_env().obs_rms
+    std = np.sqrt(statistics.var[:10] + 1e-8)
+    raw = statistics.mean[:10] + std * seen[:, :10]
+    expected = np.clip(actions[0].numpy(), -1.0, 1.0)
+    np.testing.assert_allclose(network(raw), expected, rtol=0, atol=1e-6)
+
+
+def test_a_critic_sees_the_true_robot_in_the_mirror_where_the_actor_is() -> None:
+    """Catches truth of other worlds, and a load that hangs on the other side of a mirrored step."""
+    worlds = training_worlds(TrainConfig(**CRITIC), [("drawn", 4)], 1)
+    features, _ = worlds.reset(seed=0)
+    truth = worlds.unwrapped.truth()
+    assert worlds.actor_features == 10
+    np.testing.assert_array_equal(features[:, 10:], np.hstack([truth.load, truth.mounting]))
+    two = training_worlds(
+        TrainConfig(**{**CRITIC, "env_options": {"num_steps": 2}}), [("drawn", 4)], 1
+    )
+    two.reset(seed=0)
+    for _ in range(22):  # into the second step, which stands on the right foot
+        features, *_ = two.step(np.zeros(two.action_space.shape))
+    truth = two.unwrapped.truth()
+    mirrored = np.hstack([truth.load * [1, 1, -1], truth.mounting * [-1, 1]])
+    np.testing.assert_array_equal(features[:, 10:], mirrored)
+
+
+def test_a_critic_of_actions_sees_no_truth() -> None:
+    """Catches a key that is taken and has no effect."""
+    with pytest.raises(ConfigurationError, match=r"critic_sees is for PPO and A2C.*got SAC"):
+        TrainConfig(**{**CRITIC, "algorithm": "SAC", "algorithm_options": {}})
+    with pytest.raises(ConfigurationError, match=r"unknown quantity that a critic sees 'mass'"):
+        TrainConfig(**{**CRITIC, "critic_sees": ["mass"]})

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
-from baselines.residual.true_robot import QUANTITIES
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.errors import quote, require_known
 
@@ -15,6 +14,9 @@ Bound = float | dict[str, float]
 
 RESIDUAL = "residual:"
 """Before the folder of a trained residual, where policies are named."""
+
+TRUE_QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction", "mounting")
+"""What a teacher or a critic can see of the true robot."""
 
 _Titles = Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)]
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
@@ -77,7 +79,7 @@ class ResidualSettings(Model):
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:
         require_known("input", self.acts_on, INPUTS)
-        require_known("quantity that a teacher sees", self.privileged, QUANTITIES)
+        require_known("quantity that a teacher sees", self.privileged, TRUE_QUANTITIES)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
             whole = kind.default if bound is None else bound

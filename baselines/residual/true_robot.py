@@ -1,7 +1,8 @@
-"""What a teacher sees beside a residual's features: the true robot, in simulation alone.
+"""The true robot, in simulation alone: what a teacher sees beside its features, or a critic.
 
-No robot knows it. What such a residual gains says how much there is to gain by knowing the robot,
-and so bounds what estimates of it can bring.
+No robot knows it. What a teacher gains says how much there is to gain by knowing the robot, and so
+bounds what estimates of it can bring. A critic that knows the robot takes no other robot's luck for
+the actor's merit: an IMU that is mounted askew costs the same whatever the actor does.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from baselines.residual.correction import Corrected
+from baselines.residual.mirror import Mirror
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Mirrored, Signal
 from elastic_env.world.robot_model import RobotModel, WalkerModel
-
-QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction")
-"""Names of what a teacher can see."""
 
 _PARTS: dict[str, tuple[str, dict[str, Mirrored]]] = {
     "load": ("kg", {"mass": "same", "forward": "same", "left": "opposite"}),
     "slope": ("rad", {"forward": "same", "left": "opposite"}),
     "friction": ("1", {"factor": "same"}),
+    "mounting": ("rad", {"roll": "opposite", "pitch": "same"}),
 }
 
 
@@ -27,7 +28,7 @@ class TrueRobot:
     """A source of features that are the truth, see `baselines.residual.features`.
 
     Args:
-        names: Of `QUANTITIES`.
+        names: Of `baselines.residual.settings.TRUE_QUANTITIES`.
         model: Assumed robot.
         truth: Noise-free state and true parameters of all worlds, as of `env.truth`.
 
@@ -41,7 +42,8 @@ class TrueRobot:
         if truth is None or not isinstance(model, WalkerModel):
             raise ConfigurationError(
                 f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
-                " knows: it is no residual for a robot; train one with privileged: []"
+                " knows: it is no residual for a robot; train one with privileged: [], and"
+                " critic_sees: [] where there is no such truth"
             )
         self._names = names
         self._truth = truth
@@ -69,5 +71,32 @@ class TrueRobot:
             "load": truth.load,
             "slope": truth.slope,
             "friction": truth.friction[:, None],
+            "mounting": truth.mounting,
         }
         return np.hstack([values[name] for name in self._names]), memory
+
+
+class CriticView:
+    """What a critic sees of the true robots while it learns, in the mirror where the actor is.
+
+    Args:
+        names: Of `baselines.residual.settings.TRUE_QUANTITIES`.
+        corrected: The base and its correction.
+
+    Raises:
+        ConfigurationError: There is no truth to see, or the robot is no walker.
+    """
+
+    def __init__(self, names: Sequence[str], corrected: Corrected) -> None:
+        model = corrected.model
+        self._source = TrueRobot(names, model, corrected.truth)
+        self._mirror = Mirror(self._source.signals) if corrected.settings.mirror else None
+        self._support = model.observation_table.columns("clock.support")
+        self.width = len(self._source.signals)
+
+    def at(self, rows: Array) -> Array:
+        """Truth at a decision, (num_worlds, width), for observations, (num_worlds, m)."""
+        values, _ = self._source.observe(rows, self._source.begin(len(rows)))
+        if self._mirror is None:
+            return values
+        return np.where(rows[:, self._support] == 1.0, self._mirror(values), values)

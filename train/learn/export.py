@@ -91,15 +91,16 @@ def network_of(model: BaseAlgorithm, normaliser: Any) -> tuple[Tensors, dict[str
     features = tensors["weight0"].shape[1]
     tensors |= {"mean": np.zeros(features), "std": np.ones(features)}
     if normaliser is not None:
-        tensors["mean"] = normaliser.obs_rms.mean.copy()
-        tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
+        seen = normaliser.obs_rms  # the actor's columns are the first ones
+        tensors["mean"] = seen.mean[:features].copy()
+        tensors["std"] = np.sqrt(seen.var[:features] + normaliser.epsilon)
     return tensors, {"activation": names[activations.pop()], "output": output}
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     """The joints of the robot, if the widths of a network are those that its residual needs."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
-    sees = flatdim(worlds.single_observation_space)
+    sees = worlds.actor_features
     does = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()

@@ -6,7 +6,12 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 import baselines
-from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
+from baselines.residual.settings import (
+    TRUE_QUANTITIES,
+    ResidualDescription,
+    ResidualSettings,
+    require_plain_base,
+)
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import Entries, Locator, Once, Title, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
@@ -20,7 +25,7 @@ from train.evaluate.conditions import (
     require_drawn,
 )
 from train.evaluate.environments import environment
-from train.learn.algorithm_options import checked_options
+from train.learn.algorithm_options import CONSTANTS, checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.user_code import CodeNamingModel, is_a
 
@@ -60,6 +65,9 @@ class TrainConfig(CodeNamingModel):
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""
+    critic_sees: Entries[Title] = []
+    """What the critic sees of the true robot while it learns, for PPO and A2C on a walker
+    (`baselines.residual.true_robot`); the residual does without."""
     algorithm: Locator = "PPO"
     """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a
     search over residuals that never change."""
@@ -92,6 +100,7 @@ class TrainConfig(CodeNamingModel):
     def _scenarios_fit(self) -> Self:
         require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
+        require_known("quantity that a critic sees", self.critic_sees, TRUE_QUANTITIES)
         motion = self.reference if isinstance(self.reference, dict) else {}
         if twice := sorted(motion.keys() & self.training_options.keys()):
             raise ValueError(
@@ -106,6 +115,15 @@ class TrainConfig(CodeNamingModel):
         cls, options: dict[str, Any], others: ValidationInfo
     ) -> dict[str, Any]:
         return checked_options(str(others.data.get("algorithm")), options)
+
+    @model_validator(mode="after")
+    def _critic_is_one_of_the_state(self) -> Self:
+        if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
+            raise ValueError(
+                f"critic_sees is for PPO and A2C, whose critic looks at the state alone, got"
+                f" {self.algorithm}; leave it out"
+            )
+        return self
 
     @property
     def names_of_code(self) -> list[str]:
@@ -194,4 +212,6 @@ def training_worlds(
     base = baselines.make(config.base, worlds, **config.base_options)
     settings = config.settings.model_dump()
     mode = AutoresetMode.SAME_STEP
-    return ResidualVectorWrapper(worlds, base, autoreset_mode=mode, **settings)
+    return ResidualVectorWrapper(
+        worlds, base, autoreset_mode=mode, critic_sees=config.critic_sees, **settings
+    )

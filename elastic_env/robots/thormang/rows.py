@@ -134,6 +134,7 @@ class WalkTruth:
             forward and to the left [kg·m], (num_worlds, 3).
         slope: Slope of the ground, forward and to the left, (num_worlds, 2) [rad].
         friction: True over assumed friction of the joints, (num_worlds,) [1].
+        mounting: Error of roll and pitch by the IMU, (num_worlds, 2) [rad].
         models: The true joints and masses of the worlds of each scenario, what is drawn aside.
     """
 
@@ -152,6 +153,7 @@ class WalkTruth:
     load: Array
     slope: Array
     friction: Array
+    mounting: Array
     models: tuple[WalkerModel, ...]
 
     @property

@@ -235,6 +235,7 @@ class WalkTask(Task):
             load=self._bias["load"].copy(),
             slope=self._bias["slope"].copy(),
             friction=self._bias["friction"].copy(),
+            mounting=self._bias["imu_attitude"].copy(),
             pelvis=body["pelvis"].copy(),
             ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
