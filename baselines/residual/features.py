@@ -11,7 +11,7 @@
 | `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
-| `phase` | walker: the first two harmonics of the phase of a step [1] |
+| `phase` | walker: the first eight harmonics of the phase of a step [1] |
 | `standing`, `zmp_offset`, `feet`, `landing`, `shear` | what a base such as `foothold` has learned of the robot, from its memory |
 | `base_action` | what the base alone would command now [rad] |
 """  # noqa: E501
@@ -325,7 +325,8 @@ def _phase(model: WalkerModel) -> _Instant:
     return _Instant(signals, observe)
 
 
-_PHASE_HARMONICS = 2
+_PHASE_HARMONICS = 8
+"""As many as decisions every 0.1 s resolve in a step of 1.6 s."""
 
 _ERRORS = {
     "encoder_error": ("encoder_angle", "reference_angle"),
