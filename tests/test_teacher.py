@@ -192,6 +192,12 @@ def test_a_critic_sees_the_true_robot_in_the_mirror_where_the_actor_is() -> None
     np.testing.assert_array_equal(features[:, 10:], mirrored)
 
 
+def test_a_training_without_such_a_critic_is_read_back() -> None:
+    """Catches an empty list that the defaults have and a file may not."""
+    config = TrainConfig()
+    assert TrainConfig.model_validate(config.model_dump(mode="json")) == config
+
+
 def test_a_critic_of_actions_sees_no_truth() -> None:
     """Catches a key that is taken and has no effect."""
     with pytest.raises(ConfigurationError, match=r"critic_sees is for PPO and A2C.*got SAC"):

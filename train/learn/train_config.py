@@ -13,7 +13,7 @@ from baselines.residual.settings import (
     require_plain_base,
 )
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import Entries, Locator, Once, Title, quantity
+from elastic_env.core.config import MOST_ENTRIES, Entries, Locator, Once, Title, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
@@ -65,7 +65,7 @@ class TrainConfig(CodeNamingModel):
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""
-    critic_sees: Entries[Title] = []
+    critic_sees: Annotated[list[Title], Field(max_length=MOST_ENTRIES)] = []
     """What the critic sees of the true robot while it learns, for PPO and A2C on a walker
     (`baselines.residual.true_robot`); the residual does without."""
     algorithm: Locator = "PPO"
