@@ -22,7 +22,7 @@ from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import ResidualSettings
-from baselines.residual.true_robot import CriticView
+from baselines.residual.true_robot import CriticView, truth_of
 from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.envs import final_of, reset_mask
@@ -46,9 +46,8 @@ class _Deciding:
                 f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}"
             )
         policy = make(base, env) if isinstance(base, str) else base
-        own = env.unwrapped
-        truth = getattr(own, "truth", None)
-        self.corrected = Corrected(policy, own.assumed_model, self.settings, truth)
+        model = env.unwrapped.assumed_model
+        self.corrected = Corrected(policy, model, self.settings, truth_of(env))
         self.features = Features(self.corrected)
         self._critic = CriticView(critic_sees, self.corrected) if critic_sees else None
         further = 0 if self._critic is None else self._critic.width

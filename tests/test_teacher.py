@@ -18,6 +18,7 @@ from baselines.residual.settings import (
     ResidualDescription,
     ResidualSettings,
 )
+from baselines.residual.true_robot import truth_of
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.environment import make as make_walk
@@ -40,7 +41,10 @@ def test_a_teacher_sees_the_robot_that_was_drawn() -> None:
     task = env.unwrapped.task
     features = Features(
         Corrected(
-            baselines.make("input_output", env), env.unwrapped.assumed_model, teacher(), env.truth
+            baselines.make("input_output", env),
+            env.unwrapped.assumed_model,
+            teacher(),
+            truth_of(env),
         )
     )
     names = [signal.name for signal in features.signals]
@@ -178,7 +182,7 @@ def test_a_critic_sees_the_true_robot_in_the_mirror_where_the_actor_is() -> None
     """Catches truth of other worlds, and a load that hangs on the other side of a mirrored step."""
     worlds = training_worlds(TrainConfig(**CRITIC), [("drawn", 4)], 1)
     features, _ = worlds.reset(seed=0)
-    truth = worlds.unwrapped.truth()
+    truth = worlds.unwrapped.envs[0].truth()
     assert worlds.actor_features == 10
     np.testing.assert_array_equal(features[:, 10:], np.hstack([truth.load, truth.mounting]))
     two = training_worlds(
@@ -187,7 +191,7 @@ def test_a_critic_sees_the_true_robot_in_the_mirror_where_the_actor_is() -> None
     two.reset(seed=0)
     for _ in range(22):  # into the second step, which stands on the right foot
         features, *_ = two.step(np.zeros(two.action_space.shape))
-    truth = two.unwrapped.truth()
+    truth = two.unwrapped.envs[0].truth()
     mirrored = np.hstack([truth.load * [1, 1, -1], truth.mounting * [-1, 1]])
     np.testing.assert_array_equal(features[:, 10:], mirrored)
 

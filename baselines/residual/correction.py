@@ -6,9 +6,9 @@ pair of joints. It is decided from the features of `baselines.residual.features`
 becomes an input of the base (`baselines.compensation.inputs`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
+Truth: TypeAlias = Callable[[], Sequence[Any]]
+"""True states and parameters now, of one environment's worlds after the other's."""
+
 
 class CorrectedMemory(NamedTuple):
     """Values of the inputs behind the low-pass, (num_worlds, width), and the memory of the base."""
@@ -43,7 +46,7 @@ class Corrected:
         base: Any policy that has the inputs; every policy has `command`.
         model: What may be known of the robot.
         settings: How the residual acts.
-        truth: What a teacher sees by: `truth` of the environment; None where there is none.
+        truth: What a teacher sees by, see `baselines.residual.true_robot.truth_of`.
 
     Raises:
         ConfigurationError: An input that the base does not have, a joint that the robot has not, or
@@ -55,7 +58,7 @@ class Corrected:
         base: Any,
         model: RobotModel,
         settings: ResidualSettings,
-        truth: Callable[[], Any] | None = None,
+        truth: Truth | None = None,
     ) -> None:
         has = named_inputs.inputs_of(base)
         if lacking := [name for name in settings.acts_on if name not in has]:

@@ -5,12 +5,12 @@ bounds what estimates of it can bring. A critic that knows the robot takes no ot
 the actor's merit: an IMU that is mounted askew costs the same whatever the actor does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from baselines.residual.correction import Corrected
+from baselines.residual.correction import Corrected, Truth
 from baselines.residual.mirror import Mirror
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Mirrored, Signal
@@ -23,6 +23,21 @@ _PARTS: dict[str, tuple[str, dict[str, Mirrored]]] = {
     "mounting": ("rad", {"roll": "opposite", "pitch": "same"}),
 }
 
+_UNIT_OF_JOINTS = {"stiffness": "1", "backlash": "rad"}
+
+
+def truth_of(env: Any) -> Truth | None:
+    """Truth of the worlds of an environment, or of the environments of a mixture; None if unknown.
+
+    Args:
+        env: An environment of ours, wrapped or not.
+    """
+    own = env.unwrapped
+    envs = getattr(own, "envs", [own])
+    if not all(hasattr(one, "truth") for one in envs):
+        return None
+    return lambda: [one.truth() for one in envs]
+
 
 class TrueRobot:
     """A source of features that are the truth, see `baselines.residual.features`.
@@ -30,15 +45,13 @@ class TrueRobot:
     Args:
         names: Of `baselines.residual.settings.TRUE_QUANTITIES`.
         model: Assumed robot.
-        truth: Noise-free state and true parameters of all worlds, as of `env.truth`.
+        truth: As of `truth_of`.
 
     Raises:
         ConfigurationError: There is no truth to see, or the robot is no walker.
     """
 
-    def __init__(
-        self, names: Sequence[str], model: RobotModel, truth: Callable[[], Any] | None
-    ) -> None:
+    def __init__(self, names: Sequence[str], model: RobotModel, truth: Truth | None) -> None:
         if truth is None or not isinstance(model, WalkerModel):
             raise ConfigurationError(
                 f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
@@ -51,7 +64,7 @@ class TrueRobot:
         signals: list[Signal] = []
         for name in names:
             joints: dict[str, Mirrored] = dict.fromkeys(model.joint_names, "same")
-            unit, parts = _PARTS.get(name, ("1", joints))
+            unit, parts = _PARTS.get(name) or (_UNIT_OF_JOINTS[name], joints)
             signals += [
                 Signal(f"true_{name}.{part}", unit, f"true {name}, {part}", mirrored=mirrored)
                 for part, mirrored in parts.items()
@@ -64,16 +77,18 @@ class TrueRobot:
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """The truth of all worlds, (num_worlds, columns)."""
-        truth = self._truth()
-        values = {
-            "stiffness": truth.stiffness / self._stiffness - 1.0,
-            "backlash": truth.backlash,
-            "load": truth.load,
-            "slope": truth.slope,
-            "friction": truth.friction[:, None],
-            "mounting": truth.mounting,
-        }
-        return np.hstack([values[name] for name in self._names]), memory
+        parts = []
+        for truth in self._truth():
+            values = {
+                "stiffness": truth.stiffness / self._stiffness - 1.0,
+                "backlash": truth.backlash,
+                "load": truth.load,
+                "slope": truth.slope,
+                "friction": truth.friction[:, None],
+                "mounting": truth.mounting,
+            }
+            parts.append(np.hstack([values[name] for name in self._names]))
+        return np.concatenate(parts), memory
 
 
 class CriticView:

@@ -87,17 +87,6 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """The rules of the first environment, whose length and observation are those of all."""
         return self.envs[0].task
 
-    def truth(self) -> Any:
-        """Noise-free state and true parameters of all worlds, for scoring and teachers alone."""
-        parts = [vars(env.truth()) for env in self.envs]
-        joined = {name: [part[name] for part in parts] for name in parts[0]}
-        return type(self.envs[0].truth())(
-            **{
-                name: sum(own, ()) if isinstance(own[0], tuple) else np.concatenate(own)
-                for name, own in joined.items()
-            }
-        )
-
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
