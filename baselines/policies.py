@@ -21,6 +21,7 @@ from baselines.options import PolicyOptions
 from baselines.residual.correction import Corrected
 from baselines.residual.residual_policy import ResidualPolicy, load_residual
 from baselines.residual.settings import RESIDUAL
+from baselines.residual.true_robot import truth_of
 from elastic_env.core.errors import ConfigurationError, shorten, unknown_name
 from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
@@ -153,7 +154,8 @@ def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         has = f"the environment's has {', '.join(joints)}"
         raise ConfigurationError(f"{shorten(folder)} was trained on {trained}; {has}")
     base = make(description.base, env, **{**description.base_options, **options})
-    return ResidualPolicy(Corrected(base, model, description.settings), network)
+    corrected = Corrected(base, model, description.settings, truth_of(env))
+    return ResidualPolicy(corrected, network)
 
 
 def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:

@@ -6,7 +6,7 @@ decision. A world that ends inside a decision takes no further part in it: its o
 reward are those up to its end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -22,6 +22,7 @@ from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import ResidualSettings
+from baselines.residual.true_robot import CriticView, truth_of
 from elastic_env.core.errors import ActionError, ConfigurationError, quote
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.world.envs import final_of, reset_mask
@@ -32,7 +33,12 @@ class _Deciding:
     """Base policy, correction and features of some worlds, and their memories."""
 
     def __init__(
-        self, env: Any, base: Policy | str, settings: Mapping[str, Any], num_worlds: int
+        self,
+        env: Any,
+        base: Policy | str,
+        settings: Mapping[str, Any],
+        num_worlds: int,
+        critic_sees: Sequence[str] = (),
     ) -> None:
         self.settings = ResidualSettings(**settings)
         if not hasattr(env.unwrapped, "assumed_model"):
@@ -40,9 +46,12 @@ class _Deciding:
                 f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}"
             )
         policy = make(base, env) if isinstance(base, str) else base
-        self.corrected = Corrected(policy, env.unwrapped.assumed_model, self.settings)
+        model = env.unwrapped.assumed_model
+        self.corrected = Corrected(policy, model, self.settings, truth_of(env))
         self.features = Features(self.corrected)
-        seen = (self.features.width,)
+        self._critic = CriticView(critic_sees, self.corrected) if critic_sees else None
+        further = 0 if self._critic is None else self._critic.width
+        seen = (self.features.width + further,)
         decided = (self.corrected.num_residuals,)
         self.observation_space = Box(-np.inf, np.inf, seen, np.float64)
         self.action_space = Box(-1.0, 1.0, decided, np.float32)
@@ -68,7 +77,9 @@ class _Deciding:
             past = put_rows(self._past, worlds, select_rows(past, worlds))
         self._past = past
         self._fresh = self._fresh & (False if worlds is None else ~worlds)
-        return features
+        if self._critic is None:
+            return features
+        return np.hstack([features, self._critic.at(rows)])
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
         """Commands of the corrected base for a control step."""
@@ -151,6 +162,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
         autoreset_mode: When it restarts them; None as the environment would.
+        critic_sees: Truth that stands behind the features of the residual, for a critic alone.
         **settings: As of `ResidualWrapper`.
 
     Raises:
@@ -162,10 +174,13 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         env: gymnasium.vector.VectorEnv[Any, Any, Any],
         base_policy: Policy | str,
         autoreset_mode: AutoresetMode | None = None,
+        critic_sees: Sequence[str] = (),
         **settings: Any,
     ) -> None:
         super().__init__(env)
-        self._deciding = _Deciding(env, base_policy, settings, env.num_envs)
+        self._deciding = _Deciding(env, base_policy, settings, env.num_envs, critic_sees)
+        self.actor_features = self._deciding.features.width
+        """Columns of the observation that the residual decides by, the first ones."""
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
         self.settings = self._deciding.settings
@@ -202,14 +217,14 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         return self._last.copy(), info
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Cut the first episodes at decisions spread evenly over their length, in random order.
+        """Cut the first episodes at decisions spread evenly over their fewest, in random order.
 
         Call it after `reset`. From the end of the first whole episode on the worlds are all over
         it; learning that saw all worlds in the same phase would see one phase at a time. What is
         cut counts as truncated, and has no metrics.
         """
         env: Any = self.env.unwrapped
-        length = -(-env.task.num_steps // self.settings.decision_period)
+        length = -(-env.task.fewest_control_steps // self.settings.decision_period)
         order = generator.permutation(np.arange(1, self.num_envs + 1))
         self._decisions = 0
         self._cut_at = -(-order * length // self.num_envs)

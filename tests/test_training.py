@@ -564,6 +564,31 @@ def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> Non
     assert not trained & scored
 
 
+def test_walks_that_are_learned_from_have_other_lengths_than_those_of_evaluations() -> None:
+    """Catches a drawn length or a coarse physics step in an evaluation, and a training without."""
+    config = TrainConfig(
+        env="walker",
+        reference=[0.3, 0.4, 0.3],
+        scenarios=["nominal", "soft"],
+        worlds=40,
+        training_options={"num_steps": 8, "fewest_steps": 4, "timestep_s": 2e-3},
+    )
+    worlds: Any = training_worlds(config, config.shares, 1)
+    worlds.reset(seed=0)
+    for env in worlds.unwrapped.envs:
+        numbers = 8 - env.task._bias["skipped"] // 250
+        assert set(numbers.tolist()) == {4, 6, 8}
+        assert env.task.num_substeps == 2
+    evaluated: Any = make_vector_env(config.condition("soft", config.base), 2, 1).unwrapped
+    assert evaluated.task.num_steps == 500 + 4 * 250 == evaluated.task.fewest_control_steps
+    assert evaluated.task.num_substeps == 4
+    walk = {"step_period": 3, "num_steps": 4}
+    with pytest.raises(
+        ConfigurationError, match=r"must not say what the reference does: num_steps"
+    ):
+        TrainConfig(reference=walk, training_options={"num_steps": 20})
+
+
 @pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_train_command_trains_every_seed_and_resumes(
     jobs: str,

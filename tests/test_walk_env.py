@@ -25,7 +25,7 @@ from elastic_env.robots.thormang import task as walk_in_place
 from elastic_env.robots.thormang.config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
-from elastic_env.world.control_kernels import tilt_penalty, zmp_penalty
+from elastic_env.world.control_kernels import distance_penalty, tilt_penalty
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.world.scenario import make_scenario
 from tests.docstrings import documented_tables
@@ -1358,6 +1358,8 @@ def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(
         expected = {
             "tilt": -info["pelvis_error"] / 0.01,
             "zmp": -info["zmp_deviation"] / 0.03,
+            "zmp_in_feet": np.zeros(3),
+            "foot_drift": np.zeros(3),
             "effort": -0.001 * info["servo_torque"],
             "smoothness": -0.1 * info["command_rate"],
             "fall": np.zeros(3),
@@ -1408,7 +1410,7 @@ def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() ->
 def test_penalties_never_saturate() -> None:
     """Catches a kernel that hides how bad a large error is: twice the error costs twice as much."""
     errors = np.array([1e-3, 0.01, 0.2, 1.0])
-    for penalty in (tilt_penalty, zmp_penalty):
+    for penalty in (tilt_penalty, distance_penalty):
         np.testing.assert_allclose(penalty(2.0 * errors), 2.0 * penalty(errors))
         assert (penalty(errors) < 0.0).all()
     env = walk_env(scenario="ideal")

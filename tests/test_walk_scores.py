@@ -146,6 +146,27 @@ def test_the_mirrored_robot_drifts_to_the_other_side() -> None:
     assert info["foot_drift"][1] == pytest.approx(info["foot_drift"][0], rel=1e-3)
 
 
+def test_the_reward_has_the_zmp_in_the_feet_and_the_drift_as_terms_of_their_own() -> None:
+    """Catches a term of the other figure, of squares, without its weight, and one that counts
+    where a weight is zero."""
+    weights = {"zmp": 0.0, "zmp_in_feet": 150.0, "foot_drift": 40.0, "standing": 0.25}
+    env = make_walk(**FAST, num_steps=2, scenario="soft", reward=weights)
+    plain = make_walk(**FAST, num_steps=2, scenario="soft")
+    walking = env.unwrapped.task.plan.timing.walking[1:]
+    infos, plain_infos = walked(env), walked(plain)
+    factor = np.where(walking, 1.0, 0.25)
+    for name, weight in (("zmp_in_feet", 150.0), ("foot_drift", 40.0)):
+        found = np.array([info["reward_terms"][name] for info in infos])
+        np.testing.assert_allclose(found, -weight * factor * column(infos, name), rtol=1e-12)
+        assert all(info["reward_terms"][name] == 0.0 for info in plain_infos)
+    assert column(infos, "foot_drift").max() > 1e-3
+    assert all(info["reward_terms"]["zmp"] == 0.0 for info in infos)
+    env.reset(seed=0)
+    for _ in range(STANDING + 80):
+        _, reward, _, _, info = env.step(NO_OFFSET)
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-14)
+
+
 def test_a_gait_of_named_steps_is_scored_behind_its_settling_steps() -> None:
     """Catches a settling step in the scores, and standing."""
     gait = Gait(

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
-from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array, BoolArray, SignalTable
+from elastic_env.core.errors import ElasticError, unknown_name
+from elastic_env.core.signals import Array, BoolArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
 
 Action = npt.NDArray[np.float32]
@@ -91,6 +91,8 @@ class BatchPolicy(ABC):
         self.view = ObservationView(model)
         self.inputs: tuple[str, ...] = ()
         """Names of its inputs beside `command`, and of those of the policies inside it."""
+        self.estimates: Mapping[str, tuple[Signal, ...]] = {}
+        """What it has learned of the robot at hand, by name: values of `estimate`."""
 
     def predict(
         self,
@@ -150,6 +152,19 @@ class BatchPolicy(ABC):
             inputs: Values of its inputs.
         """
 
+    def estimate(self, name: str, rows: Array, memory: Any) -> Array:  # noqa: ARG002
+        """One of its `estimates` from its memory, (num_worlds, columns).
+
+        Args:
+            name: Which.
+            rows: Observations whose reference is meant, (num_worlds, m).
+            memory: That of the last control step.
+
+        Raises:
+            ConfigurationError: There is none of that name.
+        """
+        raise unknown_name("estimate of a policy", name, self.estimates)
+
     def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002
         """`link_estimate` of rows, (num_worlds, n) [rad]: without one the encoder angles."""
         return self.view.theta(rows)
@@ -167,6 +182,11 @@ class PolicyAround(BatchPolicy):
         super().__init__(model)
         self.policy = as_batch_policy(policy, model)
         self.inputs = self.policy.inputs
+        self.estimates = self.policy.estimates
+
+    @override
+    def estimate(self, name: str, rows: Array, memory: Any) -> Array:
+        return self.policy.estimate(name, rows, memory.inner)
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:

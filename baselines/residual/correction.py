@@ -6,8 +6,9 @@ pair of joints. It is decided from the features of `baselines.residual.features`
 becomes an input of the base (`baselines.compensation.inputs`).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
+Truth: TypeAlias = Callable[[], Sequence[Any]]
+"""True states and parameters now, of one environment's worlds after the other's."""
+
 
 class CorrectedMemory(NamedTuple):
     """Values of the inputs behind the low-pass, (num_worlds, width), and the memory of the base."""
@@ -42,13 +46,20 @@ class Corrected:
         base: Any policy that has the inputs; every policy has `command`.
         model: What may be known of the robot.
         settings: How the residual acts.
+        truth: What a teacher sees by, see `baselines.residual.true_robot.truth_of`.
 
     Raises:
         ConfigurationError: An input that the base does not have, a joint that the robot has not, or
             caution without a walker.
     """
 
-    def __init__(self, base: Any, model: RobotModel, settings: ResidualSettings) -> None:
+    def __init__(
+        self,
+        base: Any,
+        model: RobotModel,
+        settings: ResidualSettings,
+        truth: Truth | None = None,
+    ) -> None:
         has = named_inputs.inputs_of(base)
         if lacking := [name for name in settings.acts_on if name not in has]:
             raise ConfigurationError(
@@ -63,6 +74,7 @@ class Corrected:
         self.base = as_batch_policy(base, model)
         self.settings = settings
         self.model = model
+        self.truth = truth
         self.view = self.base.view
         self.channels = Channels(model, settings)
         turns = settings.cutoff_hz * model.control_period_s
@@ -109,10 +121,14 @@ class Corrected:
             action = (action + offset).astype(np.float32)
         return action, CorrectedMemory(values, inner)
 
+    def base_memory(self, rows: Array, state: Any, episode_start: Any) -> Any:
+        """Memory of the base before it acts on observations, for the state of the last step."""
+        inner = None if state is None else state.inner
+        return resume_memory(self.base, rows, inner, episode_start)
+
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
         """Command of the base alone, (num_worlds, n) [rad]."""
-        inner = None if state is None else state.inner
-        memory = resume_memory(self.base, rows, inner, episode_start)
+        memory = self.base_memory(rows, state, episode_start)
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:

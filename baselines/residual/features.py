@@ -7,8 +7,12 @@
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
 | `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
+| `zmp_error` | walker: measured ZMP of flat feet less the planned one [m], whatever the ground's tilt adds |
+| `zmp_of_steps` | walker: mean `zmp_error` in the last step on either foot |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
+| `phase` | walker: the first eight harmonics of the phase of a step [1] |
+| `standing`, `zmp_offset`, `feet`, `landing`, `shear` | what a base such as `foothold` has learned of the robot, from its memory |
 | `base_action` | what the base alone would command now [rad] |
 """  # noqa: E501
 
@@ -17,14 +21,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import put_rows, select_rows
+from baselines.compensation.policy import BatchPolicy, put_rows, select_rows
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
-from baselines.walking.flat_feet import FlatFeet
+from baselines.residual.true_robot import TrueRobot
+from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, Signal, rename_group
+from elastic_env.core.signals import (
+    Array,
+    BoolArray,
+    Mirrored,
+    Signal,
+    SignalGroup,
+    rename_group,
+)
+from elastic_env.motion.trajectory import STAND_S
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
@@ -44,7 +58,7 @@ class FeaturesMemory(NamedTuple):
 class Features:
     """Features that decide a residual, in the order of the settings.
 
-    The base's action and earlier measurements last.
+    What a teacher sees behind them; the base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -59,7 +73,10 @@ class Features:
         self._corrected = corrected
         period_s = settings.decision_period * model.control_period_s
         names = _source_names(settings.observe, model)
-        self._sources = [_source(name, model, period_s) for name in names]
+        self._sources = [_source(name, corrected, period_s) for name in names]
+        if settings.privileged:
+            self._sources.append(TrueRobot(settings.privileged, model, corrected.truth))
+        self._reads_base = any(isinstance(source, _Estimate) for source in self._sources)
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
@@ -99,7 +116,12 @@ class Features:
             fresh = np.ones_like(fresh)
         else:
             kept = put_rows(memory, fresh, select_rows(kept, fresh))
-        pairs = zip(self._sources, kept.sources, strict=True)
+        memories = kept.sources
+        if self._reads_base:
+            base = self._corrected.base_memory(rows, state, episode_start)
+            pairs = zip(self._sources, memories, strict=True)
+            memories = [base if isinstance(one, _Estimate) else own for one, own in pairs]
+        pairs = zip(self._sources, memories, strict=True)
         observed = [source.observe(rows, own) for source, own in pairs]
         values = [values for values, _ in observed]
         seen = np.hstack([np.zeros((len(rows), 0)), *values])
@@ -149,12 +171,15 @@ def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     return [name for name in names if name != BASE_ACTION]
 
 
-def _source(name: str, model: RobotModel, period_s: float) -> Any:
+def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     """A source of features.
 
     It has `signals`, `begin(num_worlds)` makes its memory, and `observe(rows, memory)` returns
     features and the new memory.
     """
+    model = corrected.model
+    if name in corrected.base.estimates:
+        return _Estimate(corrected.base, name)
     table = model.observation_table
     groups = _groups(model)
     if name in groups or name in table.names:
@@ -168,10 +193,23 @@ def _source(name: str, model: RobotModel, period_s: float) -> Any:
     if isinstance(model, WalkerModel):
         if name == "bending":
             return BendingObserver(model)
+        if name == "phase":
+            return _phase(model)
+        if name == "zmp_error":
+            return _zmp_error(model)
+        if name == "zmp_of_steps":
+            return _ZmpOfSteps(model)
         timed = {"contact_error": _ContactError, "level": GroundLevel}
         if name in timed:
             return timed[name](model, period_s)
-        further += [*timed, "bending"]
+        further += [
+            *timed,
+            "bending",
+            "phase",
+            "zmp_error",
+            "zmp_of_steps",
+            *corrected.base.estimates,
+        ]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 
@@ -189,6 +227,106 @@ class _Instant:
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
         return self._function(rows), memory
 
+
+class _Estimate:
+    """A source that the base has in its memory, see `BatchPolicy.estimate`."""
+
+    def __init__(self, base: BatchPolicy, name: str) -> None:
+        self.signals = base.estimates[name]
+        self._base = base
+        self._name = name
+
+    def begin(self, num_worlds: int) -> Array:
+        return np.zeros((num_worlds, 0))
+
+    def observe(self, rows: Array, memory: Any) -> tuple[Array, Array]:
+        """Values from the memory of the base; nothing is kept beside it."""
+        return self._base.estimate(self._name, rows, memory), self.begin(len(rows))
+
+
+def _zmp_error(model: WalkerModel) -> _Instant:
+    """ZMP of flat feet less the planned one; zero where the feet carry too little."""
+    feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
+    mirrored: dict[str, Mirrored | None] = {"x": "same", "y": "opposite"}
+    meaning = "{part} of the ZMP of flat feet less the planned one"
+    signals = SignalGroup.of("zmp_error", "m", meaning, mirrored, None).signals
+    return _Instant(signals, lambda rows: np.nan_to_num(feet.zmp_error(rows), nan=0.0))
+
+
+class _StepMemory(NamedTuple):
+    """Memory of `_ZmpOfSteps`.
+
+    Attributes:
+        total: Sum of the errors in this step, (num_worlds, 2) [m].
+        number: Measurements in it, (num_worlds,).
+        support: Support foot of this step, (num_worlds,).
+        means: Of the last steps on both feet, (num_worlds, 2, 2) [m].
+    """
+
+    total: Array
+    number: Array
+    support: Array
+    means: Array
+
+
+class _ZmpOfSteps:
+    """Mean error of the ZMP in the last step on the left foot, and on the right; zero before it.
+
+    What alternates with the steps, a slow integral of the error does not see.
+    """
+
+    def __init__(self, model: WalkerModel) -> None:
+        of_feet: dict[str, Mirrored | None] = {
+            "l_x": "same",
+            "l_y": "opposite",
+            "r_x": "same",
+            "r_y": "opposite",
+        }
+        meaning = "mean ZMP error {part} in the last step on a foot"
+        self.signals = SignalGroup.of("zmp_of_steps", "m", meaning, of_feet, None).signals
+        self._error = _zmp_error(model)
+        self._time, self._support = (
+            model.observation_table.columns(f"clock.{name}") for name in ("time", "support")
+        )
+
+    def begin(self, num_worlds: int) -> _StepMemory:
+        total = np.zeros((num_worlds, 2))
+        means = np.zeros((num_worlds, 2, 2))
+        return _StepMemory(total, np.zeros(num_worlds), np.zeros(num_worlds), means)
+
+    def observe(self, rows: Array, memory: _StepMemory) -> tuple[Array, _StepMemory]:
+        error, _ = self._error.observe(rows, memory.total)
+        support = rows[:, self._support][:, 0]
+        is_new = support != memory.support
+        mean = memory.total / np.maximum(memory.number, 1.0)[:, None]
+        feet = np.arange(2) == memory.support[:, None]
+        ended = (is_new[:, None] & feet)[:, :, None]
+        means = np.where(ended, mean[:, None], memory.means)
+        walks = rows[:, self._time][:, 0] > STAND_S
+        total = np.where(is_new[:, None], 0.0, memory.total) + walks[:, None] * error
+        number = np.where(is_new, 0.0, memory.number) + walks
+        return means.reshape(len(rows), 4), _StepMemory(total, number, support, means)
+
+
+def _phase(model: WalkerModel) -> _Instant:
+    """Harmonics of the phase of a step, which runs on before and after the walk."""
+    plan = model.plan
+    psi = stride_angle(plan.timing, plan.gait.step_period_s)
+    table = harmonics(psi, _PHASE_HARMONICS, is_odd=False)
+    time = model.observation_table.columns("clock.time")
+    parts = [f"{kind}_{k + 1}" for k in range(_PHASE_HARMONICS) for kind in ("cosine", "sine")]
+    mirrored: dict[str, Mirrored | None] = dict.fromkeys(parts, "same")
+    signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", mirrored, None).signals
+
+    def observe(rows: Array) -> Array:
+        row = np.rint(rows[:, time][:, 0] / model.control_period_s).astype(np.int64)
+        return table.take(row, axis=0, mode="clip")
+
+    return _Instant(signals, observe)
+
+
+_PHASE_HARMONICS = 8
+"""As many as decisions every 0.1 s resolve in a step of 1.6 s."""
 
 _ERRORS = {
     "encoder_error": ("encoder_angle", "reference_angle"),

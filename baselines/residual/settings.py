@@ -15,6 +15,9 @@ Bound = float | dict[str, float]
 RESIDUAL = "residual:"
 """Before the folder of a trained residual, where policies are named."""
 
+TRUE_QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction", "mounting")
+"""What a teacher or a critic can see of the true robot."""
+
 _Titles = Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)]
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _OLD_SPACES = {"model": DEFLECTION, "joint": COMMAND}
@@ -53,6 +56,9 @@ class ResidualSettings(Model):
     and what `baselines.residual.features` makes of it and of the plan."""
     history: int = quantity("1", 0, ge=0, le=1000)
     """Earlier decisions whose measurements it sees as well [1]."""
+    privileged: tuple[Title, ...] = Field(default=(), max_length=MOST_ENTRIES)
+    """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
+    that a robot can play. For a walker in simulation."""
 
     @model_validator(mode="before")
     @classmethod
@@ -73,6 +79,7 @@ class ResidualSettings(Model):
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:
         require_known("input", self.acts_on, INPUTS)
+        require_known("quantity that a teacher sees", self.privileged, TRUE_QUANTITIES)
         for name, bound in self.acts_on.items():
             kind = INPUTS[name]
             whole = kind.default if bound is None else bound

@@ -29,7 +29,8 @@ from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, S
 from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array, IntArray, Mirrored, SignalGroup
+from elastic_env.rigid.leg_kinematics import turn
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -59,6 +60,7 @@ PLANNED = record_type(heading=(), foot_yaw=(2,))
 FOOTHOLDS = record_type(
     place=(2, 2),  # of the feet against the plan, in the world [m]
     bias=(2, 2),  # error with which they land [m]
+    landed=(2, 2),  # error of their last landings [m]
     landings=(2,),
     target=(2, 2),  # offset with which they land [m]
     offset=(2, 2),  # commanded now [m]
@@ -67,6 +69,25 @@ FOOTHOLDS = record_type(
     swing=(),  # foot in the air, -1 for none
 )
 """Memory of the foothold correction."""
+
+
+_OF_FEET: dict[str, Mirrored | None] = {
+    "l_x": "same",
+    "l_y": "opposite",
+    "r_x": "same",
+    "r_y": "opposite",
+}
+# the mirror changes left and right: of their difference x turns round, and y stays
+_OF_BOTH: dict[str, Mirrored | None] = {"x": "opposite", "y": "same"}
+_KNOWN = {
+    name: SignalGroup.of(name, "m", meaning, parts, kind=None).signals
+    for name, meaning, parts in (
+        ("feet", "displacement {part} of a foot against the plan", _OF_FEET),
+        ("landing", "error {part} of a foot's last landing", _OF_FEET),
+        ("shear", "{part} of the landing error by the shear of both feet so far", _OF_BOTH),
+    )
+}
+"""What the correction knows, in the plan's local frame; `shear` is zero before both feet carry."""
 
 
 class FootholdMemory(NamedTuple):
@@ -96,12 +117,27 @@ class FootholdCorrection(PolicyAround):
         self._plan: Any = np.zeros(len(model.plan.q), PLANNED)
         self._plan["heading"] = model.plan.heading
         self._plan["foot_yaw"] = model.plan.foot_yaw
+        self.estimates = {**self.policy.estimates, **_KNOWN}
 
     @override
     def begin(self, rows: Array) -> FootholdMemory:
         footholds = np.zeros(len(rows), FOOTHOLDS)
         footholds["swing"] = -1.0
         return FootholdMemory(footholds, self.policy.begin(rows))
+
+    @override
+    def estimate(self, name: str, rows: Array, memory: FootholdMemory) -> Array:
+        own = memory.footholds
+        if name == "feet":
+            time = self._walk_view.fields(rows)["clock"][:, 0]
+            row = np.rint(time / self._gains["period_s"]).astype(np.int64)
+            heading = self._plan["heading"].take(row, mode="clip")
+            return turn(own["place"], -heading[:, None]).reshape(len(rows), 4)
+        if name == "landing":
+            return own["landed"].reshape(len(rows), 4)
+        if name == "shear":
+            return own["total"] / np.maximum(own["samples"], 1.0)[:, None]
+        return super().estimate(name, rows, memory)
 
     @override
     def act(self, rows: Array, memory: FootholdMemory, inputs: PolicyInputs) -> Step:
@@ -179,6 +215,7 @@ def lift(rules: Any, planned: Any, own: Any, foot: int) -> None:
         moved = turned(error_x, error_y, planned.heading)
         for i, error in enumerate((error_x, error_y)):
             own.place[standing, i] = own.place[foot, i] + moved[i]
+            own.landed[standing, i] = error
             missed = error - own.target[standing, i] - own.bias[standing, i]
             own.bias[standing, i] += gain * missed
     own.landings[foot] += 1.0

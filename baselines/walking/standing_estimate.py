@@ -20,7 +20,7 @@ from typing_extensions import override
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array, IntArray, Signal
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.world.robot_model import WalkerModel
 
@@ -51,12 +51,23 @@ class StandingMemory(NamedTuple):
         steps: Control steps since the start of the episode, (num_worlds,).
         total: Sum of the errors of the ZMP, and of roll and pitch at rest, (num_worlds, 4) [m],
             [rad].
+        load: Sum of the excess of the load over the assumed weight, (num_worlds,) [1].
         inner: Memory of the policy.
     """
 
     steps: IntArray
     total: Array
+    load: Array
     inner: Any
+
+
+_RESTED = (
+    Signal("standing.x", "m", "ZMP at rest less the planned one, forward", mirrored="same"),
+    Signal("standing.y", "m", "the same to the left", mirrored="opposite"),
+    Signal("standing.roll", "rad", "roll at rest by the IMU", mirrored="opposite"),
+    Signal("standing.pitch", "rad", "pitch at rest by the IMU", mirrored="same"),
+    Signal("standing.load", "1", "load at rest over the assumed weight, less 1", mirrored="same"),
+)
 
 
 class StandingEstimate(PolicyAround):
@@ -88,25 +99,39 @@ class StandingEstimate(PolicyAround):
         self._per_total = per_mean / self._samples
         self._constant = np.array([gains.constant_m, 0.0])
         self._limit = gains.limit_m
+        self._wrench = table.group("wrench")
+        self._weight = model.biped.weight
+        self.estimates = {**self.policy.estimates, "standing": _RESTED}
 
     @override
     def begin(self, rows: Array) -> StandingMemory:
-        total = np.zeros((len(rows), 4))
-        return StandingMemory(np.zeros(len(rows), np.int64), total, self.policy.begin(rows))
+        n = len(rows)
+        sums = (np.zeros((n, 4)), np.zeros(n))
+        return StandingMemory(np.zeros(n, np.int64), *sums, self.policy.begin(rows))
+
+    @override
+    def estimate(self, name: str, rows: Array, memory: StandingMemory) -> Array:
+        if name != "standing":
+            return super().estimate(name, rows, memory)
+        number = np.clip(memory.steps, 1, self._samples)
+        return np.column_stack([memory.total, memory.load]) / number[:, None]
 
     @override
     def act(self, rows: Array, memory: StandingMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
         total = memory.total
+        load = memory.load
         steps = memory.steps + 1
         rests = steps <= self._samples
         if np.count_nonzero(rests) > 0:
-            zmp = np.nan_to_num(self._feet.zmp_error(rows), nan=0.0)
-            shown = np.hstack([zmp, rows[:, self._attitude]])
+            force, error = self._feet.ground(rows, rows[:, self._wrench])
+            shown = np.hstack([np.nan_to_num(error, nan=0.0), rows[:, self._attitude]])
             total = total + rests[:, None] * shown
+            vertical = force[:, 0, 2] + force[:, 1, 2]
+            load = load + rests * (vertical / self._weight - 1.0)
         error = total @ self._per_total + self._constant
         shift = np.minimum(np.maximum(-error, -self._limit), self._limit)
         shift *= self._ramp.take(steps, mode="clip")[:, None]
         zmp = shift if inputs.zmp is None else inputs.zmp + shift
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
-        return action, StandingMemory(steps, total, inner)
+        return action, StandingMemory(steps, total, load, inner)

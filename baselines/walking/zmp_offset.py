@@ -20,7 +20,7 @@ from typing_extensions import override
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, SignalGroup
 from elastic_env.world.robot_model import WalkerModel
 
 
@@ -40,6 +40,15 @@ class ZmpOffsetMemory(NamedTuple):
     inner: Any
 
 
+_SHIFT = SignalGroup.of(
+    "zmp_offset",
+    "m",
+    "shift of the planned ZMP along {part} against its mean error",
+    {"x": "same", "y": "opposite"},
+    kind=None,
+).signals
+
+
 class ZmpOffset(PolicyAround):
     """A policy of a walker with its planned ZMP shifted against the mean error, see the module.
 
@@ -54,10 +63,17 @@ class ZmpOffset(PolicyAround):
         self._feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
         self._rate = model.control_period_s / gains.time_constant_s
         self._limit = gains.limit_m
+        self.estimates = {**self.policy.estimates, "zmp_offset": _SHIFT}
 
     @override
     def begin(self, rows: Array) -> ZmpOffsetMemory:
         return ZmpOffsetMemory(np.zeros((len(rows), 2)), self.policy.begin(rows))
+
+    @override
+    def estimate(self, name: str, rows: Array, memory: ZmpOffsetMemory) -> Array:
+        if name == "zmp_offset":
+            return memory.shift
+        return super().estimate(name, rows, memory)
 
     @override
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:

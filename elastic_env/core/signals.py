@@ -65,7 +65,7 @@ class SignalGroup:
         unit: str,
         meaning: str,
         parts: Mapping[str, Mirrored | None],
-        kind: Kind,
+        kind: Kind | None,
     ) -> Self:
         """A group of one unit.
 

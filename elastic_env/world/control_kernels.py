@@ -355,7 +355,7 @@ class Walker(NamedTuple):
     Attributes:
         constants: Addresses, feet, sensors and rules: records of `CONSTANTS`, (kinds,).
         plan: One record per control step.
-        bias: Errors of mounting, and of an inertial IMU, (num_worlds,).
+        bias: What is drawn per episode, (num_worlds,).
         inertial: Records of `INERTIAL` beside the constants, or None where no robot has such an
             IMU: its filter is then not even compiled. It is therefore an argument of its own.
         columns: Where the observation has what they show, (1,).
@@ -382,6 +382,7 @@ def begin_walk(physics: Any, step: Any, walker: Any, worlds: BoolArray) -> None:
             begin_joints(physics.qpos, physics.qvel, step, world)
             step.worlds[world].truth.contact_since = -1
             read_body(physics, walker, step, world)
+            stand_off(step.worlds[world].truth, walker.plan[0])
             drawn = sample_of(step, world)
             settle_imu(walker.inertial, walker, step, world, drawn)
             is_due = walker.plan[0].imu_is_due
@@ -411,9 +412,12 @@ def sense_walk(physics: Any, step: Any, walker: Any, control: Any) -> bool:
     for world in range(len(diverged)):
         rules = walker.constants[step.kind[world]]
         truth = step.worlds[world].truth
+        if truth.step == rules.skips_at:
+            truth.step += walker.bias[world].skipped
         planned = row_of(walker.plan, truth.step)
         if not diverged[world]:
             read_body(physics, walker, step, world)
+            stand_off(truth, planned)
             drawn = sample_of(step, world)
             advance_imu(walker.inertial, walker, step, world, drawn)
             measure(walker.inertial, walker, step, world, drawn, planned.imu_is_due)
@@ -487,6 +491,14 @@ def read_body(physics: Physics, walker: Walker, step: Step, world: int) -> None:
     moment_point(force, moment, row.ankles, constants.zmp_n, row.zmp)
     row.force[0] = force[0, 2]
     row.force[1] = force[1, 2]
+
+
+@compiled
+def stand_off(row: Any, planned: Any) -> None:
+    """Where the feet stand against the plan; nan where there is no ZMP."""
+    drift_of_feet(row.force, row.ankles, planned.ankles, row.drift)
+    if np.isnan(row.zmp[0]):
+        row.drift[0] = row.drift[1] = np.nan
 
 
 @compiled
@@ -810,13 +822,21 @@ def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray
 @compiled
 def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any) -> float:
     """Weighted terms of the reward, and their sum."""
-    deviation = math.hypot(row.zmp[0] - planned.zmp[0], row.zmp[1] - planned.zmp[1])
+    x = row.zmp[0] - planned.zmp[0]
+    y = row.zmp[1] - planned.zmp[1]
+    drift_x = row.drift[0]
+    drift_y = row.drift[1]
+    in_feet = math.hypot(x - drift_x, y - drift_y)
     terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
-    terms.zmp = weights.zmp * planned.weight * zmp_penalty(deviation)
+    terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
     terms.effort = weights.effort * -row.servo_torque
     terms.smoothness = weights.smoothness * -row.command_rate
     terms.fall = weights.fall * (-1.0 if is_terminated else 0.0)
-    return terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
+    terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
+    drift = math.hypot(drift_x, drift_y)
+    terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)
+    total = terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
+    return total + (terms.zmp_in_feet + terms.foot_drift)
 
 
 @compiled
@@ -826,9 +846,9 @@ def tilt_penalty(tilt: Parameter) -> Any:
 
 
 @compiled
-def zmp_penalty(zmp_deviation: Parameter) -> Any:
-    """−ZMP deviation [m], a distance; none where the feet are not loaded and it is nan."""
-    return -np.fmax(zmp_deviation, 0.0)
+def distance_penalty(distance: Parameter) -> Any:
+    """−distance [m]; none where the feet are not loaded and it is nan."""
+    return -np.fmax(distance, 0.0)
 
 
 @compiled
@@ -921,3 +941,23 @@ def moment_points(force: Array, moment: Array, ankle: Array, least_n: float, zmp
     """`moment_point` of several robots."""
     for row in range(len(force)):
         moment_point(force[row], moment[row], ankle[row], least_n, zmp[row])
+
+
+@compiled
+def drift_of_feet(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
+    """Displacement of the standing feet of one robot, see `foot_drift`: into `drift`, (2,)."""
+    carried = 0.0
+    for foot in range(len(force)):
+        carried += force[foot]
+    for i in range(2):
+        total = 0.0 if carried > 0.0 else np.nan
+        for foot in range(len(force)):
+            total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
+        drift[i] = total
+
+
+@compiled
+def foot_drifts(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
+    """`drift_of_feet` of several robots."""
+    for row in range(len(force)):
+        drift_of_feet(force[row], ankle[row], planned[row], drift[row])

@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.rigid.biped import Biped
-from elastic_env.world.control_kernels import ground_wrenches, moment_points
+from elastic_env.world.control_kernels import foot_drifts, ground_wrenches, moment_points
 
 
 class FootSensors:
@@ -93,10 +93,11 @@ def foot_drift(force: Array, ankle: Array, planned: Array) -> Array:
     Returns:
         d, (..., 2) [m]; nan where nothing is carried.
     """
-    away = (ankle - planned)[..., :2]
-    carried = force.sum(axis=-1, keepdims=True)
-    weights = force / np.where(carried > 0.0, carried, np.nan)
-    return (weights[..., None] * away).sum(axis=-2)
+    f = _rows(force, ankle.shape[:-1], 1)
+    p, p_plan = (_rows(places, ankle.shape, 2) for places in (ankle, planned))
+    drift = np.empty((len(f), 2))
+    foot_drifts(f, p, p_plan, drift)
+    return drift.reshape(*ankle.shape[:-2], 2)
 
 
 def _rows(values: Array, shape: tuple[int, ...], axes: int) -> Array:

@@ -98,6 +98,7 @@ class Task(ABC):
         world_type: Structured type of what a control step keeps of a world: truth, shown, scores.
         noise_type: Structured type of a sample of noise.
         num_steps: Control steps of an episode that does not fail.
+        fewest_control_steps: The same of the shortest one.
     """
 
     failure_names: tuple[str, ...] = ()
@@ -128,7 +129,7 @@ class Task(ABC):
         self.name = name
         self.model = model
         self.num_worlds = num_worlds
-        self.num_steps = reference.num_steps
+        self.num_steps = self.fewest_control_steps = reference.num_steps
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         self._sensors = FurtherSensors(sensors, joints, scenarios, counts)
         self.observation_table = SignalTable((*table, *self._sensors.signals))

@@ -91,15 +91,16 @@ def network_of(model: BaseAlgorithm, normaliser: Any) -> tuple[Tensors, dict[str
     features = tensors["weight0"].shape[1]
     tensors |= {"mean": np.zeros(features), "std": np.ones(features)}
     if normaliser is not None:
-        tensors["mean"] = normaliser.obs_rms.mean.copy()
-        tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
+        seen = normaliser.obs_rms  # the actor's columns are the first ones
+        tensors["mean"] = seen.mean[:features].copy()
+        tensors["std"] = np.sqrt(seen.var[:features] + normaliser.epsilon)
     return tensors, {"activation": names[activations.pop()], "output": output}
 
 
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     """The joints of the robot, if the widths of a network are those that its residual needs."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
-    sees = flatdim(worlds.single_observation_space)
+    sees = worlds.actor_features
     does = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()
@@ -130,9 +131,14 @@ def export_zip(
         trust_pickle: Both are pickles, and loading a pickle runs code from it.
 
     Raises:
-        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the
-            configuration.
+        ConfigurationError: A teacher, pickles that are not trusted, no model, or one that does not
+            fit the configuration.
     """
+    if config.settings.privileged:
+        raise ConfigurationError(
+            f"a teacher, which sees the true {', '.join(config.settings.privileged)}, is no"
+            " residual for a robot and is not exported; leave privileged out"
+        )
     if not trust_pickle:
         raise ConfigurationError(
             f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if"

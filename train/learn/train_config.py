@@ -6,9 +6,14 @@ from gymnasium.vector import AutoresetMode
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 import baselines
-from baselines.residual.settings import ResidualDescription, ResidualSettings, require_plain_base
+from baselines.residual.settings import (
+    TRUE_QUANTITIES,
+    ResidualDescription,
+    ResidualSettings,
+    require_plain_base,
+)
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.core.config import Entries, Locator, Once, Title, quantity
+from elastic_env.core.config import MOST_ENTRIES, Entries, Locator, Once, Title, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import (
@@ -20,7 +25,7 @@ from train.evaluate.conditions import (
     require_drawn,
 )
 from train.evaluate.environments import environment
-from train.learn.algorithm_options import checked_options
+from train.learn.algorithm_options import CONSTANTS, checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.user_code import CodeNamingModel, is_a
 
@@ -51,6 +56,8 @@ class TrainConfig(CodeNamingModel):
     """Intervals that the robots of `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
+    training_options: dict[str, Any] = {}
+    """The same for the worlds that are learned from alone, such as a longer physics step."""
     base: Title = "input_output"
     """Policy that is corrected: a baseline by name, since an exported residual plays without
     code of its own.
@@ -58,6 +65,9 @@ class TrainConfig(CodeNamingModel):
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""
+    critic_sees: Annotated[list[Title], Field(max_length=MOST_ENTRIES)] = []
+    """What the critic sees of the true robot while it learns, for PPO and A2C on a walker
+    (`baselines.residual.true_robot`); the residual does without."""
     algorithm: Locator = "PPO"
     """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a
     search over residuals that never change."""
@@ -90,6 +100,13 @@ class TrainConfig(CodeNamingModel):
     def _scenarios_fit(self) -> Self:
         require_known("scenario with a weight", self.weights, self.scenarios)
         require_drawn(self.scenarios, self.ranges)
+        require_known("quantity that a critic sees", self.critic_sees, TRUE_QUANTITIES)
+        motion = self.reference if isinstance(self.reference, dict) else {}
+        if twice := sorted(motion.keys() & self.training_options.keys()):
+            raise ValueError(
+                f"training_options must not say what the reference does: {', '.join(twice)}; name"
+                " in the reference what trainings and evaluations have in common"
+            )
         return self
 
     @field_validator("algorithm_options")
@@ -98,6 +115,15 @@ class TrainConfig(CodeNamingModel):
         cls, options: dict[str, Any], others: ValidationInfo
     ) -> dict[str, Any]:
         return checked_options(str(others.data.get("algorithm")), options)
+
+    @model_validator(mode="after")
+    def _critic_is_one_of_the_state(self) -> Self:
+        if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
+            raise ValueError(
+                f"critic_sees is for PPO and A2C, whose critic looks at the state alone, got"
+                f" {self.algorithm}; leave it out"
+            )
+        return self
 
     @property
     def names_of_code(self) -> list[str]:
@@ -178,7 +204,7 @@ def training_worlds(
     """
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
-    apart = {**environment(config.env).learned_from, **config.env_options}
+    apart = environment(config.env).learned_from | config.env_options | config.training_options
     conditions = [condition.replace(env_options=apart) for condition in conditions]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
     sizes = [count for _, count in shares]
@@ -186,4 +212,6 @@ def training_worlds(
     base = baselines.make(config.base, worlds, **config.base_options)
     settings = config.settings.model_dump()
     mode = AutoresetMode.SAME_STEP
-    return ResidualVectorWrapper(worlds, base, autoreset_mode=mode, **settings)
+    return ResidualVectorWrapper(
+        worlds, base, autoreset_mode=mode, critic_sees=config.critic_sees, **settings
+    )

@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from baselines.residual.settings import ResidualDescription
 from train.learn.algorithm_options import complete_options
 from train.learn.checkpoint import read_state, write_state
+from train.learn.critic import KnowingCritic
 from train.learn.export import algorithm_class, name_options, network_of
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.train_config import (
@@ -75,7 +76,11 @@ class Training(Trainer):
                 # a rollout whose last minibatch is smaller is no mistake
                 smaller = "You have specified a mini-batch size"
                 warnings.filterwarnings("ignore", smaller, UserWarning)
-                self.model: Any = algorithm("MlpPolicy", self._normaliser, **options)
+                policy = "MlpPolicy"
+                if config.critic_sees:
+                    policy = KnowingCritic
+                    options["policy_kwargs"]["actor_features"] = worlds.actor_features
+                self.model: Any = algorithm(policy, self._normaliser, **options)
             self._learning_rate = float(self.model.lr_schedule(1.0))
             self._shrink_last_layer()
         self.model.action_space.seed(seed)

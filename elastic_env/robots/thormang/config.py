@@ -38,7 +38,11 @@ class WalkRewardWeights(Model):
     tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6)
     """Per rad of pelvis error: 1 at 0.01 rad [1/rad]."""
     zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6)
-    """Per m of ZMP deviation: 1 at 0.03 m [1/m]."""
+    """Per m of ZMP deviation in the plan's world frame: 1 at 0.03 m [1/m]."""
+    zmp_in_feet: float = quantity("1/m", 0.0, ge=0, le=1e6)
+    """Per m of ZMP deviation, were the feet where they are planned [1/m]."""
+    foot_drift: float = quantity("1/m", 0.0, ge=0, le=1e6)
+    """Per m of the displacement of the standing feet against the plan [1/m]."""
     effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6)
     """Per N·m of servo torque, rms over the joints [1/(N·m)]."""
     smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6)
@@ -46,7 +50,7 @@ class WalkRewardWeights(Model):
     fall: float = quantity("1", 200.0, ge=0, le=1e6)
     """Once, at a fall or where the simulation diverges [1]."""
     standing: float = quantity("1", 1.0, ge=0, le=1e6)
-    """Factor of tilt and zmp before and after the walk, which is not scored [1]."""
+    """Factor of tilt, ZMP and drift before and after the walk, which is not scored [1]."""
 
 
 class WalkConfig(TaskConfig):
@@ -67,6 +71,9 @@ class WalkConfig(TaskConfig):
     reward: WalkRewardWeights = WalkRewardWeights()
     bank: int = quantity("1", 0, ge=0)
     """Bank of robots that a scenario draws from [1]."""
+    fewest_steps: int | None = quantity("1", None, ge=4)
+    """Fewest steps of a walk in place, whose number is then drawn per episode; None for those of
+    the gait [1]."""
     spare_bodies: int = quantity("1", 0, ge=0)
     """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
 
@@ -78,6 +85,27 @@ class WalkConfig(TaskConfig):
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
             )
         return self
+
+    @model_validator(mode="after")
+    def _walks_can_be_shorter(self) -> Self:
+        fewest = self.fewest_steps
+        if fewest is None:
+            return self
+        if not self.gait.is_in_place:
+            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
+        most = self.gait.num_steps
+        if fewest > most or (most - fewest) % 2:
+            raise ValueError(
+                f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
+                f" {fewest}"
+            )
+        return self
+
+    @property
+    def numbers_of_steps(self) -> range:
+        """Numbers of steps that a walk can have."""
+        most = self.gait.num_steps
+        return range(most if self.fewest_steps is None else self.fewest_steps, most + 1, 2)
 
     @model_validator(mode="after")
     def _worlds_know_the_same(self) -> Self:

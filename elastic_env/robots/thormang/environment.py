@@ -33,6 +33,7 @@ def configure_walk(
     bank: int = 0,
     timestep_s: float | None = None,
     sensors: Sequence[str] = (),
+    fewest_steps: int | None = None,
 ) -> WalkConfig:
     """The walker's configuration from the arguments of `gymnasium.make`.
 
@@ -56,6 +57,9 @@ def configure_walk(
         timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
         sensors: What is observed beside the standard set: "link_encoder", "joint_torque",
             "accelerometer"; see `elastic_env.world.further_sensors`.
+        fewest_steps: Walks in place have from so many steps, at least 4, up to `num_steps`, in
+            whole strides of two, drawn per episode: to learn from. A shorter walk leaves out
+            strides after its second step, and the clock runs over them. Default `num_steps`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -88,6 +92,7 @@ def configure_walk(
         sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         reward=as_model("reward", reward, WalkRewardWeights()),
         bank=bank,
+        fewest_steps=fewest_steps,
         **({} if timestep_s is None else dict[str, Any](timestep_s=timestep_s)),
     )
 

@@ -27,6 +27,7 @@ TRUTH = record_type(
     ("wrench", REAL, _FEET_WRENCH),
     ("force", REAL, 2),  # vertical force of the ground on the feet [N]
     ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
+    ("drift", REAL, 2),  # of the feet that stand, against the plan [m], nan likewise
     # step of the first touch in the second half of the swing, -1 before it
     ("contact_since", WHOLE),
 )
@@ -58,10 +59,16 @@ BIAS = record_type(
     ("wrench", REAL, _FEET_WRENCH),  # [N], [N·m]
     ("wrench_rate", REAL, _FEET_WRENCH),  # [N/s], [N·m/s]
     ("cross_talk", REAL, (2, 6, 6)),
+    ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
+    # of the robot, where nothing measures them: load [kg] and its moments [kg·m], slope of the
+    # ground forward and to the left [rad], friction over the assumed one [1]
+    ("load", REAL, 3),
+    ("slope", REAL, 2),
+    ("friction", REAL),
 )
-"""Errors that are drawn per episode."""
+"""Errors of the sensors, length of the walk, and more that is drawn per episode."""
 
-_TERMS = ("tilt", "zmp", "effort", "smoothness", "fall")
+_TERMS = ("tilt", "zmp", "zmp_in_feet", "foot_drift", "effort", "smoothness", "fall")
 SCORES = record_type(*((term, REAL) for term in _TERMS))
 """Weighted terms of the reward."""
 
@@ -72,6 +79,7 @@ ROW_OF_PLAN = record_type(
     ("clock", REAL, 3),
     ("share", REAL),
     ("zmp", REAL, 2),  # time, swing, support; μ; [m]
+    ("ankles", REAL, (2, 3)),  # [m]
     ("half_of_swing", WHOLE),
     ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_),
@@ -96,6 +104,7 @@ CONSTANTS = record_type(
     ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP
+    ("skips_at", WHOLE),  # control step from which a shorter walk goes on further behind
     ("weights", SCORES),
 )
 """Constants of a kind of world: feet, quality of the sensors, and rules."""
@@ -120,6 +129,12 @@ class WalkTruth:
             2, 3) [N], [N·m].
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
+        backlash: True dead bands, (num_worlds, 12) [rad].
+        load: Load on the torso beyond the assumed robot [kg], and its moments about the torso
+            forward and to the left [kg·m], (num_worlds, 3).
+        slope: Slope of the ground, forward and to the left, (num_worlds, 2) [rad].
+        friction: True over assumed friction of the joints, (num_worlds,) [1].
+        mounting: Error of roll and pitch by the IMU, (num_worlds, 2) [rad].
         models: The true joints and masses of the worlds of each scenario, what is drawn aside.
     """
 
@@ -134,6 +149,11 @@ class WalkTruth:
     wrench: Array
     ankles: Array
     stiffness: Array
+    backlash: Array
+    load: Array
+    slope: Array
+    friction: Array
+    mounting: Array
     models: tuple[WalkerModel, ...]
 
     @property

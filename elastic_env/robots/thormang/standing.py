@@ -18,6 +18,8 @@ integration unstable.
 _REST_RATE = 1e-4
 _CHECK_EVERY_S = 0.25
 _LONGEST_S = 20.0
+_LONGEST_STEP_S = 1e-3
+"""Longest physics step while the robot settles [s]; the strengthened dampers make it hop else."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ def settle(
             physics step.
     """
     calm = copy.copy(model)
+    calm.opt.timestep = min(model.opt.timestep, _LONGEST_STEP_S)
     calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPING)
     calm.dof_frictionloss[:] = 0.0
     data = mujoco.MjData(calm)

@@ -33,7 +33,7 @@ positions are in the plan's world frame, x forward at the start, y to the left:
 
 | key | unit | meaning |
 |---|---|---|
-| `time_s` | s | since the start of the episode |
+| `time_s` | s | since the start of the plan, of which a walk of fewer steps leaves out strides |
 | `pelvis_roll`, `pelvis_pitch` | rad | attitude of the pelvis, positive to the right and forward down |
 | `pelvis_error` | rad | angle between its z axis and the vertical, never negative |
 | `pelvis_height` | m | of the pelvis' origin |
@@ -77,7 +77,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.motion.gait import LEFT, RIGHT
-from elastic_env.motion.trajectory import Motion, Plan
+from elastic_env.motion.trajectory import STAND_S, Motion, Plan
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 from elastic_env.robots.thormang import NAME, tables
 from elastic_env.robots.thormang import rows as records
@@ -92,12 +92,15 @@ from elastic_env.robots.thormang.config import (
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
 from elastic_env.world.foot_sensors import foot_errors
-from elastic_env.world.ground_contact import FootSensors, foot_drift
+from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.sensors import is_due
 from elastic_env.world.task import Task, spring_torque
 
+_STEPS_BEFORE_SKIP = 2
+"""Steps after which one stride of a walk in place is as the next: the preview control has
+forgotten the start, and does not see the end yet."""
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
@@ -190,6 +193,10 @@ class WalkTask(Task):
         self._torso = self.model.body("upper_body").id
         self._phases = _phase_rows(plan)
         self._bias = np.zeros(num_worlds, records.BIAS)
+        of_step = round(plan.gait.step_period_s / period_s)
+        most = plan.gait.num_steps
+        self._skips = [of_step * (most - number) for number in config.numbers_of_steps]
+        self.fewest_control_steps = self.num_steps - max(self._skips)
         self._walk_constants = np.concatenate([_constants_of(*fit) for fit in self._fits])
         self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(plan, config)
@@ -219,6 +226,11 @@ class WalkTask(Task):
             q=joints["q"].copy(),
             q_dot=joints["q_dot"].copy(),
             stiffness=joints["stiffness"].copy(),
+            backlash=joints["backlash"].copy(),
+            load=self._bias["load"].copy(),
+            slope=self._bias["slope"].copy(),
+            friction=self._bias["friction"].copy(),
+            mounting=self._bias["imu_attitude"].copy(),
             pelvis=body["pelvis"].copy(),
             ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
@@ -233,7 +245,13 @@ class WalkTask(Task):
         kind = self._kind_of_world[world]
         robot = kind.bank[int(generator.integers(len(kind.bank)))]
         self._take_robot(world, robot)
-        self._bias["imu_attitude"][world] = robot.mounting_rad
+        bias = self._bias
+        kg = robot.load_kg
+        bias["load"][world] = kg, kg * robot.load_x_m, kg * robot.load_y_m
+        direction = robot.slope_direction_rad
+        bias["slope"][world] = robot.slope_rad * np.array([np.cos(direction), np.sin(direction)])
+        bias["friction"][world] = robot.friction
+        bias["imu_attitude"][world] = robot.mounting_rad
         generator.random(2)  # not used: the trial follows what has always been drawn here
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
@@ -241,7 +259,10 @@ class WalkTask(Task):
         self._kind[world] = self._fits.index(fit)
         self._draw_imu(world, generator)
         for name, values in foot_errors(robot).items():
-            self._bias[name][world] = values
+            bias[name][world] = values
+        if len(self._skips) > 1:
+            number = random.draw_trial(lambda own: int(own.integers(len(self._skips))))
+            bias["skipped"][world] = self._skips[number]
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
         """Time and direction of the push, in the steps that are scored."""
@@ -318,8 +339,7 @@ class WalkTask(Task):
         deflection = joints["theta"] - joints["q"]
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
-        drift = foot_drift(truth["force"], truth["ankles"], plan.ankles[row])
-        drift[np.isnan(deviation)] = np.nan
+        drift = truth["drift"]
         in_feet = deviation - drift
         middle = truth["ankles"][:, :, :2].mean(axis=1)
         return {
@@ -339,8 +359,8 @@ class WalkTask(Task):
             "zmp_in_feet_x": in_feet[:, 0],
             "zmp_in_feet_y": in_feet[:, 1],
             "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
-            "foot_drift_x": drift[:, 0],
-            "foot_drift_y": drift[:, 1],
+            "foot_drift_x": drift[:, 0].copy(),
+            "foot_drift_y": drift[:, 1].copy(),
             "link_error": rms(error),
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
@@ -402,6 +422,7 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
     rows["share"] = plan.share
     rows["zmp"] = plan.zmp
+    rows["ankles"] = plan.ankles
     rows["half_of_swing"] = np.where(timing.single, halves, 0)
     rows["swing_foot"] = RIGHT - timing.support
     rows["imu_is_due"] = is_due(steps, imu_hz, config.control_period_s)
@@ -434,6 +455,7 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
     """
     config = kind.config
     scenario = config.scenario
+    period_s = config.control_period_s
     noise = np.zeros(1, records.NOISE)
     for group, deviation in tables.sensor_noise(scenario, is_inertial).items():
         noise[group] = deviation
@@ -458,6 +480,7 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
         # sensors that carry nothing stand for a ground that carries the feet
         zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,
         weights=one(records.SCORES, **weights),
+        skips_at=round((STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s) / period_s),
     )
 
 
