@@ -190,7 +190,7 @@ def _on_refined_walk(build: Builder) -> Builder:
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         further = refined(model)
         options = _with_quick_gains(options)
-        if options.base is None:
+        if options.base in (None, "dynamic"):
             options = options.replace(base="dynamic", output=options.output or "taylor")
         policy = build(env, further, options)
         policy = FootholdCorrection(policy, further, options.foothold)
@@ -263,7 +263,8 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift
     # away over the walks
     if "swing_s" not in options.posture.model_fields_set:
-        options = options.replace(posture=options.posture.replace(swing_s=0.0))
+        given = options.posture.model_dump(exclude_unset=True)
+        options = options.replace(posture=PostureGains(**given, swing_s=0.0))
     known = policies_of(is_walker)[learned_base(options, is_walker)]
     base = known.build(env, model, options)
     signals = learned_signals(model, options.learning)

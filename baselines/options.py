@@ -42,7 +42,7 @@ class PolicyOptions(Model):
     """Walker: gains of the controller, over those that the policy's name stands for."""
     base: str | None = None
     """Walker: the compensated policy that a feedback builds on; None for `input_output`, and for
-    `dynamic` where `foothold` walks with steps of less than 2 s."""
+    `dynamic` where `foothold` builds on it."""
     adaptation: AdaptationGains = AdaptationGains()
     """How fast the stiffness is adapted."""
     posture: PostureGains = PostureGains()

@@ -1,8 +1,8 @@
 """The policy that reads the truth: what perfect sensing and a perfect model of the joints give.
 
-On the walker it knows K of every joint, the links, the pelvis' attitude and the foot wrenches. It
-does not know a load, a slope, a push, or the friction and backlash of drawn robots. Where these
-count it is no bound.
+On the walker it knows K of every joint, the links, the pelvis' attitude, the foot wrenches, and a
+load that all robots of a scenario have on their shoulders. It does not know a drawn load, a slope,
+a push, or the friction and backlash of drawn robots. Where these count it is no bound.
 """
 
 from typing import Any, NamedTuple, Self

@@ -73,7 +73,7 @@ class WalkingGains(Model):
     """Time constant of the ZMP shift [s]."""
     friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0)
     """Joint rate at which friction acts in full [rad/s]."""
-    weight_filter_s: float | None = None
+    weight_filter_s: float | None = quantity("s", None, gt=0)
     """Time constant of the weight that is measured [s]. Null takes the assumed weight. A load on
     the robot then shortens the leg that carries it."""
 

@@ -17,14 +17,18 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from elastic_env.core.config import Model, plain_numbers, quantity
+from elastic_env.core.errors import quote
 from elastic_env.core.signals import Array, BoolArray
 
 
 def _ends(value: Any) -> Any:
     """A number as the interval of this one point."""
     plain = plain_numbers(value)
-    is_number = isinstance(plain, int | float) and not isinstance(plain, bool)
-    return (plain, plain) if is_number else value
+    if isinstance(plain, list | tuple):
+        return plain
+    if isinstance(plain, bool) or not isinstance(plain, int | float):
+        raise ValueError(f"must be a number or [lowest, highest], got {quote(value)}")
+    return plain, plain
 
 
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_ends)]
@@ -111,7 +115,7 @@ class RobotRanges(Model):
     cross_talk: Interval = interval("1", 0.0, bounds=(-1, 1))
     """Share of the full scale of an axis that shows on another one, of every foot and pair of axes
     its own [1]."""
-    floor_friction: Interval = interval("1", 1.0, bounds=(0, 10))
+    floor_friction: Interval = interval("1", 1.0, bounds=(1e-6, 10))
     """Factor on the friction of soles and floor [1]."""
 
     @model_validator(mode="after")

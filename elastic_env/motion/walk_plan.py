@@ -6,7 +6,7 @@ center of mass of the whole robot, not the pelvis, follows the preview control.
 Legs that swing move the ZMP off that of the cart-table, by 2.5 mm rms in steps of 3 s and by 9 mm
 in steps of 1.1 s. The error of the motion's ZMP can pass the preview control once more
 [Kajita2003], which leaves about a seventh of it. Where the robot does not walk in place, the plan
-is that. Where it does, a policy can walk the refined plan (`baselines.walking.refined_walk`).
+is that. A policy can walk a plan that is refined once more (`baselines.walking.refined_walk`).
 
 The plan's world frame: x forward at the start, y left, z up, the origin on the ground halfway
 between the feet at the start. The local frame, in which policies read the plan: level, on the
@@ -212,7 +212,9 @@ def refine_plan(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPl
         com_height_m=plan.com_height, period_s=control_period_s, gravity=plan.gravity
     )
     further = follow_zmp(preview, plan.zmp - plan.zmp_of_motion, np.zeros(2))
-    com = plan.com + further.com
+    # that of this robot, which may carry more than the one that the plan was made for
+    from_pelvis = turn(biped.chains.center_of_mass(plan.q), plan.heading)
+    com = (plan.pelvis + from_pelvis)[:, :2] + further.com
     feet = _Feet(plan.ankles, plan.foot_yaw, plan.heading)
     pelvis = _pelvis_under(com, plan.pelvis, biped, feet, plan.timing.time)
     q = _angles(biped, pelvis, feet, plan.timing.time)

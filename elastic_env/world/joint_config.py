@@ -11,7 +11,6 @@ from elastic_env.core.robot_ranges import WALKER_FIELDS
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
-from elastic_env.world import scenario as scenarios
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.scenario import Scenario, make_scenario
 
@@ -76,7 +75,7 @@ class JointConfig(TaskConfig):
         if acting:
             raise ValueError(
                 f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"
-                f" knows; here choose from: {', '.join(scenarios.scenario_names(walks=False))}"
+                " knows; leave it out, or make a named scenario by make_scenario(name, walks=False)"
             )
         return self
 

@@ -16,7 +16,7 @@ from typing import Any, Self
 from pydantic import Field, model_validator
 
 from elastic_env.core.config import Title, quantity
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.robot_ranges import LOAD_PLACE, WALKER_FIELDS, RobotRanges
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
@@ -33,7 +33,7 @@ class Scenario(RobotRanges):
 
     name: Title = "custom"
     friction_scale: float = quantity("1", 1.0, ge=0)
-    """Share of the joints' friction that acts, 0 for none; policies know it [1]."""
+    """Share of the joints' friction that acts, 0 for none; policies of the walker know it [1]."""
     pendulum_mass_scale: float = quantity("1", 1.0, gt=0)
     """Testbed: true over assumed mass of pendulum [1]."""
     push_s: float = quantity("s", 0.1, gt=0, le=600)
@@ -232,6 +232,33 @@ def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
     return kept
 
 
+def _require_ranges(ranges: Any, walks: bool) -> None:
+    """Refuse what is no mapping or list of mappings, and intervals of walkers elsewhere."""
+    each = [ranges] if isinstance(ranges, Mapping) else ranges
+    if not isinstance(each, list | tuple) or not all(isinstance(own, Mapping) for own in each):
+        raise ConfigurationError(
+            f"ranges must be a mapping of intervals, or a list of such, got {quote(ranges)}"
+        )
+    of_walkers = sorted({field for own in each for field in own} & {*WALKER_FIELDS})
+    if of_walkers and not walks:
+        here = [field for field in RobotRanges.model_fields if field not in WALKER_FIELDS]
+        raise ConfigurationError(
+            f"ranges: only a walker has {', '.join(of_walkers)}; here choose from:"
+            f" {', '.join(here)}"
+        )
+
+
+def _in_each_part(parameters: dict[str, Any], name: str) -> dict[str, Any]:
+    """Parameters of a mixture whose ranges also hold the intervals that stand beside it."""
+    beside = {field: parameters[field] for field in parameters.keys() & RobotRanges.model_fields}
+    parts: list[RobotRanges] = parameters["mixture"]
+    twice = sorted({field for own in parts for field in own.changes} & beside.keys())
+    if twice:
+        raise ConfigurationError(f"scenario {name!r} sets {', '.join(twice)} a second time")
+    others = {field: value for field, value in parameters.items() if field not in beside}
+    return {**others, "mixture": [own.replace(**beside) for own in parts]}
+
+
 def scenario_names(walks: bool = True) -> list[str]:
     """Named conditions without joined names and distributions.
 
@@ -257,6 +284,7 @@ def make_scenario(
     """
     if isinstance(name, Scenario):
         return name
+    _require_ranges(ranges or {}, walks)
     changes = str(name)[:_LONGEST_JOINED].split("+")
     ground = GROUNDS[changes.pop(0) if changes[0] in GROUNDS else "nominal"]
     parameters: dict[str, Any] = {}
@@ -277,4 +305,6 @@ def make_scenario(
                 f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time"
             )
         parameters |= added
+    if "mixture" in parameters:
+        parameters = _in_each_part(parameters, str(name))
     return ground.replace(**parameters, name=str(name))

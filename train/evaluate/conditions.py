@@ -29,7 +29,7 @@ Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
 """Episodes of a cell."""
 SCENARIO = "scenario."
 """Prefix of a field of the scenario that is varied, such as scenario.stiffness."""
-_HALF_WIDTH = "half_width"
+HALF_WIDTH = "half_width"
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
@@ -253,13 +253,14 @@ def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
     for path, value in fields.items():
         first, _, inner = path.removeprefix(SCENARIO).partition(".")
         new: Any = value
-        if inner == _HALF_WIDTH:
+        if inner == HALF_WIDTH:
             new = (-value, value)
         elif inner:
             new = getattr(scenario, first).replace(**{inner: value})
         elif first in RobotRanges.model_fields and scenario.draws(first):
             raise ConfigurationError(
-                f"scenario {scenario.name!r} draws {first} from ranges; vary it in another one"
+                f"scenario {scenario.name!r} draws {first}; vary it in another one, or vary"
+                f" {SCENARIO}{first}.{HALF_WIDTH}"
             )
         scenario = scenario.replace(**{first: new})
     return scenario
@@ -282,5 +283,5 @@ def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
             found[f"{before}{name}"] = known
             bounds: Any = extra.get("bounds", (0.0, 1.0))
             if bounds[0] == -bounds[1]:
-                found[f"{before}{name}.{_HALF_WIDTH}"] = f"half-width: {known[0]}", known[1]
+                found[f"{before}{name}.{HALF_WIDTH}"] = f"half-width: {known[0]}", known[1]
     return found

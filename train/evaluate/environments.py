@@ -252,13 +252,13 @@ class Environment:
         """True if all episodes of a condition are one and the same."""
         if self.is_real:
             return False
-        return not (make_scenario(scenario).is_random or self.draws(reference))
+        return not (make_scenario(scenario, self.walks).is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
         """True if the episodes of a condition are of one robot and one motion."""
         if self.is_real:
             return False
-        return not (make_scenario(scenario).draws_robots or self.draws(reference))
+        return not (make_scenario(scenario, self.walks).draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:

@@ -16,7 +16,13 @@ from elastic_env.core.config import MOST_ENTRIES, Model, Once, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote
 from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, change_of
-from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, vary_scenario
+from train.evaluate.conditions import (
+    HALF_WIDTH,
+    SCENARIO,
+    Condition,
+    scenario_fields,
+    vary_scenario,
+)
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
@@ -52,7 +58,8 @@ class Axis(Model):
             unit = " [s]" if self.what == "step_period" else ""
             return f"{self.what.replace('_', ' ')}{unit}"
         description, unit = scenario_fields()[self.what]
-        return f"{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
+        kind = "half-width, " if self.what.endswith(f".{HALF_WIDTH}") else ""
+        return f"{kind}{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
 
     def ticks(self, known: Environment) -> list[str]:
         """Its values as they are shown."""
@@ -82,10 +89,9 @@ class MapConfig(Model):
 
     @model_validator(mode="after")
     def _axes_differ(self) -> Self:
-        what = self.x.what
-        if what == self.y.what:
-            problem = "x and y of a map must vary two things"
-            raise ValueError(f"{problem}, both vary {what!r}")
+        x, y = (axis.what.removesuffix(f".{HALF_WIDTH}") for axis in self.axes)
+        if x == y:
+            raise ValueError(f"x and y of a map must vary two things, both vary {x!r}")
         return self
 
     @property

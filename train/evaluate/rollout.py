@@ -234,9 +234,10 @@ def shared_settings(condition: Condition) -> str:
     That is everything but the scenario of a walker, of which a policy knows the friction and the
     rate of the IMU.
     """
-    scenario = make_scenario(condition.scenario_played)
+    walks = condition.environment.walks
+    scenario = make_scenario(condition.scenario_played, walks)
     known: Any = scenario
-    if condition.environment.walks:
+    if walks:
         known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz)
     return repr((condition.env, {**condition.arguments, "scenario": known}))
 
