@@ -4,7 +4,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 
+import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.compensators import Compensated, DynamicCompensator
 from baselines.compensation.policy import PolicyInputs, Zero
@@ -74,3 +76,23 @@ def test_a_robot_without_friction_walks_with_a_third_of_the_error() -> None:
     assert deviations[0] > 8e-3
     assert deviations[1] < deviations[0] / 3.0
     assert metrics[1]["pelvis_error_rms_rad"] < metrics[0]["pelvis_error_rms_rad"]
+
+
+@pytest.mark.parametrize("name", ["foothold", "phase_table", "oracle"])
+def test_what_a_policy_inside_has_learned_is_known_outside(name: str) -> None:
+    """Catches a wrapper that looks for a memory of its own where it has none."""
+    env = gymnasium.make_vec(
+        "elastic_env/WalkInPlace-v0", num_envs=2, vectorization_mode="vector_entry_point"
+    )
+    policy = baselines.make(name, env)
+    assert {"standing", "zmp_offset", "feet", "landing", "shear"} <= {*policy.estimates}
+    observation, _ = env.reset(seed=0)
+    state = None
+    for step in range(20):
+        action, state = policy.predict(observation, state, np.full(2, step == 0))
+        observation, *_ = env.step(action)
+    standing = policy.estimate("standing", np.asarray(observation, np.float64), state)
+    assert np.abs(standing).max() > 1e-5
+    for estimate in policy.estimates:
+        assert len(policy.estimate(estimate, np.asarray(observation, np.float64), state)) == 2
+    env.close()

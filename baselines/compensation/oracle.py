@@ -15,7 +15,7 @@ from baselines.compensation.compensators import (
     DriveMemory,
     DynamicCompensator,
 )
-from baselines.compensation.policy import Motion, Policy, PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import Motion, PassingMemory, Policy, PolicyInputs, Step
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
@@ -146,7 +146,7 @@ class Oracle(Compensated):
         self.inputs = ()
 
 
-class TrueSensors(PolicyAround):
+class TrueSensors(PassingMemory):
     """A policy of a walker whose IMU and foot sensors show the truth of the environment at once.
 
     Args:
@@ -162,17 +162,9 @@ class TrueSensors(PolicyAround):
         self._columns = [(table.group(group), name) for group, name in names.items()]
 
     @override
-    def begin(self, rows: Array) -> Any:
-        return self.policy.begin(rows)
-
-    @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         truth = self._env.truth()
         seen = rows.copy()
         for columns, name in self._columns:
             seen[:, columns] = getattr(truth, name).reshape(len(rows), -1)
         return self.policy.act(seen, memory, inputs)
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)

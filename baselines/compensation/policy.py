@@ -193,6 +193,22 @@ class PolicyAround(BatchPolicy):
         return self.policy.link_angles(rows, memory.inner)
 
 
+class PassingMemory(PolicyAround):
+    """A policy around another one without a memory of its own: its memory is that of the other."""
+
+    @override
+    def begin(self, rows: Array) -> Any:
+        return self.policy.begin(rows)
+
+    @override
+    def estimate(self, name: str, rows: Array, memory: Any) -> Array:
+        return self.policy.estimate(name, rows, memory)
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        return self.policy.link_angles(rows, memory)
+
+
 class Zero(BatchPolicy):
     """Plays the reference back: no offset, no memory, and it takes the encoder for the link."""
 

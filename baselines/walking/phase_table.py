@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PassingMemory, PolicyInputs, Step
 from elastic_env.core.config import Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -128,7 +128,7 @@ def load_phase_table(step_period_s: float, file: Path | None = None) -> PhaseTab
     return table
 
 
-class PhaseFeedforward(PolicyAround):
+class PhaseFeedforward(PassingMemory):
     """A policy of a walker with a table added to its inputs `zmp` and `hip`, see the module.
 
     The table comes with the first double support and goes with the last one.
@@ -154,10 +154,6 @@ class PhaseFeedforward(PolicyAround):
         self._rate_hz = 1.0 / model.control_period_s
 
     @override
-    def begin(self, rows: Array) -> Any:
-        return self.policy.begin(rows)
-
-    @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """It adds to the inputs `zmp` and `hip`; its memory is that of the policy inside."""
         periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
@@ -165,7 +161,3 @@ class PhaseFeedforward(PolicyAround):
         zmp = ahead[:, :2] if inputs.zmp is None else inputs.zmp + ahead[:, :2]
         hip = ahead[:, 2:] if inputs.hip is None else inputs.hip + ahead[:, 2:]
         return self.policy.act(rows, memory, inputs._replace(zmp=zmp, hip=hip))
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PassingMemory, PolicyInputs, Step
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import refine_plan
 from elastic_env.world.robot_model import WalkerModel
@@ -32,7 +32,7 @@ def refined(model: WalkerModel) -> WalkerModel:
     return replace(model, plan=plan)
 
 
-class RefinedWalk(PolicyAround):
+class RefinedWalk(PassingMemory):
     """A policy for the refined plan of a walker, on the plan that the environment shows.
 
     Args:
@@ -53,10 +53,6 @@ class RefinedWalk(PolicyAround):
         self._change = motions[1] - motions[0]
 
     @override
-    def begin(self, rows: Array) -> Any:
-        return self.policy.begin(rows)
-
-    @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """Its memory is that of the policy inside."""
         periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
@@ -66,7 +62,3 @@ class RefinedWalk(PolicyAround):
         action, memory = self.policy.act(seen, memory, inputs)
         total = action + change[:, : self.view.num_joints]
         return total.astype(np.float32), memory
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)

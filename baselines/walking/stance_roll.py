@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PassingMemory, PolicyInputs, Step
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import RIGHT
@@ -59,7 +59,7 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
     return offsets.reshape(len(swing), 12)
 
 
-class StanceRoll(PolicyAround):
+class StanceRoll(PassingMemory):
     """Any policy of a walker with the hip roll feedforward added, see the module.
 
     It has no memory of its own.
@@ -76,16 +76,8 @@ class StanceRoll(PolicyAround):
         self._clock = model.observation_table.group("clock")
 
     @override
-    def begin(self, rows: Array) -> Any:
-        return self.policy.begin(rows)
-
-    @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         _, swing, support = rows[:, self._clock].T
         action, memory = self.policy.act(rows, memory, inputs)
         total = action + stance_roll(swing, support, self._gains)
         return total.astype(np.float32), memory
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)
