@@ -341,7 +341,7 @@ def test_the_leaderboard_of_the_project_has_its_columns() -> None:
     references = {reference for reference, _ in cells}
     assert {r: sum(reference == r for reference, _ in cells) for r in references} == {
         "3 s": 16,
-        "3 s num_steps=20": 3,
+        "3 s num_steps=20": 2,
         "24 s": 1,
         "1.6 s": 5,
         "1.1 s": 5,

@@ -264,9 +264,12 @@ def test_what_is_drawn_is_not_said_twice() -> None:
         make_scenario("sensor+drawn")
     with pytest.raises(ConfigurationError, match="'drawn' sets stiffness a second time"):
         make_scenario("soft+drawn")
-    with pytest.raises(ConfigurationError, match=r"mixture says in what.* leave out stiffness"):
+    with pytest.raises(ConfigurationError, match="'soft.drawn_beyond' sets stiffness a second"):
         make_scenario("soft+drawn_beyond")
     assert make_scenario("slip+drawn").floor_friction == (0.3, 0.3)
+    listed = make_scenario("slip+drawn", ranges=[{"load_kg": 1}, {"slope_rad": 0.01}])
+    for scenario in (make_scenario("slip+drawn_beyond"), listed):
+        assert {own.floor_friction for own in scenario.mixture} == {(0.3, 0.3)}
     assert make_scenario("slip+drawn").draws_robots
 
 
@@ -744,3 +747,15 @@ def test_an_arm_is_drawn_alone_as_among_others() -> None:
         first, *_ = many.step(np.full((8, 3), 0.01, np.float32))
         own, *_ = alone.step(np.full(3, 0.01, np.float32))
     np.testing.assert_array_equal(first[5], own)
+
+
+def test_ranges_that_nobody_can_have_are_refused() -> None:
+    """Catches intervals of walkers that a robot on a fixed base ignores, and what is no mapping."""
+    with pytest.raises(ConfigurationError, match=r"only a walker has load_kg; .* damping"):
+        make_scenario("drawn", walks=False, ranges={"load_kg": (0.0, 4.0), "damping": 2.0})
+    for wrong in (3, "abc", [3]):
+        with pytest.raises(ConfigurationError, match="must be a mapping of intervals, or a list"):
+            make_scenario("drawn", ranges=wrong)  # type: ignore[arg-type]
+    for nothing in ("x", True, None):
+        with pytest.raises(ModelError, match=r"a number or \[lowest, highest\], got"):
+            RobotRanges(load_kg=nothing)

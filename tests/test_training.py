@@ -28,6 +28,7 @@ from baselines.residual.residual_policy import load_residual
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.robots.thormang.config import BANK_SIZE
 from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.episodes import evaluate
@@ -560,7 +561,7 @@ def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> Non
     learned_from: Any = training_worlds(config, config.shares, 1).unwrapped.envs[0]
     evaluated: Any = make_vector_env(config.condition("spread", config.base), 2, 1).unwrapped
     trained, scored = (set(env.task._kinds[0].bank) for env in (learned_from, evaluated))
-    assert len(trained) == len(scored) == 64
+    assert len(trained) == len(scored) == BANK_SIZE
     assert not trained & scored
 
 

@@ -258,9 +258,11 @@ def vary_scenario(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
         elif inner:
             new = getattr(scenario, first).replace(**{inner: value})
         elif first in RobotRanges.model_fields and scenario.draws(first):
+            width = f"{SCENARIO}{first}.{HALF_WIDTH}"
+            further = f", or vary {width}" if width in scenario_fields() else ""
             raise ConfigurationError(
-                f"scenario {scenario.name!r} draws {first}; vary it in another one, or vary"
-                f" {SCENARIO}{first}.{HALF_WIDTH}"
+                f"scenario {scenario.name!r} draws {first} from ranges; vary it in another"
+                f" one{further}"
             )
         scenario = scenario.replace(**{first: new})
     return scenario
