@@ -347,7 +347,7 @@ def test_the_leaderboard_of_the_project_has_its_columns() -> None:
         "1.1 s": 5,
     }
     assert {len(scenarios) for scenarios in config.groups.values()} == {5, 3, 6}
-    assert {c.episodes for c in conditions if c.scenario == "drawn"} == {64}
+    assert {c.episodes for c in conditions if c.scenario == "drawn"} == {32}
     assert {c.track for c in conditions} >= set(Track)
 
 

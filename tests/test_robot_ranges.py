@@ -264,7 +264,7 @@ def test_what_is_drawn_is_not_said_twice() -> None:
         make_scenario("sensor+drawn")
     with pytest.raises(ConfigurationError, match="'drawn' sets stiffness a second time"):
         make_scenario("soft+drawn")
-    with pytest.raises(ConfigurationError, match="'soft.drawn_beyond' sets stiffness a second"):
+    with pytest.raises(ConfigurationError, match=r"'soft.drawn_beyond' sets stiffness a second"):
         make_scenario("soft+drawn_beyond")
     assert make_scenario("slip+drawn").floor_friction == (0.3, 0.3)
     listed = make_scenario("slip+drawn", ranges=[{"load_kg": 1}, {"slope_rad": 0.01}])
