@@ -156,6 +156,10 @@ def _change(paired: Paired | None) -> str:
     return f"{signed_interval(paired.change, paired.verdict)} ({paired.to})"
 
 
+_MOST_NAMED = 3
+"""Kinds of intervals that a legend names."""
+
+
 def legend(found: Sequence[Standing]) -> str:
     """Meaning of a cell, and its number of episodes."""
     meaning = _meaning([s for s in found if s.is_column])
@@ -164,7 +168,10 @@ def legend(found: Sequence[Standing]) -> str:
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
     episodes = f"episodes of a scenario, per training seed: {span}"
     over = dict.fromkeys(s.interval_over for s in found if s.interval_over)
-    intervals = f" Intervals are 95 % over {', or '.join(over)}." if over else ""
+    within = f" over {', or '.join(over)}"
+    if len(over) > _MOST_NAMED:
+        within = ", and column `interval_over` of leaderboard.csv says over what"
+    intervals = f" Intervals are 95 %{within}." if over else ""
     return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}"
 
 
