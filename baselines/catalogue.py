@@ -176,8 +176,8 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     options = _with_quick_gains(options)
     inner = _controller(env, further, options)
     policy: Any = Oracle(env, inner, further, ramp_s, friction=False, integral_gain=0.0)
+    # without friction nothing damps the springs: they ring under a feedback, which is not needed
     if model.coulomb_friction.any():
-        # springs that nothing damps ring under a feedback, and the true model needs none
         policy = PostureFeedback(policy, further, options.posture, ramp_s)
         policy = _without_mean_error(policy, further, options)
         policy = TrueSensors(env, FootholdCorrection(policy, further, options.foothold))

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from elastic_env.core.errors import ElasticError, unknown_name
-from elastic_env.core.signals import Array, BoolArray, Signal, SignalTable
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
 
 Action = npt.NDArray[np.float32]
@@ -362,7 +362,7 @@ class ObservationView:
         table = model.observation_table
         self._width = len(table)
         self._period_s = model.control_period_s
-        self._clock = table.group("clock") if "clock.time" in table.names else None
+        self._clock: Any = table.group("clock") if "clock.time" in table.names else None
         self._theta = table.group("encoder_angle")
         self._theta_dot = table.group("encoder_rate")
         self._q = table.group("reference_angle")
@@ -378,6 +378,10 @@ class ObservationView:
     def theta_dot(self, rows: Array) -> Array:
         """Encoder rates, (num_worlds, n) [rad/s]."""
         return rows[:, self._theta_dot]
+
+    def plan_row(self, rows: Array) -> IntArray:
+        """Row of a walk's plan at the end of the coming control period, (num_worlds,)."""
+        return np.rint(rows[:, self._clock.start] / self._period_s).astype(np.int64)
 
     def motion(self, rows: Array) -> Motion:
         """Reference motion for the coming control period, (num_worlds, n) each."""

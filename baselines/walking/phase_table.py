@@ -150,14 +150,12 @@ class PhaseFeedforward(PassingMemory):
         share = minimum_jerk(np.clip(np.minimum(coming, going), 0.0, 1.0))
         values = table.values(stride_angle(timing, gait.step_period_s))
         self._inputs = share[:, None] * values
-        self._time = model.observation_table.group("clock").start
-        self._rate_hz = 1.0 / model.control_period_s
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """It adds to the inputs `zmp` and `hip`; its memory is that of the policy inside."""
-        periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
-        ahead = self._inputs.take(periods, axis=0, mode="clip")
+        row = self.view.plan_row(rows)
+        ahead = self._inputs.take(row, axis=0, mode="clip")
         zmp = ahead[:, :2] if inputs.zmp is None else inputs.zmp + ahead[:, :2]
         hip = ahead[:, 2:] if inputs.hip is None else inputs.hip + ahead[:, 2:]
         return self.policy.act(rows, memory, inputs._replace(zmp=zmp, hip=hip))

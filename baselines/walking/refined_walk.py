@@ -27,7 +27,11 @@ from elastic_env.world.robot_model import WalkerModel
 
 
 def refined(model: WalkerModel) -> WalkerModel:
-    """The assumed walker with its plan refined."""
+    """The assumed walker with its plan refined.
+
+    Raises:
+        ElasticError: A foot is out of reach on the refined plan.
+    """
     plan = refine_plan(model.plan, model.biped, model.control_period_s)
     return replace(model, plan=plan)
 
@@ -44,8 +48,6 @@ class RefinedWalk(PassingMemory):
     def __init__(self, policy: Any, model: WalkerModel, further: WalkerModel) -> None:
         super().__init__(policy, model)
         table = model.observation_table
-        self._rate_hz = 1.0 / model.control_period_s
-        self._time = table.group("clock").start
         # angles, rates and accelerations stand side by side
         first = table.group("reference_angle").start
         self._columns = slice(first, table.group("reference_acceleration").stop)
@@ -55,8 +57,8 @@ class RefinedWalk(PassingMemory):
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         """Its memory is that of the policy inside."""
-        periods = np.rint(rows[:, self._time] * self._rate_hz).astype(np.int64)
-        change = self._change.take(periods, axis=0, mode="clip")
+        row = self.view.plan_row(rows)
+        change = self._change.take(row, axis=0, mode="clip")
         seen = rows.copy()
         seen[:, self._columns] += change
         action, memory = self.policy.act(seen, memory, inputs)

@@ -30,6 +30,7 @@ Seed = Annotated[int, quantity("1", ge=0, le=LARGEST_SEED - MOST_EPISODES)]
 SCENARIO = "scenario."
 """Prefix of a field of the scenario that is varied, such as scenario.stiffness."""
 HALF_WIDTH = "half_width"
+"""Part of such a name: half the width of an interval about 0 is varied."""
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
