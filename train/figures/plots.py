@@ -173,7 +173,8 @@ def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     size = (min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows)
-    figure, axes = new_figure(rows, columns, size, sharey=True, sharex=stacked)
+    # each with its own groups below it: a reference need not be played in all scenarios
+    figure, axes = new_figure(rows, columns, size, sharey=True)
     for axis, (title, groups) in zip(axes, panels.items(), strict=True):
         _draw_bars(axis, groups, column, shades)
         axis.set_title(title)
@@ -187,7 +188,7 @@ def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
         handles.append(axes[0].scatter([], [], **cross))
-    ncols = columns_of(len(handles), max(int(columns * width / 1.7), 2))
+    ncols = columns_of(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
 

@@ -1,0 +1,38 @@
+"""The overview of a comparison: bars of every policy, a panel per reference."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import pytest
+
+from train.evaluate.conditions import Condition
+from train.evaluate.episodes import evaluate
+from train.figures import plots
+
+PLAYED = {1.0: ["nominal", "payload"], 0.9: ["payload"], 0.8: ["soft"]}
+
+
+def test_panels_name_the_scenarios_that_their_bars_are_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a reference with fewer scenarios than another, whose bars stand over their names."""
+    kept: list[Any] = []
+    monkeypatch.setattr(plots, "save", lambda figure, path: kept.append(figure) or path)
+    evaluations = [
+        evaluate(
+            Condition(
+                env="walker",
+                scenario=scenario,
+                reference={"step_period": [0.2, 0.6, step - 0.8], "num_steps": 1},
+                policy={"name": "zero"},
+            )
+        )
+        for step, scenarios in ((s + 0.2, own) for s, own in PLAYED.items())
+        for scenario in scenarios
+    ]
+    column = evaluations[0].condition.environment.swept[0]
+    plots.draw_overview(evaluations, column, tmp_path / "overview.png")
+    shown = [[label.get_text() for label in axis.get_xticklabels()] for axis in kept[0].axes]
+    assert shown == list(PLAYED.values())
+    plt.close(kept[0])
