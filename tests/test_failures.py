@@ -393,7 +393,7 @@ sys.meta_path.insert(0, Blocked())
 EXTRAS = [
     (["train", str(CONFIGS / "train_testbed.yaml")], "train"),
     (["speed", "--env", "testbed"], "train"),
-    (["export", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
+    (["export", "sb3", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
     (["play", "--video", "x.mp4"], "report"),
 ]
 

@@ -1,23 +1,128 @@
-"""`elastic export`: a model of Stable-Baselines3 as a residual folder."""
+"""`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from elastic_env.core.config import Model, load_yaml
-from train.learn.export import export_zip
-from train.learn.train_config import TrainConfig
-from train.runs.folders import own_folder
+from baselines import PositionCompensator
+from elastic_env.core.config import Locator, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
+from elastic_env.core.files import write_whole
+from elastic_env.joint.model_text import is_file, name_of, read_bytes
+from train.commands.options import StiffnessOrFile
+from train.export.c_arm import c_example, c_header, prefix_of, require_prefix
 
 
-class Export(Model):
+class Output(Model):
+    """Where an exported file goes."""
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write; default the name of what is exported, in the working folder."""
+    overwrite: bool = False
+    """Replace files that are there."""
+
+    def write(self, files: Mapping[Path, str | bytes], console: Console) -> None:
+        """Write files, all or none.
+
+        Raises:
+            ResultsExistError: One is there, and is not to be replaced.
+            ConfigurationError: A folder does not exist.
+        """
+        for path in files:
+            if not path.parent.is_dir():
+                problem = f"no folder {shorten(path.parent)}; make it, or name another by --output"
+                raise ConfigurationError(problem)
+            if path.exists() and not self.overwrite:
+                cure = "add --overwrite, or name another file by --output"
+                raise ResultsExistError(f"{shorten(path)} exists; {cure}")
+        for path, content in files.items():
+            write_whole(path, content)
+            console.print(f"wrote {path}")
+
+
+class C(Output):
+    """A header in C99 that commands an arm as `PositionCompensator` does, without a heap.
+
+    It gives command, link_angle, torque, payload, ramp, limits and friction, for any controller
+    with doubles: begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). Its first lines say
+    units, signs, version and the digests of the files. The macro PREFIX_TEST adds a test vector,
+    see docs/export.md.
+
+    Example: elastic export c arm.urdf --joints joints.yaml -o arm.h
+
+    Example, with a program that checks and times it: elastic export c arm.urdf --joints joints.yaml
+        --ramp-s 1 --period-s 0.002 --example
+    """
+
+    model: Annotated[Locator, tyro.conf.Positional]
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base."""
+    joints: StiffnessOrFile
+    """YAML file of the elastic joints (elastic identify --robot writes one), or one K of all
+    hinges [N·m/rad].
+    """
+    order: list[Title] = []
+    """Joints that are commanded, in the order of the arrays; default all that are not held, in
+    the order of the model.
+    """
+    position_gain: float | None = None
+    """k_p of servos that give way under a load [N·m/rad], one for all; default what the file of
+    joints says.
+    """
+    limit_rad: float = quantity("rad", 0.2, gt=0)
+    """Largest offset between command and desired angle [rad]."""
+    ramp_s: float = quantity("s", 0.0, ge=0)
+    """Time in which offsets grow from zero, and in which a payload is taken over [s]."""
+    period_s: float = quantity("s", 0.01, gt=0)
+    """Time between two commands [s]."""
+    friction: bool | None = None
+    """Whether dry friction is compensated; default where any of it grows with the load."""
+    prefix: str | None = None
+    """Begin of all names in the header; default the name of the model's file."""
+    example: bool = False
+    """Write beside the header a program that checks it against Python and times it, and its
+    CMakeLists.txt.
+    """
+
+    def run(self, console: Console) -> None:
+        """Export."""
+        prefix = prefix_of(Path(self.model).stem)
+        if self.prefix is not None:
+            prefix = require_prefix(self.prefix)
+        if not is_file(self.model):
+            raise ConfigurationError(
+                f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
+            )
+        if self.joints is None:
+            raise ConfigurationError("joints must be a file of joints or one K [N·m/rad], got None")
+        compensator = PositionCompensator.from_model(
+            self.model,
+            self.joints,
+            joints=self.order or None,
+            position_gain=self.position_gain,
+            limit_rad=self.limit_rad,
+            ramp_s=self.ramp_s,
+            period_s=self.period_s,
+            friction=self.friction,
+        )
+        output = self.output or Path(f"{prefix}.h")
+        named = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
+        sources = {Path(name).name: read_bytes(Path(name)) for name in named}
+        files = {output: c_header(compensator, prefix, sources)}
+        if self.example:
+            made = c_example(prefix, output.name)
+            files |= {output.with_name(name): text for name, text in made.items()}
+        self.write(files, console)
+
+
+class Sb3(Model):
     """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
 
     Loading that folder runs no code.
 
-    Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl
+    Example: elastic export sb3 model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl
         --trust-pickle
     """
 
@@ -34,7 +139,23 @@ class Export(Model):
 
     def run(self, console: Console) -> None:
         """Export."""
+        # these need torch, the other exports do not
+        from elastic_env.core.config import load_yaml
+        from train.learn.export import export_zip
+        from train.learn.train_config import TrainConfig
+        from train.runs.folders import own_folder
+
         config = load_yaml(self.config, TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         console.print(f"play it as residual:{folder}")
+
+
+class Export(Model):
+    """Give compensators and residuals to other programs: C99 for a controller, SB3 as residual."""
+
+    command: C | Sb3
+
+    def run(self, console: Console) -> None:
+        """Do what was asked for."""
+        self.command.run(console)
