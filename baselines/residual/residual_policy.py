@@ -56,6 +56,9 @@ class ResidualPolicy(policies.BatchPolicy):
         corrected: The base and its correction.
         network: What decides.
 
+    Attributes:
+        features: What the network sees.
+
     Raises:
         ConfigurationError: The network does not fit the settings, or they do not fit the robot.
     """
@@ -64,9 +67,9 @@ class ResidualPolicy(policies.BatchPolicy):
         super().__init__(corrected.model)
         self.corrected = corrected
         self._network = network
-        self._features = Features(corrected)
+        self.features = Features(corrected)
         self._period = corrected.settings.decision_period
-        expected = (self._features.width, corrected.num_residuals)
+        expected = (self.features.width, corrected.num_residuals)
         if (network.num_features, network.num_outputs) != expected:
             raise ConfigurationError(
                 f"the network must take {expected[0]} features and give {expected[1]} residuals for"
@@ -83,7 +86,7 @@ class ResidualPolicy(policies.BatchPolicy):
         caution = None if self._caution is None else self._caution.begin(n)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        own = (wait, residual, self._features.begin(n), caution)
+        own = (wait, residual, self.features.begin(n), caution)
         return ResidualMemory(*own, self.corrected.begin(rows))
 
     @override
@@ -104,10 +107,10 @@ class ResidualPolicy(policies.BatchPolicy):
         """Memory after a decision, of the worlds that are due."""
         inner = memory.inner
         fresh = memory.wait == _UNDECIDED
-        seen, features = self._features.at(rows, memory.features, fresh, inner, None)
+        seen, features = self.features.at(rows, memory.features, fresh, inner, None)
         known = None
         residual = memory.residual.copy()
-        residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
+        residual[due] = self.features.turn_back(rows[due], self._network(seen[due]))
         if self._caution is not None:
             trust, known = self._caution.observe(rows, memory.caution)
             residual[due] *= trust[due]
