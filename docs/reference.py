@@ -20,7 +20,7 @@ from elastic_env.core.signals import Signal
 from elastic_env.world.scenario import scenario_names
 from train.commands.cli import COMMANDS, main
 
-PARTS = {"hardware": ("scan", "check", "run", "emulate"), "export": ("c", "sb3")}
+PARTS = {"hardware": ("scan", "check", "run", "emulate"), "export": ("c", "onnx", "sb3")}
 """Parts of commands, which have their help."""
 
 

@@ -789,7 +789,7 @@ NAMES = (
 )
 PARTS = (
     *(("hardware", name) for name in ("scan", "check", "run", "emulate")),
-    *(("export", name) for name in ("c", "sb3")),
+    *(("export", name) for name in ("c", "onnx", "sb3")),
 )
 
 

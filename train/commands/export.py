@@ -117,6 +117,45 @@ class C(Output):
         self.write(files, console)
 
 
+class Onnx(Output):
+    """A residual as one graph of ONNX, with normalisation, mirror and bounds, and a test vector.
+
+    The input `features` has a column for each feature of the residual. Metadata of the file say
+    their names and units, the columns of the output, periods, version and digest. The file beside
+    it, .npz, has inputs and what Python makes of them. docs/export.md says what the program around
+    it has to do.
+
+    Example: elastic export onnx residual:testbed/seed_0 -o testbed.onnx
+
+    Example, of a robot of your own: elastic export onnx residual:runs/mine/seed_0 --env arm.yaml
+    """
+
+    residual: Annotated[Locator, tyro.conf.Positional]
+    """residual:PATH, a folder or the name of a residual that comes with the package."""
+    env: Locator | None = None
+    """Environment that it is for, ROBOT.yaml or FILE.py:ROBOT; default the one of the package that
+    the residual names.
+    """
+
+    def run(self, console: Console) -> None:
+        """Export."""
+        from train.export.onnx_residual import onnx_model, played_vector
+        from train.export.residual_layout import ResidualLayout
+
+        layout = ResidualLayout.of(self.residual, self.env)
+        output = self.output or Path(f"{_short_name(self.residual)}.onnx")
+        if output.suffix != ".onnx":
+            problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
+            raise ConfigurationError(problem)
+        files = {output: onnx_model(layout), output.with_suffix(".npz"): played_vector(layout)}
+        self.write(files, console)
+
+
+def _short_name(residual: str) -> str:
+    """A name from the last two folders of a residual, such as testbed_seed_0."""
+    return prefix_of("_".join(Path(residual.partition(":")[2]).parts[-2:]))
+
+
 class Sb3(Model):
     """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
 
@@ -152,9 +191,13 @@ class Sb3(Model):
 
 
 class Export(Model):
-    """Give compensators and residuals to other programs: C99 for a controller, SB3 as residual."""
+    """Give compensators and residuals to other programs, and models of SB3 to this one.
 
-    command: C | Sb3
+    c: an arm's compensator as a header in C99. onnx: a residual as a graph. sb3: a model of
+    Stable-Baselines3 as a residual.
+    """
+
+    command: C | Onnx | Sb3
 
     def run(self, console: Console) -> None:
         """Do what was asked for."""

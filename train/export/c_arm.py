@@ -70,7 +70,7 @@ def require_prefix(prefix: str) -> str:
 
 def prefix_of(name: str) -> str:
     """A prefix from the name of a robot or file; `arm` where nothing of it fits."""
-    return _identifier(name).lower().strip("_0123456789")[:_LONGEST_PREFIX] or "arm"
+    return _identifier(name).lower().lstrip("_0123456789")[:_LONGEST_PREFIX] or "arm"
 
 
 def c_header(
