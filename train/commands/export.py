@@ -13,7 +13,8 @@ from elastic_env.core.errors import ConfigurationError, ResultsExistError, short
 from elastic_env.core.files import write_whole
 from elastic_env.joint.model_text import is_file, name_of, read_bytes
 from train.commands.options import StiffnessOrFile
-from train.export.c_arm import c_example, c_header, prefix_of, require_prefix
+from train.export.c_arm import c_example, c_header
+from train.export.c_text import prefix_of, require_prefix
 
 
 class Output(Model):
