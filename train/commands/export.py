@@ -1,6 +1,6 @@
 """`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -8,13 +8,16 @@ import tyro
 from rich.console import Console
 
 from baselines import PositionCompensator
+from baselines.residual.settings import RESIDUAL
 from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
 from elastic_env.core.files import write_whole
 from elastic_env.joint.model_text import is_file, name_of, read_bytes
-from train.commands.options import StiffnessOrFile
+from train.commands.options import StiffnessOrFile, option_name
 from train.export.c_arm import c_example, c_header
 from train.export.c_text import prefix_of, require_prefix
+
+_OF_ARMS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
 
 
 class Output(Model):
@@ -45,24 +48,26 @@ class Output(Model):
 
 
 class C(Output):
-    """A header in C99 that commands an arm as `PositionCompensator` does, without a heap.
+    """A header in C99, without a heap: the compensator of an arm, or the network of a residual.
 
-    It gives command, link_angle, torque, payload, ramp, limits and friction, for any controller
-    with doubles: begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). Its first lines say
-    units, signs, version and the digests of the files. The macro PREFIX_TEST adds a test vector,
-    see docs/export.md.
+    Of an arm it gives what `PositionCompensator` does: command, link_angle, torque, payload, ramp,
+    limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). The first
+    lines say units, signs, version and digests. The macro PREFIX_TEST adds a test vector, see
+    docs/export.md.
 
     Example: elastic export c arm.urdf --joints joints.yaml -o arm.h
 
     Example, with a program that checks and times it: elastic export c arm.urdf --joints joints.yaml
         --ramp-s 1 --period-s 0.002 --example
+
+    Example, of a residual: elastic export c residual:testbed/seed_0 -o net.h
     """
 
     model: Annotated[Locator, tyro.conf.Positional]
-    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base."""
-    joints: StiffnessOrFile
-    """YAML file of the elastic joints (elastic identify --robot writes one), or one K of all
-    hinges [N·m/rad].
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, or residual:PATH."""
+    joints: StiffnessOrFile = None
+    """YAML file of the elastic joints of an arm (elastic identify --robot writes one), or one K of
+    all hinges [N·m/rad].
     """
     order: list[Title] = []
     """Joints that are commanded, in the order of the arrays; default all that are not held, in
@@ -81,7 +86,9 @@ class C(Output):
     friction: bool | None = None
     """Whether dry friction is compensated; default where any of it grows with the load."""
     prefix: str | None = None
-    """Begin of all names in the header; default the name of the model's file."""
+    """Begin of all names in the header; default the name of the model's file or the residual."""
+    env: Locator | None = None
+    """Environment of a residual, as of elastic export onnx."""
     example: bool = False
     """Write beside the header a program that checks it against Python and times it, and its
     CMakeLists.txt.
@@ -89,15 +96,50 @@ class C(Output):
 
     def run(self, console: Console) -> None:
         """Export."""
-        prefix = prefix_of(Path(self.model).stem)
-        if self.prefix is not None:
-            prefix = require_prefix(self.prefix)
+        is_residual = self.model.startswith(RESIDUAL)
+        name = _short_name(self.model) if is_residual else Path(self.model).stem
+        prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
+        output = self.output or Path(f"{prefix}.h")
+        if is_residual:
+            self._refuse(_OF_ARMS, "an arm")
+            header, example = self._residual(prefix, output.name)
+        else:
+            self._refuse(("env",), "a residual")
+            header, example = self._arm(prefix, output.name)
+        files = {output: header}
+        if self.example:
+            files |= {output.with_name(name): text for name, text in example.items()}
+        self.write(files, console)
+
+    def _refuse(self, names: Sequence[str], owner: str) -> None:
+        """Refuse options that have no effect here."""
+        given = [
+            name for name in names if getattr(self, name) != type(self).model_fields[name].default
+        ]
+        if given:
+            listed = ", ".join(option_name((name,)) for name in given)
+            problem = f"only {owner} has {listed}; leave it out for {shorten(self.model)}"
+            raise ConfigurationError(problem)
+
+    def _residual(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of a residual."""
+        from train.export.c_residual import c_residual, c_residual_example
+        from train.export.residual_layout import ResidualLayout
+
+        layout = ResidualLayout.of(self.model, self.env)
+        return c_residual(layout, prefix), c_residual_example(prefix, header)
+
+    def _arm(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of an arm."""
         if not is_file(self.model):
             raise ConfigurationError(
                 f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
             )
         if self.joints is None:
-            raise ConfigurationError("joints must be a file of joints or one K [N·m/rad], got None")
+            raise ConfigurationError(
+                "an arm needs the stiffness of its joints: name a file by --joints joints.yaml, or"
+                " one K of all hinges [N·m/rad] by --joints 400"
+            )
         compensator = PositionCompensator.from_model(
             self.model,
             self.joints,
@@ -108,14 +150,9 @@ class C(Output):
             period_s=self.period_s,
             friction=self.friction,
         )
-        output = self.output or Path(f"{prefix}.h")
         named = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
         sources = {Path(name).name: read_bytes(Path(name)) for name in named}
-        files = {output: c_header(compensator, prefix, sources)}
-        if self.example:
-            made = c_example(prefix, output.name)
-            files |= {output.with_name(name): text for name, text in made.items()}
-        self.write(files, console)
+        return c_header(compensator, prefix, sources), c_example(prefix, header)
 
 
 class Onnx(Output):

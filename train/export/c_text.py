@@ -114,4 +114,4 @@ def comment(lines: Iterable[str]) -> str:
 
 def plain(name: str) -> str:
     """A user's name for a comment: it cannot end the comment, and is in ASCII."""
-    return re.sub(r"[^A-Za-z0-9 _.,:+=()@-]", "_", name)
+    return re.sub(r"[^A-Za-z0-9 _.,:+=()@^/-]", "_", name)

@@ -1,11 +1,11 @@
-"""Residuals as graphs of ONNX: equal to NumPy, with mirror, bounds and what one must know."""
+"""Residuals as graphs of ONNX and as headers in C: equal to NumPy, on a walk too."""
 
 import json
 import subprocess
 import sys
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,9 @@ from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from tests.test_c_export import compiled
 from train.commands.cli import main
+from train.export.c_residual import c_residual
 from train.export.onnx_residual import onnx_model
 from train.export.residual_layout import ResidualLayout
 
@@ -102,33 +104,139 @@ def test_the_graph_computes_what_python_does(case: str, tmp_path: Path) -> None:
     assert ("trust" in names) == (case == "cautious")
 
 
-def test_it_decides_on_a_walk_as_the_policy_does(tmp_path: Path) -> None:
-    """Catches features in another order, and a mirror at the wrong steps or of one side alone."""
-    name = residual("mirrored", tmp_path / "r")
-    session = onnxruntime.InferenceSession(onnx_model(ResidualLayout.of(name)))
+class Walk(NamedTuple):
+    """What a policy has decided on a walk, a row per control step.
+
+    Attributes:
+        layout: Of its residual.
+        features: Before the mirror, as every moment has them.
+        on_right: Whether the step is on the right foot, (T, 1).
+        residual, values: As the policy remembers them.
+    """
+
+    layout: ResidualLayout
+    features: Array
+    on_right: Any
+    residual: Array
+    values: Array
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
+    """A short walk under the mirrored residual."""
+    name = residual("mirrored", tmp_path_factory.mktemp("walk") / "r")
     env: Any = gymnasium.make(IDS["walker"], step_period=[0.3, 0.4, 0.3], num_steps=2)
     policy: Any = baselines.make(name, env)
     settings = policy.corrected.settings.model_dump() | {"mirror": False}
-    base = baselines.make("posture", env)
     model = env.unwrapped.assumed_model
+    base = baselines.make("posture", env)
     features = Features(Corrected(base, model, ResidualSettings(**settings)))
     support = env.unwrapped.task.observation_table.columns("clock.support")
     observation, _ = env.reset(seed=0)
+    rows: list[Any] = []
     state = None
-    feet: list[float] = []
-    for step in range(700):
-        rows = observation[None]
+    is_over = False
+    while not is_over:
+        before = observation[None]
         action, state = policy.predict(observation, state)
-        if step % 25 == 0:
-            seen, _ = features.at(rows, None, np.array([True]), None, None)
-            on_right = rows[:, support] == 1.0
-            decided, _ = session.run(None, {"features": seen, "on_right": on_right})
-            np.testing.assert_allclose(decided, state.residual, rtol=0.0, atol=TOLERANCE)
-            feet.append(float(rows[0, support][0]))
+        seen, _ = features.at(before, None, np.array([True]), None, None)
+        on_right = before[:, support] == 1.0
+        rows.append((seen[0], on_right[0], state.residual[0], state.inner.values[0]))
         observation, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            break
-    assert set(feet) == {0.0, 1.0}
+        is_over = terminated or truncated
+    return Walk(ResidualLayout.of(name), *map(np.array, zip(*rows, strict=True)))
+
+
+def test_the_graph_decides_on_a_walk_as_the_policy_does(walk: Walk) -> None:
+    """Catches features in another order, and a mirror at the wrong steps or of one side alone."""
+    session = onnxruntime.InferenceSession(onnx_model(walk.layout))
+    given = {"features": walk.features[::25], "on_right": walk.on_right[::25]}
+    decided, _ = session.run(None, given)
+    np.testing.assert_allclose(decided, walk.residual[::25], rtol=0.0, atol=TOLERANCE)
+    assert set(walk.on_right[::25].ravel()) == {False, True}
+
+
+DRIVER = r"""
+#include "arm.h"
+#include <stdio.h>
+
+int main(int count, char **paths) {
+    double in[ARM_FEATURES + 2], out[ARM_DECIDED + ARM_COLUMNS];
+    FILE *from = fopen(paths[1], "rb"), *to = fopen(paths[2], "wb");
+    arm_state state;
+    arm_begin(&state);
+    while (count == 3 && fread(in, sizeof in, 1, from) == 1) {
+        const int on_right = in[ARM_FEATURES] > 0.0;
+        int k;
+        if (!arm_decide(in, on_right, in[ARM_FEATURES + 1], out)) return 1;
+        if (!arm_step(&state, arm_is_due(&state) ? in : 0, on_right, in[ARM_FEATURES + 1])) return 1;
+        for (k = 0; k < ARM_COLUMNS; k++) out[ARM_DECIDED + k] = state.values[k];
+        fwrite(out, sizeof out, 1, to);
+    }
+    fclose(from);
+    return fclose(to);
+}
+"""
+
+
+def played_in_c(
+    layout: ResidualLayout, folder: Path, features: Array, on_right: Any, trust: Array
+) -> tuple[Array, Array]:
+    """Decisions of every row, and values of the base's inputs where the rows are a motion."""
+    program = compiled(folder, c_residual(layout, "arm"), "gcc", DRIVER)
+    np.hstack([features, on_right, trust]).tofile(folder / "in")
+    subprocess.run([program, "in", "out"], cwd=folder, check=True, timeout=300)
+    found = np.fromfile(folder / "out").reshape(len(features), -1)
+    decided, values = np.split(found, [len(layout.residual)], axis=1)
+    return decided, values
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
+    """Catches what is wrong with a table, a layer, an activation, the mirror or the trust."""
+    layout = ResidualLayout.of(residual(case, tmp_path / "r"))
+    drawn = layout.draw(10_000, seed=2)
+    found, _ = played_in_c(layout, tmp_path, **drawn)
+    expected, _ = layout.decide(**drawn)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
+
+
+def test_the_header_corrects_on_a_walk_as_the_policy_does(walk: Walk, tmp_path: Path) -> None:
+    """Catches another period, a low-pass of another share, and a column at another's bound."""
+    trust = np.ones_like(walk.residual[:, :1])
+    _, values = played_in_c(walk.layout, tmp_path, walk.features, walk.on_right, trust)
+    np.testing.assert_allclose(values, walk.values, rtol=0.0, atol=TOLERANCE)
+    assert (np.abs(values).max(axis=0) > 0.0).sum() == np.count_nonzero(walk.layout.bounds)
+
+
+def test_numbers_that_are_not_finite_change_nothing_in_c(tmp_path: Path) -> None:
+    layout = ResidualLayout.of(residual("testbed", tmp_path / "r"))
+    program = """#include "arm.h"
+        int main(void) {
+            double features[ARM_FEATURES] = {0.0};
+            arm_state state;
+            arm_begin(&state);
+            features[0] = NAN;
+            if (arm_step(&state, features, 0, 1.0) || !arm_is_due(&state)) return 1;
+            features[0] = 0.0;
+            return !arm_step(&state, features, 0, 1.0) || arm_is_due(&state);
+        }"""
+    subprocess.run([compiled(tmp_path, c_residual(layout, "arm"), "gcc", program)], check=True)
+
+
+def test_the_example_in_c_checks_the_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a test vector of another residual, and options of arms that have no effect."""
+    monkeypatch.chdir(tmp_path)
+    residual("cautious", Path("mine/r"))
+    main(["export", "c", "residual:mine/r", "--prefix", "arm", "-o", "arm.h", "--example"])
+    program = compiled(tmp_path, Path("arm.h").read_text(), "gcc", Path("arm_main.c").read_text())
+    said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert "us per decision" in said
+    with pytest.raises(SystemExit):
+        main(["export", "c", "residual:mine/r", "--joints", "300"])
+    assert "only an arm has --joints" in capsys.readouterr().err
 
 
 def test_the_file_says_what_one_must_know(
