@@ -236,7 +236,7 @@ def test_the_example_in_c_checks_the_header(
     assert "us per decision" in said
     with pytest.raises(SystemExit):
         main(["export", "c", "residual:mine/r", "--joints", "300"])
-    assert "only an arm has --joints" in capsys.readouterr().err
+    assert "--joints: without effect on residual:mine/r" in capsys.readouterr().err
 
 
 def test_the_file_says_what_one_must_know(

@@ -1,12 +1,14 @@
 """`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 
+import baselines
 from baselines import PositionCompensator
 from baselines.residual.settings import RESIDUAL
 from elastic_env.core.config import Locator, Model, Title, quantity
@@ -17,6 +19,8 @@ from train.commands.options import StiffnessOrFile, option_name
 from train.export.c_arm import c_example, c_header
 from train.export.c_text import prefix_of, require_prefix
 
+_OF_WALKER = "input_output"
+"""The only policy of a walker that is there in C."""
 _OF_ARMS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
 
 
@@ -48,7 +52,7 @@ class Output(Model):
 
 
 class C(Output):
-    """A header in C99, without a heap: the compensator of an arm, or the network of a residual.
+    """A header in C99, without a heap: an arm's compensator, a walker's, a residual's network.
 
     Of an arm it gives what `PositionCompensator` does: command, link_angle, torque, payload, ramp,
     limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). The first
@@ -61,10 +65,14 @@ class C(Output):
         --ramp-s 1 --period-s 0.002 --example
 
     Example, of a residual: elastic export c residual:testbed/seed_0 -o net.h
+
+    Example, of the walker's policy input_output: elastic export c input_output -o walker.h
     """
 
     model: Annotated[Locator, tyro.conf.Positional]
-    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, or residual:PATH."""
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, residual:PATH, or
+    input_output, a policy of the walker.
+    """
     joints: StiffnessOrFile = None
     """YAML file of the elastic joints of an arm (elastic identify --robot writes one), or one K of
     all hinges [N·m/rad].
@@ -88,7 +96,7 @@ class C(Output):
     prefix: str | None = None
     """Begin of all names in the header; default the name of the model's file or the residual."""
     env: Locator | None = None
-    """Environment of a residual, as of elastic export onnx."""
+    """Environment of a residual or of a walker's policy, as of elastic export onnx."""
     example: bool = False
     """Write beside the header a program that checks it against Python and times it, and its
     CMakeLists.txt.
@@ -96,29 +104,31 @@ class C(Output):
 
     def run(self, console: Console) -> None:
         """Export."""
-        is_residual = self.model.startswith(RESIDUAL)
-        name = _short_name(self.model) if is_residual else Path(self.model).stem
+        export = self._arm
+        name = Path(self.model).stem
+        if self.model.startswith(RESIDUAL):
+            export = self._residual
+            name = _short_name(self.model)
+        elif self.model == _OF_WALKER:
+            export = self._walker
+            name = "walker"
+        self._refuse(["env"] if export == self._arm else _OF_ARMS)
         prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
         output = self.output or Path(f"{prefix}.h")
-        if is_residual:
-            self._refuse(_OF_ARMS, "an arm")
-            header, example = self._residual(prefix, output.name)
-        else:
-            self._refuse(("env",), "a residual")
-            header, example = self._arm(prefix, output.name)
+        header, example = export(prefix, output.name)
         files = {output: header}
         if self.example:
             files |= {output.with_name(name): text for name, text in example.items()}
         self.write(files, console)
 
-    def _refuse(self, names: Sequence[str], owner: str) -> None:
+    def _refuse(self, names: Sequence[str]) -> None:
         """Refuse options that have no effect here."""
         given = [
             name for name in names if getattr(self, name) != type(self).model_fields[name].default
         ]
         if given:
             listed = ", ".join(option_name((name,)) for name in given)
-            problem = f"only {owner} has {listed}; leave it out for {shorten(self.model)}"
+            problem = f"{listed}: without effect on {shorten(self.model)}; leave it out"
             raise ConfigurationError(problem)
 
     def _residual(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
@@ -128,6 +138,17 @@ class C(Output):
 
         layout = ResidualLayout.of(self.model, self.env)
         return c_residual(layout, prefix), c_residual_example(prefix, header)
+
+    def _walker(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of a walker's policy."""
+        from train.evaluate.conditions import Condition, PolicySpec
+        from train.evaluate.rollout import make_vector_env
+        from train.export.c_walker import c_walker, c_walker_example
+
+        condition = Condition(env=self.env or "walker", policy=PolicySpec(name=self.model))
+        with closing(make_vector_env(condition, num_envs=1, num_threads=1)) as worlds:
+            policy = baselines.make(self.model, worlds)
+        return c_walker(policy, prefix), c_walker_example(prefix, header)
 
     def _arm(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
         """Header and example of an arm."""

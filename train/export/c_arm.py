@@ -85,6 +85,7 @@ def c_header(
         "arm.h.in",
         prefix,
         **tables,
+        vectors=fill("common_vectors.h.in", prefix),
         version=elastic_env.__version__,
         digest=digest,
         origin=comment(_origin_lines(sources or {})),
