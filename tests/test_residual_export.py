@@ -19,7 +19,7 @@ from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import compiled
+from tests.test_c_export import compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_residual import c_residual
 from train.export.onnx_residual import onnx_model
@@ -222,6 +222,15 @@ def test_numbers_that_are_not_finite_change_nothing_in_c(tmp_path: Path) -> None
             return !arm_step(&state, features, 0, 1.0) || arm_is_due(&state);
         }"""
     subprocess.run([compiled(tmp_path, c_residual(layout, "arm"), "gcc", program)], check=True)
+
+
+def test_the_header_needs_no_heap(tmp_path: Path) -> None:
+    layout = ResidualLayout.of(residual("mirrored", tmp_path / "r"))
+    function = """int all(arm_state *state, const double *features) {
+        arm_begin(state);
+        return arm_step(state, features, 1, 1.0);
+    }"""
+    require_no_library(tmp_path, c_residual(layout, "arm"), function)
 
 
 def test_the_example_in_c_checks_the_header(

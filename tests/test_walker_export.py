@@ -11,7 +11,7 @@ import pytest
 import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import compiled
+from tests.test_c_export import compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_walker import PlayedSteps, c_walker, play_steps
 
@@ -20,7 +20,7 @@ WALKER = "elastic_env/WalkInPlace-v0"
 CASES: dict[str, dict[str, Any]] = {
     "default": {},
     "weighing": {
-        "gains": {"weight_filter_s": 0.5, "dcm": 2.0},
+        "gains": {"weight_filter_s": 0.5, "dcm": 2.0, "force_difference": 0.05},
         "stiffness": [600.0] * 6 + [1400.0] * 6,
     },
     "open": {"com_feedback": False, "gravity": "ankle", "ramp_s": 0.3},
@@ -120,6 +120,14 @@ def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
             return !(state.steps == 0 && offset[0] == 7.0 && arm_test() < 1e-12);
         }"""
     subprocess.run([compiled(tmp_path, c_walker(policy, "arm"), "gcc", program)], check=True)
+
+
+def test_it_needs_no_heap(tmp_path: Path) -> None:
+    function = """int all(arm_state *state, arm_shown *shown, arm_plan *plan, double *offset) {
+        arm_begin(state);
+        return arm_step(state, shown, plan, offset);
+    }"""
+    require_no_library(tmp_path, c_walker(walker(), "arm"), function)
 
 
 def test_the_command_writes_it(

@@ -22,7 +22,8 @@ from train.export.c_text import braced, comment, fill, nested, number, numbers, 
 _TEST_STEPS = 12
 _NOISE_RAD = 0.02
 _NOISE_N = 30.0
-"""Spread of encoders, attitude and forces of the test vector about the plan."""
+_NOISE_M = 0.01
+"""Spread of encoders, attitude, forces and ZMP of the test vector about the plan."""
 _OF_CONTROLLER = (
     *("thigh", "shank", "weight", "weight_of_feet", "omega"),
     *("velocity_share", "zmp_share", "weight_share"),
@@ -200,7 +201,7 @@ def _observations(model: WalkerModel, row: IntArray, generator: np.random.Genera
         "reference_angle": plan.q[row],
         "reference_rate": plan.q_dot[row],
         "load_share": plan.share[row, None],
-        "zmp_reference": plan.zmp[row],
+        "zmp_reference": plan.zmp[row] + generator.normal(0.0, _NOISE_M, (len(row), 2)),
     }
     for name, values in planned.items():
         rows[:, table.group(name)] = values
