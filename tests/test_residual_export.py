@@ -167,9 +167,10 @@ int main(int count, char **paths) {
     arm_begin(&state);
     while (count == 3 && fread(in, sizeof in, 1, from) == 1) {
         const int on_right = in[ARM_FEATURES] > 0.0;
+        const double trust = in[ARM_FEATURES + 1];
         int k;
-        if (!arm_decide(in, on_right, in[ARM_FEATURES + 1], out)) return 1;
-        if (!arm_step(&state, arm_is_due(&state) ? in : 0, on_right, in[ARM_FEATURES + 1])) return 1;
+        if (!arm_decide(in, on_right, trust, out)) return 1;
+        if (!arm_step(&state, arm_is_due(&state) ? in : 0, on_right, trust)) return 1;
         for (k = 0; k < ARM_COLUMNS; k++) out[ARM_DECIDED + k] = state.values[k];
         fwrite(out, sizeof out, 1, to);
     }
@@ -306,6 +307,7 @@ def test_a_residual_that_no_robot_can_play_is_no_graph(tmp_path: Path) -> None:
 
 
 def test_the_layout_needs_no_torch() -> None:
-    code = "import sys, train.export.residual_layout, train.export.c_arm; print('torch' in sys.modules)"
+    modules = "train.export.residual_layout, train.export.c_arm"
+    code = f"import sys, {modules}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
