@@ -60,7 +60,8 @@ def number(value: Any) -> str:
         return "NAN"
     if np.isinf(value):
         return "INFINITY" if value > 0.0 else "-INFINITY"
-    return f"{value!s}f" if isinstance(value, np.float32) else repr(float(value))
+    is_single = np.asarray(value).dtype == np.float32
+    return f"{value!s}f" if is_single else repr(float(value))
 
 
 def numbers(values: Any) -> str:

@@ -117,11 +117,12 @@ def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
 
 def _require_input_output(policy: Any) -> WalkerModel:
     """The model of a policy, which must be the paper's compensator around its controller."""
-    if isinstance(policy, Compensated) and isinstance(policy.policy, WalkingController):
-        made: Any = policy.compensator
-        is_papers = isinstance(made, GravityCompensator) and made.output == "taylor"
-        if is_papers and made.gravity.chains is made.model.biped.chains:
-            return made.model
+    made = policy.compensator if isinstance(policy, Compensated) else None
+    if isinstance(made, GravityCompensator) and isinstance(policy.policy, WalkingController):
+        model = made.model
+        assert isinstance(model, WalkerModel)  # as its controller needs one
+        if made.output == "taylor" and made.gravity.chains is model.biped.chains:
+            return model
     raise ConfigurationError(
         "only input_output of a walker is there in C, with output: taylor and gravity: com or ankle"
     )
