@@ -26,6 +26,7 @@ from train.export.c_arm import c_example, c_header, payload_frames
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Werror -fsanitize=undefined"
 CHECKED = f"{STRICT} -fno-sanitize-recover=undefined"
+RELEASED = "-std=c99 -O3 -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
 COMPILERS = [name for name in ("gcc", "clang") if name == "gcc" or shutil.which(name)]
 TOLERANCE = 1e-12
 # of records: whether there is a payload, frame, mass, place; whether there are rates
@@ -165,13 +166,15 @@ def played(compensator: PositionCompensator, states: Array) -> Array:
     return rows
 
 
-def compiled(folder: Path, header: str, compiler: str, program: str = DRIVER) -> Path:
+def compiled(
+    folder: Path, header: str, compiler: str, program: str = DRIVER, options: str = CHECKED
+) -> Path:
     """A program with the header, compiled strictly."""
     assert shutil.which(compiler), f"no {compiler}: apt-get install gcc libc6-dev"
     (folder / "arm.h").write_text(header)
     (folder / "driver.c").write_text(program)
     made = folder / f"driver_{compiler}"
-    arguments = [compiler, *CHECKED.split(), "driver.c", "-o", str(made), "-lm"]
+    arguments = [compiler, *options.split(), "driver.c", "-o", str(made), "-lm"]
     done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return made
@@ -263,7 +266,7 @@ def test_the_example_checks_and_times_the_header(tmp_path: Path) -> None:
     (tmp_path / "robot.h").write_text(header := c_header(springs(), "arm"))
     made = c_example("arm", "robot.h")
     assert "add_executable(arm_main arm_main.c)" in made["CMakeLists.txt"]
-    program = compiled(tmp_path, header, "gcc", made["arm_main.c"])
+    program = compiled(tmp_path, header, "gcc", made["arm_main.c"], RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert said.startswith("largest deviation from Python: 0 rad")
     assert "us per command" in said
@@ -300,7 +303,10 @@ def test_the_command_writes_header_and_example(
     assert "k_p 800 N*m/rad" in header
     assert "MY_ARM_RAMP_STEPS = 50" in header
     assert "joints.yaml, SHA-256" in header
-    assert Path("my_arm_main.c").exists()
+    example = Path("my_arm_example/my_arm_main.c").read_text()
+    assert '#include "../my_arm.h"' in example
+    assert Path("my_arm_example/CMakeLists.txt").exists()
+    assert not Path("CMakeLists.txt").exists()
     main([*arguments, "--order", "elbow", "shoulder", "--prefix", "so101", "-o", "b.h"])
     assert "SO101_JOINT_ELBOW,\n    SO101_JOINT_SHOULDER\n" in Path("b.h").read_text()
     capsys.readouterr()

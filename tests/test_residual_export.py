@@ -19,7 +19,7 @@ from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import compiled, require_no_library
+from tests.test_c_export import RELEASED, compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_residual import c_residual
 from train.export.onnx_residual import onnx_model
@@ -241,7 +241,9 @@ def test_the_example_in_c_checks_the_header(
     monkeypatch.chdir(tmp_path)
     residual("cautious", Path("mine/r"))
     main(["export", "c", "residual:mine/r", "--prefix", "arm", "-o", "arm.h", "--example"])
-    program = compiled(tmp_path, Path("arm.h").read_text(), "gcc", Path("arm_main.c").read_text())
+    example = Path("arm_example/arm_main.c").read_text()
+    folder = tmp_path / "arm_example"
+    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per decision" in said
     with pytest.raises(SystemExit):

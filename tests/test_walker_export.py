@@ -11,7 +11,7 @@ import pytest
 import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import compiled, require_no_library
+from tests.test_c_export import RELEASED, compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_walker import PlayedSteps, c_walker, play_steps
 
@@ -136,7 +136,9 @@ def test_the_command_writes_it(
     """Catches an example of another header, and what is not there in C."""
     monkeypatch.chdir(tmp_path)
     main(["export", "c", "input_output", "--prefix", "arm", "-o", "arm.h", "--example"])
-    program = compiled(tmp_path, Path("arm.h").read_text(), "gcc", Path("arm_main.c").read_text())
+    example = Path("arm_example/arm_main.c").read_text()
+    folder = tmp_path / "arm_example"
+    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per control step" in said
     capsys.readouterr()

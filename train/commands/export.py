@@ -33,20 +33,22 @@ class Output(Model):
     """Replace files that are there."""
 
     def write(self, files: Mapping[Path, str | bytes], console: Console) -> None:
-        """Write files, all or none.
+        """Write files, the first one into a folder that is there.
 
         Raises:
-            ResultsExistError: One is there, and is not to be replaced.
-            ConfigurationError: A folder does not exist.
+            ResultsExistError: One is there, and is not to be replaced; nothing is written.
+            ConfigurationError: The folder does not exist.
         """
+        folder = next(iter(files)).parent
+        if not folder.is_dir():
+            problem = f"no folder {shorten(folder)}; make it, or name another by --output"
+            raise ConfigurationError(problem)
         for path in files:
-            if not path.parent.is_dir():
-                problem = f"no folder {shorten(path.parent)}; make it, or name another by --output"
-                raise ConfigurationError(problem)
             if path.exists() and not self.overwrite:
                 cure = "add --overwrite, or name another file by --output"
                 raise ResultsExistError(f"{shorten(path)} exists; {cure}")
         for path, content in files.items():
+            path.parent.mkdir(exist_ok=True)
             write_whole(path, content)
             console.print(f"wrote {path}")
 
@@ -98,8 +100,8 @@ class C(Output):
     env: Locator | None = None
     """Environment of a residual or of a walker's policy, as of elastic export onnx."""
     example: bool = False
-    """Write beside the header a program that checks it against Python and times it, and its
-    CMakeLists.txt.
+    """Write a folder PREFIX_example beside the header: a program that checks it against Python and
+    times it, and its CMakeLists.txt.
     """
 
     def run(self, console: Console) -> None:
@@ -115,10 +117,11 @@ class C(Output):
         self._refuse(["env"] if export == self._arm else _OF_ARMS)
         prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
         output = self.output or Path(f"{prefix}.h")
-        header, example = export(prefix, output.name)
+        header, example = export(prefix, f"../{output.name}")
         files = {output: header}
         if self.example:
-            files |= {output.with_name(name): text for name, text in example.items()}
+            folder = output.with_name(f"{prefix}_example")
+            files |= {folder / name: text for name, text in example.items()}
         self.write(files, console)
 
     def _refuse(self, names: Sequence[str]) -> None:

@@ -101,7 +101,7 @@ def c_example(prefix: str, header: str) -> dict[str, str]:
 
     Args:
         prefix: Of the header's names.
-        header: Name of its file.
+        header: Its file, as the program includes it.
     """
     return {
         f"{prefix}_main.c": fill("arm_main.c.in", prefix, header=header),

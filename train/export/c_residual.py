@@ -85,7 +85,7 @@ def c_residual_example(prefix: str, header: str) -> dict[str, str]:
 
     Args:
         prefix: Of the header's names.
-        header: Name of its file.
+        header: Its file, as the program includes it.
     """
     return {
         f"{prefix}_main.c": fill("residual_main.c.in", prefix, header=header),
