@@ -28,7 +28,7 @@ _METRICS = {
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
 ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
 """Metrics of an arm."""
-MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
+MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
