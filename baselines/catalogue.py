@@ -238,7 +238,7 @@ _BASE = "input_output"
 _ZMP_OFFSET_S = 23.0
 """Time constant of the ZMP offset of `foothold`, whose standing estimate leaves little [s]."""
 QUICK_POSTURE = PostureGains(
-    proportional=2.7, integral=16.0, derivative=0.09, leak_s=0.6, filter_s=0.008
+    proportional=2.7, integral=16.0, derivative=0.09, leak_s=0.25, trim=4.0, filter_s=0.008
 )
 """Found on robots of bank 1, with a test of the margin. Without footholds the feet drift more under
 them than under the default."""

@@ -2,7 +2,7 @@
 the package.
 
     make residuals                                       # or, for some of them:
-    python -m tests.residuals_anew testbed walker_3s_posture --seeds 0 1 --jobs 2
+    python -m tests.residuals_anew testbed walker_3s --seeds 0 1 --jobs 2
 
 Training and comparison of each are runs in runs/residuals. A call goes on where the last one was
 interrupted.
@@ -31,9 +31,6 @@ RESIDUALS = {
     "testbed_friction": "learned_testbed_friction",
     "robot": "learned_robot",
     "walker_3s": "learned_walker",
-    "walker_3s_posture": "learned_posture",
-    "walker_3s_offset": "learned_offset",
-    "walker_3s_constants": "learned_constants",
     "walker_1600ms_posture": "learned_posture_1600ms",
     "walker_1100ms_posture": "learned_posture_1100ms",
 }

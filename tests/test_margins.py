@@ -141,8 +141,8 @@ def test_causes_are_those_of_every_world_alone() -> None:
 
 def test_gains_are_stronger_and_nothing_else_changes() -> None:
     """Catches a gain that is left out, and a limit that grows with them."""
-    gains = PostureGains(proportional=2.0, integral=8.0, derivative=0.2, leak_s=0.7)
-    expected = gains.replace(proportional=2.5, integral=10.0, derivative=0.25)
+    gains = PostureGains(proportional=2.0, integral=8.0, derivative=0.2, trim=4.0, leak_s=0.7)
+    expected = gains.replace(proportional=2.5, integral=10.0, derivative=0.25, trim=5.0)
     assert stronger(gains, 1.25) == expected
     assert stronger(gains, 1.0) == gains
 

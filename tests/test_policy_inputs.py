@@ -400,9 +400,6 @@ def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
         ("input", {"acts_on": {"zmp": {"x": 0.0}}}, r"bound of zmp must be positive"),
         ("input", {"acts_on": {"hip": {}}}, r"bound of hip must be positive"),
         ("input", {"acts_on": {}}, r"at least 1"),
-        ("input", {"space": "joints"}, r"space must be one of model, joint, got 'joints'"),
-        ("input", {"space": ["model"]}, r"space must be one of model, joint, got \['model'\]"),
-        ("input", {"space": "model", "acts_on": {"zmp": 0.01}}, r"leave these two out"),
     ],
 )
 def test_what_cannot_be_acted_on_says_what_can(
@@ -415,21 +412,13 @@ def test_what_cannot_be_acted_on_says_what_can(
         Corrected(baselines.make(base, env), model_of(env), ResidualSettings(**settings))
 
 
-def test_folders_of_before_read_as_what_they_meant() -> None:
-    """Catches an old key that is read as another input, and a shipped residual that no longer
-    loads."""
-    assert ResidualSettings(space="joint", scale=0.04).acts_on == {"command": 0.04}
-    assert ResidualSettings(space="model").bounds == {"deflection": 0.6}
-    assert ResidualSettings(scale={"knee": 0.2}).acts_on == {"deflection": {"knee": 0.2}}
+def test_shipped_residuals_and_written_settings_read_as_what_they_say() -> None:
+    """Catches a shipped residual that no longer loads, and settings that change when written."""
     for name in shipped_names():
         description = read_description(Path(name))
-        raw = json.loads((ROOT / "baselines" / "trained" / name / "residual.json").read_text())[
-            "settings"
-        ]
-        old = {"model": ["deflection"], "joint": ["command"]}
-        assert list(description.settings.acts_on) == (
-            old[raw["space"]] if "space" in raw else list(raw["acts_on"])
-        )
+        file = ROOT / "baselines" / "trained" / name / "residual.json"
+        raw = json.loads(file.read_text())["settings"]
+        assert list(description.settings.acts_on) == list(raw["acts_on"])
     again = ResidualSettings(acts_on={"zmp": {"x": 0.01}, "hip": None})
     assert ResidualSettings(**again.model_dump()) == again
 

@@ -18,13 +18,19 @@ from tests.test_walk_policies import PERIOD_S, first, scalar
 GAINS = PostureGains(proportional=1.5, integral=2.0, derivative=0.1, leak_s=0.5, limit_rad=0.2)
 
 
-def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = GAINS) -> Array:
+def turned(
+    attitude: Array,
+    rate: Array,
+    seconds: float,
+    gains: PostureGains = GAINS,
+    ramp_s: float = PERIOD_S,
+) -> Array:
     """Offsets under a constant attitude and rate of the IMU, (steps, 12)."""
     env = scalar()
     model = env.unwrapped.assumed_model
     table = model.observation_table
     observation = first(env)
-    policy = PostureFeedback(Zero(model), model, gains, ramp_s=PERIOD_S)
+    policy = PostureFeedback(Zero(model), model, gains, ramp_s=ramp_s)
     observation[table.group("imu_attitude")] = attitude
     observation[table.columns("imu_rate.x", "imu_rate.y")] = rate
     state = None
@@ -67,6 +73,44 @@ def test_the_response_is_that_of_the_equation() -> None:
         2, 6
     )
     np.testing.assert_allclose(with_rate[:, 1] - found[:, 1], gains.derivative * 0.05, rtol=1e-4)
+
+
+def test_the_trim_grows_once_the_ramp_has_ended() -> None:
+    """Catches a trim that leaks, that learns from the tilt before the policy is at work, or whose
+    gain is one per step: it adds k_t φ t."""
+    gains = GAINS.replace(trim=3.0)
+    tilt = np.array([0.01, -0.02])
+    plain = turned(tilt, np.zeros(2), 0.9, ramp_s=0.3)
+    trimmed = turned(tilt, np.zeros(2), 0.9, gains, ramp_s=0.3)
+    further = (trimmed - plain).reshape(-1, 2, 6)[:, :, 1:3]
+    ramp = round(0.3 / PERIOD_S)
+    assert not further[: ramp - 1].any()
+    np.testing.assert_allclose(further[-1], np.tile(3.0 * 0.6 * tilt, (2, 1)), rtol=0.02)
+    rates = np.diff(further[ramp + 20 :], axis=0) / PERIOD_S
+    np.testing.assert_allclose(rates, np.broadcast_to(3.0 * tilt, rates.shape), rtol=1e-3)
+
+
+def test_a_tilt_that_stays_is_taken_off_with_the_named_time_constant() -> None:
+    """On legs that follow at once the tilt falls from d / (1 + k_p + k_i T) as
+    exp(−k_t t / (1 + k_p + k_i T)); without the trim it stays."""
+    gains = GAINS.replace(trim=2.0, leak_s=0.05, filter_s=1e-4, derivative=0.0)
+    stiff = 1.0 + gains.proportional + gains.integral * gains.leak_s
+    left = []
+    for own in (gains.replace(trim=0.0), gains):
+        env = scalar()
+        model = env.unwrapped.assumed_model
+        observation = first(env)
+        roll = model.observation_table.columns("imu_attitude.roll")
+        policy = PostureFeedback(Zero(model), model, own, ramp_s=PERIOD_S)
+        state = None
+        tilt = 0.03
+        for step in range(round(1.0 / PERIOD_S)):
+            observation[roll] = tilt
+            action, state = policy.predict(observation, state, step == 0)
+            tilt += 0.2 * (0.03 - float(action[1]) - tilt)
+        left.append(tilt)
+    assert left[0] == pytest.approx(0.03 / stiff, rel=0.01)
+    assert left[1] == pytest.approx(left[0] * np.exp(-gains.trim / stiff), rel=0.05)
 
 
 def test_nothing_exceeds_the_limit() -> None:

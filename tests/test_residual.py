@@ -50,15 +50,15 @@ TESTBED = "elastic_env/Testbed-v0"
 QUICK = {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
 SINE = {"reference": {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}}
 BASES = [
-    ("walker", "input_open", "model"),
-    ("walker", "input_output", "model"),
-    ("walker", "input_wrench", "model"),
-    ("walker", "dynamic", "model"),
-    ("walker", "uncompensated", "joint"),
-    ("walker", "input_output", "joint"),
-    ("testbed", "input", "model"),
-    ("testbed", "dynamic", "model"),
-    ("testbed", "zero", "joint"),
+    ("walker", "input_open", "deflection"),
+    ("walker", "input_output", "deflection"),
+    ("walker", "input_wrench", "deflection"),
+    ("walker", "dynamic", "deflection"),
+    ("walker", "uncompensated", "command"),
+    ("walker", "input_output", "command"),
+    ("testbed", "input", "deflection"),
+    ("testbed", "dynamic", "deflection"),
+    ("testbed", "zero", "command"),
 ]
 
 
@@ -114,13 +114,13 @@ def around(env: Any, base: str, **settings: Any) -> Corrected:
     )
 
 
-@pytest.mark.parametrize(("robot", "base", "space"), BASES)
-def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, space: Any) -> None:
+@pytest.mark.parametrize(("robot", "base", "acts_on"), BASES)
+def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, acts_on: str) -> None:
     """Catches a correction that rounds, a filter that starts elsewhere, and a base that sees it
     normalised."""
     env = scalar(robot)
     expected = played(env, baselines.make(base, env), 250)
-    corrected = around(env, base, space=space)
+    corrected = around(env, base, acts_on={acts_on: None})
     for seen in (
         played(env, Deciding(corrected, np.zeros((20, corrected.num_residuals))), 250),
         played(env, ResidualPolicy(corrected, nothing(corrected)), 250),
@@ -159,7 +159,7 @@ def test_model_space_compensates_another_deflection() -> None:
     9 and in Eq. 12."""
     env = scalar("walker")
     r = 0.25
-    corrected = around(env, "input_output", space="model", scale=1.0, cutoff_hz=1e6)
+    corrected = around(env, "input_output", acts_on={"deflection": 1.0}, cutoff_hz=1e6)
     softer = baselines.make("input_output", env, stiffness_scale=1.0 / (1.0 + r))
     observation, _ = env.reset(seed=1)
     wanted, state = corrected.act(observation, np.full((1, 12), r))
@@ -187,7 +187,7 @@ def test_the_correction_passes_a_first_order_low_pass() -> None:
     """Catches a cut-off in rad/s, a filter that runs once per decision, and a scale of the wrong
     joint."""
     env = scalar("testbed")
-    corrected = around(env, "zero", space="joint", scale=0.05, cutoff_hz=3.0)
+    corrected = around(env, "zero", acts_on={"command": 0.05}, cutoff_hz=3.0)
     observation, _ = env.reset(seed=0)
     state = None
     found = []
@@ -240,7 +240,7 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("robot", "base", "space", "mode"),
+    ("robot", "base", "acts_on", "mode"),
     [  # each mode on both robots, and each space on the walker
         (*BASES[1], AutoresetMode.SAME_STEP),
         (*BASES[4], AutoresetMode.NEXT_STEP),
@@ -249,15 +249,17 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
     ],
 )
 def test_a_vector_of_worlds_is_the_scalar_wrapper(
-    robot: str, base: str, space: Any, mode: AutoresetMode
+    robot: str, base: str, acts_on: str, mode: AutoresetMode
 ) -> None:
     """Catches rewards that go on after an end, worlds that begin inside a decision, and memories
     that are mixed up."""
     further = {"history": 2, "observe": ["observation", "base_action"], "decision_period": 20}
     n = 3
     generator = np.random.default_rng(0)
-    many = ResidualVectorWrapper(vector(robot, n, mode), base, space=space, **further)
-    ones = [ResidualWrapper(scalar(robot), base, space=space, **further) for _ in range(n)]
+    many = ResidualVectorWrapper(vector(robot, n, mode), base, acts_on={acts_on: None}, **further)
+    ones = [
+        ResidualWrapper(scalar(robot), base, acts_on={acts_on: None}, **further) for _ in range(n)
+    ]
     observation, _ = many.reset(seed=5)
     expected = np.stack([one.reset(seed=5 + i)[0] for i, one in enumerate(ones)])
     np.testing.assert_array_equal(observation, expected)

@@ -48,10 +48,10 @@ CASES: dict[str, dict[str, Any]] = {
         "activation": "relu",
         "output": "tanh",
     },
-    "cautious": {
+    "clipped": {
         "robot": "walker",
         "base": "input_output",
-        "settings": {**ON_WALKER, "acts_on": {"deflection": 0.5}, "cautious": True},
+        "settings": {**ON_WALKER, "acts_on": {"deflection": 0.5}},
         "activation": "tanh",
         "output": "clip",
         "clip": 3.0,
@@ -89,7 +89,7 @@ def inputs_of(session: Any, given: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_graph_computes_what_python_does(case: str, tmp_path: Path) -> None:
-    """Catches a transposed weight, a wrong activation, a lost mean, mirror, bound or trust, and
+    """Catches a transposed weight, a wrong activation, a lost mean, mirror or bound, and
     features in single precision."""
     layout = ResidualLayout.of(residual(case, tmp_path / "r"))
     session = onnxruntime.InferenceSession(onnx_model(layout))
@@ -101,7 +101,6 @@ def test_the_graph_computes_what_python_does(case: str, tmp_path: Path) -> None:
         assert (other.std(axis=0) > 1e-3).sum() >= len(layout.residual)
     names = [one.name for one in session.get_inputs()]
     assert ("on_right" in names) == (case != "testbed")
-    assert ("trust" in names) == (case == "cautious")
 
 
 class Walk(NamedTuple):
@@ -161,16 +160,15 @@ DRIVER = r"""
 #include <stdio.h>
 
 int main(int count, char **paths) {
-    double in[ARM_FEATURES + 2], out[ARM_DECIDED + ARM_COLUMNS];
+    double in[ARM_FEATURES + 1], out[ARM_DECIDED + ARM_COLUMNS];
     FILE *from = fopen(paths[1], "rb"), *to = fopen(paths[2], "wb");
     arm_state state;
     arm_begin(&state);
     while (count == 3 && fread(in, sizeof in, 1, from) == 1) {
         const int on_right = in[ARM_FEATURES] > 0.0;
-        const double trust = in[ARM_FEATURES + 1];
         int k;
-        if (!arm_decide(in, on_right, trust, out)) return 1;
-        if (!arm_step(&state, arm_is_due(&state) ? in : 0, on_right, trust)) return 1;
+        if (!arm_decide(in, on_right, out)) return 1;
+        if (!arm_step(&state, arm_is_due(&state) ? in : 0, on_right)) return 1;
         for (k = 0; k < ARM_COLUMNS; k++) out[ARM_DECIDED + k] = state.values[k];
         fwrite(out, sizeof out, 1, to);
     }
@@ -181,11 +179,11 @@ int main(int count, char **paths) {
 
 
 def played_in_c(
-    layout: ResidualLayout, folder: Path, features: Array, on_right: Any, trust: Array
+    layout: ResidualLayout, folder: Path, features: Array, on_right: Any
 ) -> tuple[Array, Array]:
     """Decisions of every row, and values of the base's inputs where the rows are a motion."""
     program = compiled(folder, c_residual(layout, "arm"), "gcc", DRIVER)
-    np.hstack([features, on_right, trust]).tofile(folder / "in")
+    np.hstack([features, on_right]).tofile(folder / "in")
     subprocess.run([program, "in", "out"], cwd=folder, check=True, timeout=300)
     found = np.fromfile(folder / "out").reshape(len(features), -1)
     decided, values = np.split(found, [len(layout.residual)], axis=1)
@@ -194,7 +192,7 @@ def played_in_c(
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
-    """Catches what is wrong with a table, a layer, an activation, the mirror or the trust."""
+    """Catches what is wrong with a table, a layer, an activation or the mirror."""
     layout = ResidualLayout.of(residual(case, tmp_path / "r"))
     drawn = layout.draw(10_000, seed=2)
     found, _ = played_in_c(layout, tmp_path, **drawn)
@@ -204,8 +202,7 @@ def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None
 
 def test_the_header_corrects_on_a_walk_as_the_policy_does(walk: Walk, tmp_path: Path) -> None:
     """Catches another period, a low-pass of another share, and a column at another's bound."""
-    trust = np.ones_like(walk.residual[:, :1])
-    _, values = played_in_c(walk.layout, tmp_path, walk.features, walk.on_right, trust)
+    _, values = played_in_c(walk.layout, tmp_path, walk.features, walk.on_right)
     np.testing.assert_allclose(values, walk.values, rtol=0.0, atol=TOLERANCE)
     assert (np.abs(values).max(axis=0) > 0.0).sum() == np.count_nonzero(walk.layout.bounds)
 
@@ -218,9 +215,9 @@ def test_numbers_that_are_not_finite_change_nothing_in_c(tmp_path: Path) -> None
             arm_state state;
             arm_begin(&state);
             features[0] = NAN;
-            if (arm_step(&state, features, 0, 1.0) || !arm_is_due(&state)) return 1;
+            if (arm_step(&state, features, 0) || !arm_is_due(&state)) return 1;
             features[0] = 0.0;
-            return !arm_step(&state, features, 0, 1.0) || arm_is_due(&state);
+            return !arm_step(&state, features, 0) || arm_is_due(&state);
         }"""
     subprocess.run([compiled(tmp_path, c_residual(layout, "arm"), "gcc", program)], check=True)
 
@@ -229,7 +226,7 @@ def test_the_header_needs_no_heap(tmp_path: Path) -> None:
     layout = ResidualLayout.of(residual("mirrored", tmp_path / "r"))
     function = """int all(arm_state *state, const double *features) {
         arm_begin(state);
-        return arm_step(state, features, 1, 1.0);
+        return arm_step(state, features, 1);
     }"""
     require_no_library(tmp_path, c_residual(layout, "arm"), function)
 
@@ -239,7 +236,7 @@ def test_the_example_in_c_checks_the_header(
 ) -> None:
     """Catches a test vector of another residual, and options of arms that have no effect."""
     monkeypatch.chdir(tmp_path)
-    residual("cautious", Path("mine/r"))
+    residual("clipped", Path("mine/r"))
     main(["export", "c", "residual:mine/r", "--prefix", "arm", "-o", "arm.h", "--example"])
     example = Path("arm_example/arm_main.c").read_text()
     folder = tmp_path / "arm_example"

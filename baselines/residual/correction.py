@@ -26,7 +26,7 @@ from baselines.compensation.policy import (
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
-from elastic_env.world.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel
 
 Truth: TypeAlias = Callable[[], Sequence[Any]]
 """True states and parameters now, of one environment's worlds after the other's."""
@@ -65,11 +65,6 @@ class Corrected:
             raise ConfigurationError(
                 f"the residual acts on {', '.join(lacking)}, which {type(base).__name__} does not"
                 f" have as an input; it has: {', '.join(has)}"
-            )
-        if settings.cautious and not isinstance(model, WalkerModel):
-            raise ConfigurationError(
-                f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set"
-                " cautious: false"
             )
         self.base = as_batch_policy(base, model)
         self.settings = settings

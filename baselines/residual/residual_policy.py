@@ -16,7 +16,6 @@ from typing_extensions import override
 
 from baselines.compensation import policy as policies
 from baselines.residual.correction import Corrected, CorrectedMemory
-from baselines.residual.evidence import Evidence
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network, Tensors
 from baselines.residual.settings import ResidualDescription
@@ -38,14 +37,12 @@ class ResidualMemory(NamedTuple):
         wait: Control steps until the next decision, (num_worlds,); -1 before the first.
         residual: What was decided, (num_worlds, k).
         features: Memory of the features.
-        caution: Memory of the evidence, None without caution.
         inner: Memory of the corrected base.
     """
 
     wait: IntArray
     residual: Array
     features: FeaturesMemory
-    caution: Any
     inner: CorrectedMemory
 
 
@@ -75,19 +72,13 @@ class ResidualPolicy(policies.BatchPolicy):
                 f"the network must take {expected[0]} features and give {expected[1]} residuals for"
                 f" these settings, it has {network.num_features} and {network.num_outputs}"
             )
-        self._caution: Evidence | None = None
-        if corrected.settings.cautious:
-            model: Any = corrected.model  # a walker
-            self._caution = Evidence(model, self._period * model.control_period_s)
 
     @override
     def begin(self, rows: Array) -> ResidualMemory:
         n = len(rows)
-        caution = None if self._caution is None else self._caution.begin(n)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        own = (wait, residual, self.features.begin(n), caution)
-        return ResidualMemory(*own, self.corrected.begin(rows))
+        return ResidualMemory(wait, residual, self.features.begin(n), self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:
@@ -108,14 +99,10 @@ class ResidualPolicy(policies.BatchPolicy):
         inner = memory.inner
         fresh = memory.wait == _UNDECIDED
         seen, features = self.features.at(rows, memory.features, fresh, inner, None)
-        known = None
         residual = memory.residual.copy()
         residual[due] = self.features.turn_back(rows[due], self._network(seen[due]))
-        if self._caution is not None:
-            trust, known = self._caution.observe(rows, memory.caution)
-            residual[due] *= trust[due]
         wait = np.full_like(memory.wait, self._period)
-        return ResidualMemory(wait, residual, features, known, inner)
+        return ResidualMemory(wait, residual, features, inner)
 
 
 _UNDECIDED = -1

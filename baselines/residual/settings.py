@@ -1,11 +1,10 @@
 """How a residual acts and what it sees, and the content of `residual.json`."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
+from baselines.compensation.inputs import DEFLECTION, INPUTS
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.errors import quote, require_known
 
@@ -20,7 +19,6 @@ TRUE_QUANTITIES = ("stiffness", "load", "slope", "backlash", "friction", "mounti
 
 _Titles = Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)]
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
-_OLD_SPACES = {"model": DEFLECTION, "joint": COMMAND}
 
 
 class ResidualSettings(Model):
@@ -47,10 +45,6 @@ class ResidualSettings(Model):
     mirror: bool = False
     """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is
     turned back (`baselines.residual.mirror`). For a walker."""
-    cautious: bool = False
-    """It is played only as far as there is `evidence` that the model is wrong
-    (`baselines.residual.evidence`), and else leaves the base alone. In training, under the wrappers
-    of `train`, it acts freely. For a walker."""
     observe: _Titles = ("observation",)
     """Features that it sees: groups of the observation such as (clock, load_share), or all of it,
     and what `baselines.residual.features` makes of it and of the plan."""
@@ -59,22 +53,6 @@ class ResidualSettings(Model):
     privileged: tuple[Title, ...] = Field(default=(), max_length=MOST_ENTRIES)
     """What a teacher sees of the true robot (`baselines.residual.true_robot`); none for a residual
     that a robot can play. For a walker in simulation."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_old_keys(cls, values: Any) -> Any:
-        """Folders and configurations from before `acts_on` say space (model or joint) and scale."""
-        if not isinstance(values, Mapping) or not {"space", "scale"} & values.keys():
-            return values
-        if "acts_on" in values:
-            raise ValueError("acts_on says what space and scale did; leave these two out")
-        space = values.get("space", "model")
-        if not isinstance(space, str) or space not in _OLD_SPACES:
-            known = ", ".join(_OLD_SPACES)
-            raise ValueError(f"space must be one of {known}, got {quote(space)}")
-        acts_on = {_OLD_SPACES[space]: values.get("scale")}
-        others = {key: values[key] for key in values if key not in ("space", "scale")}
-        return {**others, "acts_on": acts_on}
 
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:

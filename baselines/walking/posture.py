@@ -13,6 +13,11 @@ leg needs while it carries the robot alone would move the other foot forth and b
 winds up against homing errors and the integrator of the foot force control else. Walking robots do
 this widely, also the published controller of this one [Kajita2010, section V].
 
+With the leak's time constant T, 1/(1 + k_p + k_i T) is left of what tilts the pelvis all the time:
+a slope, a load, homing errors. A second integral takes that off. It does not leak, and it is slow:
+with its gain k_t, `trim`, the rest falls with the time constant (1 + k_p + k_i T)/k_t. It begins
+when the ramp has ended, as the tilt before that is not the one of the walk.
+
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum
 Tracking", IROS.
 """
@@ -46,15 +51,17 @@ class PostureGains(Model):
     """Hip angle per rate of the tilt [s]."""
     leak_s: float = quantity("s", 1.0, gt=0)
     """Time constant with which the integral leaks [s]."""
+    trim: float = quantity("1/s", 0.0, ge=0)
+    """Hip angle per tilt and time, of an integral that does not leak [1/s]."""
     filter_s: float = quantity("s", 0.02, gt=0)
     """Time constant of the attitude's filter [s]."""
     swing_s: float = quantity("s", 0.5, ge=0)
     """Time constant with which the pitch of a leg in the air follows [s]."""
     limit_rad: float = quantity("rad", 0.08, gt=0)
-    """Largest part of the integral, and of the whole [rad]."""
+    """Largest part of either integral, and of the whole [rad]."""
 
 
-_GAINS = ("proportional", "integral", "derivative", "leak_s", "limit_rad")
+_GAINS = ("proportional", "integral", "derivative", "leak_s", "trim", "limit_rad")
 POSTURE = record_type(
     period_s=(),
     **dict.fromkeys(_GAINS, ()),
@@ -68,6 +75,7 @@ FEEDBACK = record_type(
     steps=(),
     tilt=(2,),  # filtered roll and pitch [rad]
     integral=(2,),  # of them [rad·s]
+    trim=(2,),  # hip angle against a tilt that stays [rad]
     kept=(2,),  # hip pitch that either leg keeps [rad]
 )
 """Memory of the posture feedback."""
@@ -168,6 +176,7 @@ def hold_posture(
         kept = now[world]
         kept.steps = last.steps + 1.0
         share = ramp[int(min(kept.steps, len(ramp) - 1.0))]
+        learned = own.period_s * own.trim if share >= 1.0 else 0.0
         further = change[world, 0] if len(change) > 0 else 0.0
         for i in range(2):
             missing = shown.imu_attitude[i] - last.tilt[i]
@@ -178,6 +187,8 @@ def hold_posture(
             kept.integral[i] = within(integral, own.integral_limit)
             turn = own.proportional * tilt + own.integral * kept.integral[i]
             turn += own.derivative * shown.imu_rate[i]
+            kept.trim[i] = within(last.trim[i] + learned * tilt, own.limit_rad)
+            turn += kept.trim[i]
             turn = share * within((1.0 + further) * turn, own.limit_rad)
             for leg in range(2):
                 if i == 0:

@@ -10,7 +10,6 @@ from pathlib import Path
 from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import (
-    BEST_ANALYTIC,
     FEWEST_SEEDS,
     percent,
     percent_interval,
@@ -29,12 +28,10 @@ _METRICS = {
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
 ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
 """Metrics of an arm."""
-MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
+MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
-GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
-"""Groups of scenarios, and scenarios that stand for themselves."""
 _BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
@@ -129,22 +126,15 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
 
 
-def changes_table(
-    rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = _BASE
-) -> str:
+def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
     """Paired changes of residuals over their bases in every scenario and group, from the rows of a
     `statistics.csv`.
 
     Args:
         rows: Its rows.
         metrics: The metrics that are shown, where the table has them.
-        scopes: The scenarios and groups that are shown; empty for all.
-        against: What the residuals are compared with, as the rows say it.
     """
-    own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
-    own = [
-        row for row in own if row["kind"] == "residual" and (row["scope"] in scopes or not scopes)
-    ]
+    own = [row for row in rows if row["base_is"] == _BASE and row["metric"] in metrics]
     titles = {
         metric: _METRICS[metric]
         for metric in metrics
@@ -174,37 +164,23 @@ def changes_table(
     return page_table(head, lines, words=len(names) + 1)
 
 
-def beyond_the_best(*tables: Rows) -> str:
-    """Changes of residuals over the best policy without learning, in groups of scenarios.
+def learning_in_short(*tables: Rows) -> str:
+    """Gains of residuals over their bases, in groups of scenarios, on the motions that they are
+    compared on.
 
     Args:
         tables: Rows of a `statistics.csv` each.
     """
-    return changes_table(
-        [row for rows in tables for row in rows], scopes=GROUPS, against=BEST_ANALYTIC
-    )
-
-
-def learning_in_short(*tables: Rows) -> str:
-    """Gains of residuals over their bases, in groups of scenarios, each residual on the gait that
-    it was trained on.
-
-    Args:
-        tables: Rows of a `statistics.csv` each; the motion that comes first counts.
-    """
     metrics = _JUDGED[:2]
     lines = []
     for rows in tables:
-        own = [
-            row
-            for row in rows
-            if row["base_is"] == _BASE and row["reference"] == rows[0]["reference"]
-        ]
-        cells = {(row["scope"], row["metric"]): row for row in own if row["pooled"] == "True"}
-        changes = [
-            _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
-        ]
-        lines.append([own[0]["reference"], f"`{own[0]['base']}`", *changes])
+        own = [row for row in rows if row["base_is"] == _BASE and row["scope"] in _SHORT]
+        for reference, found in group_by(own, lambda row: row["reference"]).items():
+            cells = {(row["scope"], row["metric"]): row for row in found}
+            changes = [
+                _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
+            ]
+            lines.append([reference, f"`{found[0]['base']}`", *changes])
     head = [
         "step",
         "base",

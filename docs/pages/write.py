@@ -20,10 +20,8 @@ from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
-    GROUPS,
     MAPS,
     LearnedMap,
-    beyond_the_best,
     changes_table,
     learned_maps,
     learning_in_short,
@@ -56,10 +54,6 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
-            "learned_constants",
-            "learned_offset",
-            "learned_offset_played",
-            "learned_posture",
             "learned_posture_1600ms",
             "learned_posture_1100ms",
             "learned_robot",
@@ -207,7 +201,6 @@ PARTS: Mapping[str, Part] = {
     "learning in short": _of(
         learning_in_short,
         "learned_walker",
-        "learned_posture",
         "learned_posture_1600ms",
         "learned_posture_1100ms",
     ),
@@ -230,10 +223,6 @@ PARTS: Mapping[str, Part] = {
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
-    "learned with an offset": _of(changes_table, "learned_offset"),
-    "learned beyond the best": _of(beyond_the_best, "learned_offset", "learned_offset_played"),
-    "constants": _of(partial(changes_table, scopes=GROUPS), "learned_constants"),
-    "learned posture": _of(changes_table, "learned_posture"),
     "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
     "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
     "learned on the testbed": _of(changes_table, "learned_testbed"),

@@ -47,11 +47,12 @@ _PARTS = [
     _part("sine", "uncompensated", "input", "dynamic", "oracle", "residual:testbed/seed_0"),
     _part({"step_period": 24, "num_steps": 2}, "uncompensated", "input_output"),
     _part(3, "uncompensated", "input_output", "input_wrench"),
-    # where the model is right, a residual leaves its base alone; the pitch of the start is that of
-    # the uncompensated robot, as long as policies ramp in and learn of the softness
+    # the pitch of the start is that of the uncompensated robot, as long as policies ramp in and
+    # learn of the softness
     _part(
         3,
         "input_output",
+        "phase_table",
         "residual:walker_3s/seed_0",
         scenario="soft",
         gait={"settling_steps": 1},

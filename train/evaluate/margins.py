@@ -30,7 +30,7 @@ from train.evaluate.rollout import (
 Causes = npt.NDArray[np.str_]
 """Why episodes failed: empty for those that did not."""
 
-_GAINS = ("proportional", "integral", "derivative")
+_GAINS = ("proportional", "integral", "derivative", "trim")
 _PELVIS = "pelvis_error_rms_rad"
 CHECKED_SHARE = 0.9
 """Share of the way to the worst edge where all robots are played once more."""
@@ -239,11 +239,11 @@ def _cell(record: Mapping[str, Any], quantity: Quantity) -> str:
 
 
 def stronger(gains: PostureGains, factor: float) -> PostureGains:
-    """Posture feedback with its three gains times a factor.
+    """Posture feedback with its gains times a factor.
 
     Args:
-        gains: Proportional, integral and derivative gain among others.
-        factor: Of all three [1].
+        gains: Proportional, integral and derivative gain, and trim, among others.
+        factor: Of all four [1].
     """
     return gains.replace(**{name: factor * getattr(gains, name) for name in _GAINS})
 

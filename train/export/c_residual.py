@@ -57,7 +57,6 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         widest=max(len(layout.features), *widths),
         decision_period=settings.decision_period,
         has_mirror=int(layout.mirrors is not None),
-        is_cautious=int(settings.cautious),
         column_names=enumerated(
             unique(f"{prefix.upper()}_", [signal.name for signal in layout.columns])
         ),
@@ -75,7 +74,7 @@ def c_residual(layout: ResidualLayout, prefix: str) -> str:
         share=number(facts["share_per_control_step"]),
         rows=_TEST_ROWS,
         test_features=nested(drawn["features"]),
-        test_foot=nested(np.hstack([drawn["on_right"], drawn["trust"]])),
+        test_foot=numbers(drawn["on_right"]),
         test_decided=nested(decided),
     )
 

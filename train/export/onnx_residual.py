@@ -35,9 +35,6 @@ def onnx_model(layout: ResidualLayout) -> bytes:
     residual = _network(graph, seen, layout)
     if layout.mirrors is not None:
         residual = graph.mirrored(residual, on_right, layout.mirrors[1])
-    if layout.description.settings.cautious:
-        trust = graph.take("trust", 1, "how far a cautious residual is played, from 0 to 1")
-        residual = graph.add("Mul", residual, trust)
     graph.give("residual", residual, len(layout.residual), "what is decided, within [-1, 1]")
     of_columns = graph.add("Gather", residual, graph.keep(layout.source), axis=1)
     correction = graph.add("Mul", of_columns, graph.keep(layout.bounds))
@@ -52,8 +49,6 @@ def played_vector(layout: ResidualLayout) -> bytes:
     residual, correction = layout.decide(**drawn)
     if layout.mirrors is None:
         del drawn["on_right"]
-    if not layout.description.settings.cautious:
-        del drawn["trust"]
     content = io.BytesIO()
     np.savez(content, **drawn, residual=residual, correction=correction)
     return content.getvalue()

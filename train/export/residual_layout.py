@@ -108,15 +108,13 @@ class ResidualLayout:
         """Layers of the network."""
         return sum(name.startswith("weight") for name in self.tensors)
 
-    def decide(self, features: Array, on_right: BoolArray, trust: Array) -> tuple[Array, Array]:
+    def decide(self, features: Array, on_right: BoolArray) -> tuple[Array, Array]:
         """Residual and correction of a decision, (N, k) and (N, columns).
 
         Args:
             features: Before the mirror, (N, width).
             on_right: Whether the step is on the right foot, (N, 1); without effect where there is
                 no mirror.
-            trust: How far a cautious residual is played, from 0 to 1, (N, 1); without effect on
-                others.
         """
         if self.mirrors is None:
             residual = self.network(features)
@@ -124,8 +122,6 @@ class ResidualLayout:
             of_features, of_residual = self.mirrors
             residual = self.network(np.where(on_right, of_features(features), features))
             residual = np.where(on_right, of_residual(residual), residual)
-        if self.description.settings.cautious:
-            residual = residual * trust
         return residual, self.bounds * residual[:, self.source]
 
     def draw(self, count: int, seed: int = 0) -> dict[str, Any]:
@@ -137,7 +133,7 @@ class ResidualLayout:
         on_right = generator.random((count, 1)) < 0.5
         if self.mirrors is not None:  # the network sees them as drawn
             features = np.where(on_right, self.mirrors[0](features), features)
-        return {"features": features, "on_right": on_right, "trust": generator.random((count, 1))}
+        return {"features": features, "on_right": on_right}
 
     def facts(self) -> dict[str, Any]:
         """What one must know to use it, in types of JSON."""
