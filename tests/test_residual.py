@@ -420,7 +420,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     venv.save("normaliser.pkl")
     given = {"env": "testbed", "base": "input", "settings": env.settings.model_dump(mode="json")}
     Path("c.yaml").write_text(json.dumps(given))
-    arguments = ["export", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
+    arguments = ["export", "sb3", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
     loaded = []
     monkeypatch.setattr(
         "train.learn.export.algorithm_class", lambda name: loaded.append(name) or PPO
@@ -447,7 +447,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     )
     Path("no.zip").write_bytes(b"nothing")
     with pytest.raises(SystemExit):
-        main(["export", "no.zip", "c.yaml", "--trust-pickle"])
+        main(["export", "sb3", "no.zip", "c.yaml", "--trust-pickle"])
     assert "no.zip is no model" in capsys.readouterr().err
 
 
