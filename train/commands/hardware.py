@@ -17,9 +17,9 @@ from rich.markup import escape
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.packets import RANGE_OF_RATES, RATES, require_ids
-from elastic_env.hardware.buses.servo_models import servo_models
+from elastic_env.hardware.buses.packets import RANGE_OF_RATES, require_ids
+from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_models import Protocol, servo_model, servo_models
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import Check as BusCheck
@@ -45,26 +45,31 @@ class Scan(Model):
     """Port, such as /dev/ttyUSB0."""
     baudrate: int | None = quantity("bit/s", None, **RANGE_OF_RATES)
     """Bits per second; default: the usual rates, one after the other."""
+    protocol: Protocol | None = None
+    """Protocol of the servos; default: one after the other."""
 
     def run(self, console: Console) -> None:
         """Scan; exit code 3 where no servo answers."""
         rows = []
-        for rate in RATES if self.baudrate is None else (self.baudrate,):
-            with DynamixelBus(self.port, rate) as bus:
-                for servo in bus.scan():
-                    number = servo.model_number
-                    model = servo_models().get(number)
-                    name = model.name if model is not None else "not known here"
-                    cells = (rate, servo.servo_id, number, name, servo.firmware)
-                    rows.append([str(cell) for cell in cells])
+        for protocol, kind in BUSES.items():
+            if self.protocol not in (None, protocol):
+                continue
+            for rate in kind.rates if self.baudrate is None else (self.baudrate,):
+                with kind(self.port, rate) as bus:
+                    for servo in bus.scan():
+                        number = servo.model_number
+                        model = servo_models().get(number)
+                        name = model.name if model is not None else "not known here"
+                        cells = (protocol, rate, servo.servo_id, number, name, servo.firmware)
+                        rows.append([str(cell) for cell in cells])
         if not rows:
             console.print(
                 f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
                 " it is the IMU's port"
             )
             sys.exit(3)
-        head = ["bit/s", "id", "model number", "model", "firmware"]
-        console.print(make_table(f"servos at {self.port}", head, rows, left=5))
+        head = ["protocol", "bit/s", "id", "model number", "model", "firmware"]
+        console.print(make_table(f"servos at {self.port}", head, rows, left=6))
 
 
 class Check(Model):
@@ -79,8 +84,10 @@ class Check(Model):
     """Port, such as /dev/ttyUSB0."""
     ids: list[int] = [1]
     """Ids of the servos."""
-    baudrate: int = 3_000_000
-    """Bits per second."""
+    baudrate: int | None = quantity("bit/s", None, **RANGE_OF_RATES)
+    """Bits per second; default the usual rate of the protocol."""
+    protocol: Protocol = "dynamixel"
+    """Protocol of the servos."""
     imu_port: str | None = None
     """Port of the IMU, another one than the servos'."""
     imu_baudrate: int = 115_200
@@ -88,9 +95,9 @@ class Check(Model):
 
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
-        HardwareSettings(**self.model_dump(exclude={"ids"}))  # checks them
+        HardwareSettings(port=self.port, imu_port=self.imu_port, imu_baudrate=self.imu_baudrate)
         require_ids(self.ids)
-        with DynamixelBus(self.port, self.baudrate) as bus:
+        with BUSES[self.protocol](self.port, self.baudrate) as bus:
             checks = check_bus(bus, self.ids)
         if self.imu_port is not None:
             with AttitudeStream(self.imu_port, self.imu_baudrate) as stream:
@@ -204,9 +211,9 @@ class Emulate(Model):
     ids: list[int] = [1]
     """Ids of the servos; the IMU is on the link of the first."""
     model_number: int = 54024
-    """Type of the servos: 54024, 54025 or 2020."""
-    baudrate: int = 3_000_000
-    """Bits per second; no other rate is heard."""
+    """Type of the servos, as docs/hardware.md lists them, such as 54024 or 777."""
+    baudrate: int | None = None
+    """Bits per second, no other rate is heard; default the usual rate of the protocol."""
     scenario: str = "nominal"
     """Scenario of the joint and of the IMU, as in elastic identify."""
     stiffness: float | None = None
@@ -226,8 +233,8 @@ class Emulate(Model):
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
     fault: list[str] = []
-    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf,
-    imu_out_of_range, imu_frozen."""
+    """Faults that begin later: overload, hot, silent, same_id, unplugged, imu_silent, imu_nan,
+    imu_inf, imu_out_of_range, imu_frozen."""
     fault_after_s: float = quantity("s", 20.0, ge=0, le=86_400)
     """When that happens, after the start [s]."""
     seed: int = 0
@@ -251,8 +258,12 @@ class Emulate(Model):
         with RunningEmulator(config) as emulator, ends:
             console.print(f"servos {', '.join(map(str, self.ids))} at {emulator.port}")
             console.print(f"IMU at {emulator.imu_port}")
+            check = f"elastic hardware check {emulator.port}"
+            model = servo_model(self.model_number)
+            if model.protocol != "dynamixel":
+                check += f" --protocol {model.protocol}"
             console.print(
-                f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
+                f"for example: {check}, or\nelastic identify --port"
                 f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it."
             )
             if self.fault:
