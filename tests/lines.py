@@ -1,13 +1,15 @@
 """Emulated servos on a line without terminals and without waiting: bytes in, bytes out."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.feetech_bus import FeetechBus
 from elastic_env.hardware.buses.servo_bus import BusGroup, ServoBus
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.joints import ArmJoints, EmulatedArm
@@ -68,11 +70,20 @@ class Loop:
         self.is_using = False
 
     is_using = False
+    latency_timer_ms = 1
+    latency_timer = "latency_timer"
+
+    def closePort(self) -> None:  # noqa: N802
+        pass
+
+    def open(self) -> None:
+        pass
 
 
 def looped(servos: Sequence[EmulatedServo], **options: Any) -> ServoBus:
     """The driver of emulated servos, attached to them."""
-    bus = BUSES[servos[0].model.protocol]("loop")
+    kinds = {"dynamixel": DynamixelBus, "feetech": FeetechBus}  # BUSES may be patched
+    bus = kinds[servos[0].model.protocol]("loop")
     bus.port = Loop(servos, **options)  # type: ignore[assignment]
     bus._wait_for_silence = lambda: None  # type: ignore[method-assign]
     bus.attach([servo.servo_id for servo in servos])
@@ -140,7 +151,7 @@ class VirtualArm:
         self.bus.write_goals(allowed)
         while self.now_s < at - 1e-9:  # the physics leaves out what is too much at a time
             self.advance(min(0.1, at - self.now_s))
-        states = self.bus.read_states(0.003)
+        states = replace(self.bus.read_states(0.003), time_s=self.now_s)
         if reason := self._guard.check(states):
             raise FaultError(reason)
         return Cycle(states, allowed, is_limited, is_held, late_s=0.0)

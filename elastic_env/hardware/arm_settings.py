@@ -128,11 +128,11 @@ class ServoMap:
                 np.minimum(highest, limits.highest_rad),
             ]
         )
-        ranges = np.sort(self.servo_angle(ends), axis=0).clip(-math.pi, math.pi).T
-        for name, (low, high) in zip(self.joints, ranges, strict=True):
-            if not low < high:
-                raise ConfigurationError(
-                    f"joint {name!r} has no range: its limits are {low:.3f} to {high:.3f} rad of"
-                    " the servo, which turns from -3.142 to 3.142; correct zero_rad or the limits"
-                )
-        return ranges
+        ranges = np.sort(self.servo_angle(ends), axis=0).clip(-math.pi, math.pi)
+        for joint in np.flatnonzero((ends[0] >= ends[1]) | (ranges[0] >= ranges[1])):
+            low, high = ends[:, joint]
+            raise ConfigurationError(
+                f"joint {self.joints[joint]!r} has no range: from {low:.4g} to {high:.4g} rad by"
+                " model and limits, and within a turn of its servo; correct zero_rad or the limits"
+            )
+        return ranges.T

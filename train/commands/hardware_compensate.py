@@ -465,7 +465,7 @@ def write_servo_logs(log: Path, known: _Known) -> list[Path]:
             f"tau_known.{joint} [N·m]": load[:, column],
         }
         files.append(log.with_name(f"servo_{joint}.csv"))
-        pd.DataFrame(content).to_csv(files[-1], index=False, float_format="%.7g")
+        pd.DataFrame(content).to_csv(files[-1], index=False, float_format="%.9g")
     return files
 
 

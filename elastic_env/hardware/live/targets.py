@@ -20,6 +20,8 @@ from elastic_env.motion.arm_references import Csv, Workspace
 _MOST_POSES = 10_000
 _MOST_PENDING = 1_000_000
 _REACHED_RAD = 1e-3
+_LAST_RAD = 1e-9
+"""A way that is no step [rad]."""
 
 
 class Targets(ABC):
@@ -343,7 +345,7 @@ class Follower:
         self.q_dot += np.clip(wanted - self.q_dot, -step, step)
         move = self.q_dot * period_s
         # the last step ends on the target
-        is_last = np.abs(error) <= np.maximum(np.abs(move), 1e-9)
+        is_last = np.abs(error) <= np.abs(move) + _LAST_RAD
         is_slow = np.abs(self.q_dot) <= 2.0 * step
         arrives = is_last & is_slow
         self.q = np.where(arrives, target, self.q + move)
