@@ -5,7 +5,11 @@ import contextlib
 import io
 import json
 import os
+import signal
 import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,16 +28,20 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.hardware.arm_settings import ARM_LIMITS, ArmSettings
 from elastic_env.hardware.emulator.joints import EmulatedArm
+from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.live import arm as live
 from elastic_env.hardware.live import targets as sources
 from elastic_env.hardware.live.targets import Follower, Poses, Socket, Stream, read_targets
 from elastic_env.hardware.safety import realtime
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
+from tests.busy import once_more
 from tests.lines import VirtualArm, looped
 from tests.test_hardware_arm_servos import servos
 from train.commands import hardware_compensate as command
+from train.commands.cli import main
 from train.commands.hardware_compensate import Compensate
 from train.runs.console import PlainConsole
 
@@ -505,3 +513,106 @@ def test_the_live_table_has_a_line_for_each_joint(clocks: Any) -> None:
     assert [line.split()[0] for line in lines[2:8]] == list(NAMES)
     assert f"{state.target[1]:+8.4f}" in lines[3]
     assert "1 cycles, 0 late" in lines[-1]
+
+
+def emulator(**changes: Any) -> RunningEmulator:
+    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated(), **changes)
+    return RunningEmulator(config)
+
+
+@pytest.mark.slow
+@once_more
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGSTOP])
+def test_an_arm_sinks_when_its_program_ends(how: signal.Signals) -> None:
+    """Catches an arm that drops, and one that stays under torque: torque is gone a moment after
+    `release_s`, and until then the arm sinks."""
+    with emulator() as running:
+        command_line = [sys.executable, "-m", "tests.hardware_trials.held", running.port]
+        program = subprocess.Popen(
+            [*command_line, *map(str, range(1, 7))],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            assert program.stdout is not None
+            program.stdout.readline()
+            time.sleep(0.5)
+            running.events()
+            program.send_signal(how)
+            fastest = 0.0
+            before = running.state()
+            deadline = time.monotonic() + 30.0
+            while any((now := running.state())["torque_on"]) and time.monotonic() < deadline:
+                time.sleep(0.05)
+                moved = np.abs(np.subtract(now["q"], before["q"])).max()
+                fastest = max(fastest, moved / max(now["time_s"] - before["time_s"], 0.02))
+                before = now
+        finally:
+            program.kill()
+            program.wait()
+        events = running.events()
+    off = min(t for t, _, name, value in events if (name, value) == ("torque_enable", 0))
+    efforts = [(t, value) for t, i, name, value in events if (name, i) == ("torque_limit", 2)]
+    fall = [(t, value) for t, value in efforts if t < off]
+    assert len(fall) > 10
+    assert [value for _, value in fall] == sorted([value for _, value in fall], reverse=True)
+    assert off - fall[0][0] < ARM_LIMITS.release_s + 1.0
+    assert efforts[-1][1] == 1000
+    assert fastest < 3.0
+
+
+@pytest.mark.slow
+@once_more
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"hot": True}, "too hot"),
+        ({"overload": True}, "reports a hardware error"),
+        ({"silent": True}, "no usable reply"),
+        ({"same_id": True}, "no usable reply"),
+        ({"corrupted": 1.0}, "no usable reply"),
+        ({"unplugged": True}, "is gone"),
+    ],
+)
+def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) -> None:
+    """Catches an arm that goes on with a servo that is hot, gone, or answers for another."""
+    with emulator() as running:
+        placed_at = SETTINGS.servos(NAMES)
+        limits = ARM_LIMITS.replace(patience_cycles=10, release_s=0.3)
+        settings = SETTINGS.replace(port=running.port, limits=limits)
+        ranges = placed_at.servo_ranges(LOWEST, HIGHEST, limits)
+        bus = SupervisedBus({running.port: placed_at.ids}, protocol="feetech")
+        with contextlib.suppress(HardwareError), bus:
+            arm = live.Arm(bus, settings, placed_at, compensator(), ranges)
+            arm.begin()
+            targets = Poses(drawn(5), 1.0)
+            for number, _ in zip(range(50), arm.play(targets), strict=False):
+                assert number < 50
+            running.faults(**fault)
+            with pytest.raises(HardwareError, match=words):
+                list(arm.play(targets))
+            running.faults(**Faults(**{"unplugged": "unplugged" in fault}).model_dump())
+        highest = {i: 2048 + HIGHEST[i - 1] * 4096 / 2 / np.pi for i in range(1, 7)}
+        goals = [(i, v) for _, i, name, v in running.events() if name == "goal_position"]
+        assert all(value <= highest[i] + 1 for i, value in goals)
+
+
+@pytest.mark.slow
+@once_more
+def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a step between the command line and the emulated arm that does not fit."""
+    main(
+        [
+            *("hardware", "compensate", "--robot", ROBOT, "--joints", str(JOINTS)),
+            *("--mounting", str(MOUNTING), "--targets", str(FOLDER / "so101_poses.csv")),
+            *("--dry-run", "--no-check", "--output", str(tmp_path / "run")),
+        ]
+    )
+    said = capsys.readouterr().out
+    assert "checks of the servos: all fine" in said
+    assert "estimated link from its target" in said
+    table = np.genfromtxt(tmp_path / "run" / "log.csv", delimiter=",", names=True)
+    assert len(table) > 300
+    assert (tmp_path / "run" / "servo_gripper.csv").is_file()

@@ -1,6 +1,7 @@
 """Servos of small arms: packets against the makers' examples, tables against others' tables, and
 every instruction through driver and emulated servo."""
 
+import math
 from importlib import resources
 from typing import Any
 
@@ -15,7 +16,9 @@ from elastic_env.hardware.buses.servo_models import Register, servo_model, servo
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.servos import EmulatedServo
 from elastic_env.hardware.errors import HardwareError, ReplyError
+from elastic_env.hardware.settings import SafetyLimits
 from tests.lines import Loop, looped
+from tests.test_hardware_supervisor import served
 
 STS = 777
 SMALL = sorted(number for number, one in servo_models().items() if one.counts_per_turn == 4096)
@@ -266,6 +269,48 @@ def test_the_driver_never_writes_the_torque_switch_to_calibrate() -> None:
     register = servo_model(STS).table["torque_enable"].address
     assert any(wire[5] == register for wire in writes)
     assert not any(128 in wire[6:-1] for wire in writes if wire[5] == register)
+
+
+def lowered(number: int, *more: tuple[str, dict[str, Any]]) -> list[tuple[str, int]]:
+    """What a servo is told when its program is gone in motion, with `release_s`."""
+    events: list[tuple[str, int]] = []
+    model = servo_model(number)
+    servo = EmulatedServo(1, model, lambda _, name, value: events.append((name, value)))
+    limits = SafetyLimits(lowest_rad=-1.0, highest_rad=1.0, release_s=0.1, hang_s=0.09)
+    enable = ("enable", {"limits": limits.model_dump()})
+    served([looped([servo])], enable, *more)  # type: ignore[list-item]
+    assert not servo.is_on
+    return events[events.index(("torque_enable", 1)) + 1 :]
+
+
+@pytest.mark.parametrize("number", [STS, 1020])
+def test_torque_falls_in_steps_before_it_is_off(number: int) -> None:
+    """Catches an arm that drops, and a servo that keeps a limit of zero for the next program."""
+    name = servo_model(number).effort_register
+    events = lowered(number)
+    off = events.index(("torque_enable", 0))
+    steps = [value for what, value in events[:off] if what == name]
+    assert len(steps) >= 3
+    assert steps == sorted(steps, reverse=True)
+    assert steps[-1] == 0
+    assert events[-1] == (name, servo_model(number).table[name].initial)
+
+
+def test_servos_without_such_a_limit_lose_their_torque_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a wait that leaves a testbed under torque for nothing."""
+    monkeypatch.setattr(servo_bus, "_LOWER_S", math.nan)  # no time to sleep
+    assert {name for name, _ in lowered(54024)} <= {"goal_position", "torque_enable"}
+
+
+def test_a_fault_lets_torque_fall_too() -> None:
+    """Catches a fall that is slow when the program ends, and a drop when something is wrong."""
+    far = ("exchange", {"goals": [math.nan], "at": 0.0})
+    events = lowered(STS, far)
+    values = [value for name, value in events if name == "torque_limit"]
+    assert 0 < min(set(values) - {0}) < 1000
+    assert events.count(("torque_enable", 0)) >= 1
 
 
 def test_an_unknown_register_or_joint_of_an_emulated_arm_is_refused() -> None:

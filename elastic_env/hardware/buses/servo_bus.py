@@ -278,6 +278,11 @@ class ServoBus(ABC):
                 self._full_efforts[servo_id] = full
                 self.write_register(servo_id, model.effort_register, full)
 
+    @property
+    def can_limit_effort(self) -> bool:
+        """True if the torque of its servos can be limited at once."""
+        return bool(self._full_efforts)
+
     def limit_effort(self, share: float) -> None:
         """Limit the torque of all servos to a share of what their settings allow.
 
@@ -454,8 +459,10 @@ class BusGroup:
     def lower(self, duration_s: float) -> None:
         """Let the torque of all servos fall to nothing within a time [s], so that an arm sinks.
 
-        What a bus does not take is left to `torque_off`.
+        What a bus does not take is left to `torque_off`. Nothing where no servo can limit it.
         """
+        if not any(bus.can_limit_effort for bus in self.buses):
+            return
         begin = time.monotonic()
         share = 1.0
         while share > 0.0:
