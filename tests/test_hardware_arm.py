@@ -40,8 +40,9 @@ from elastic_env.rigid.tree.end_effector import EndEffector
 from tests.busy import once_more
 from tests.lines import VirtualArm, looped
 from tests.test_hardware_arm_servos import servos
-from train.commands import hardware_compensate as command
+from train.commands import hardware_arm as command
 from train.commands.cli import main
+from train.commands.hardware_arm import KnownArm
 from train.commands.hardware_compensate import Compensate
 from train.runs.console import PlainConsole
 
@@ -222,7 +223,7 @@ def test_a_turned_joint_is_found_by_its_load(clocks: Any) -> None:
     virtual = VirtualArm(emulated(direction=tuple(direction)))
     arm = begun(virtual, clocks, compensator())
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
-    known = command._Known(OPTIONS)
+    known = KnownArm(OPTIONS, JOINTS)
     with pytest.raises(HardwareError, match=r"'elbow_flex' holds .*write direction: -1 for it"):
         command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.friction)
     right = VirtualArm(emulated())
@@ -427,7 +428,7 @@ def checked(monkeypatch: pytest.MonkeyPatch, number: int, **registers: int) -> s
     monkeypatch.setitem(command.BUSES, "feetech", lambda *_: contextlib.nullcontext(bus))
     text = io.StringIO()
     console: Console = PlainConsole(file=text, width=200)
-    command._check_servos(command._Known(OPTIONS), SETTINGS, console)
+    command._check_servos(KnownArm(OPTIONS, JOINTS), SETTINGS, console)
     return text.getvalue()
 
 
@@ -462,7 +463,7 @@ def test_the_log_is_one_that_identify_reads(clocks: Any, tmp_path: Path) -> None
     turns the joint forward, against the torque that holds it."""
     virtual = VirtualArm(emulated())
     arm = begun(virtual, clocks, compensator())
-    known = command._Known(OPTIONS)
+    known = KnownArm(OPTIONS, JOINTS)
     path = tmp_path / "log.csv"
     with path.open("w") as file:
         log = command.Log(file, NAMES)
@@ -489,7 +490,7 @@ def test_the_log_is_one_that_identify_reads(clocks: Any, tmp_path: Path) -> None
 def test_options_that_contradict_are_refused(changes: dict[str, Any], words: str) -> None:
     """Catches a dry run that moves a real arm."""
     with pytest.raises(ConfigurationError, match=words):
-        command.compensate(OPTIONS.replace(**changes), PlainConsole(file=io.StringIO()))
+        OPTIONS.replace(**changes).run(PlainConsole(file=io.StringIO()))
 
 
 def test_nobody_at_the_terminal_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""`elastic hardware`: scan, check, compensate, run, emulate."""
+"""`elastic hardware`: scan, check, log, compensate, run, emulate."""
 
 import contextlib
 import csv
@@ -26,7 +26,7 @@ from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
-from train.commands.hardware_compensate import Compensate
+from train.commands.hardware_compensate import Compensate, LogPoses
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import ControlStep, control_steps, make_policy
@@ -277,7 +277,14 @@ class Emulate(Model):
 class Hardware(Model):
     """Real servos, or an emulated bus: scan, check, compensate an arm, run the testbed, emulate."""
 
-    command: Scan | Check | Compensate | Run | Emulate
+    command: (
+        Scan
+        | Check
+        | Compensate
+        | Annotated[LogPoses, tyro.conf.subcommand(name="log")]
+        | Run
+        | Emulate
+    )
 
     def run(self, console: Console) -> None:
         """Do what was asked for."""

@@ -58,11 +58,14 @@ class Poses(Targets):
     Args:
         poses: (N, n) [rad].
         hold_s: How long the desired angles stay at each [s].
+
+    Attributes:
+        poses: The same.
     """
 
     def __init__(self, poses: Array, hold_s: float) -> None:
         super().__init__()
-        self._poses = poses
+        self.poses = poses
         self._hold_s = hold_s
         self._held_s = 0.0
 
@@ -73,13 +76,13 @@ class Poses(Targets):
         if self._held_s > self._hold_s:
             self._held_s = 0.0
             self.number += 1
-        if self.number >= len(self._poses):
+        if self.number >= len(self.poses):
             return None
-        return self._poses[self.number]
+        return self.poses[self.number]
 
     def is_reached(self, desired: Array) -> bool:
         """True if the desired angles are those of the pose."""
-        return bool(np.abs(desired - self._poses[self.number]).max() < _REACHED_RAD)
+        return bool(np.abs(desired - self.poses[self.number]).max() < _REACHED_RAD)
 
 
 class Trajectory(Targets):
@@ -302,6 +305,7 @@ def read_targets(
         path = Csv(file=str(file)).joint_plan(workspace, period_s).q
         require_in_range(str(file), joints, path, lowest, highest)
         return Trajectory(path)
+    names = tuple(map(_joint_of, names))
     require_known(f"column of {file}", names, joints)
     if not 0 < len(rows) <= _MOST_POSES:
         raise ConfigurationError(f"{file} must have 1 to {_MOST_POSES} poses, it has {len(rows)}")
@@ -309,6 +313,12 @@ def read_targets(
     poses[:, [list(joints).index(name) for name in names]] = rows
     require_in_range(str(file), joints, poses, lowest, highest)
     return Poses(poses, hold_s)
+
+
+def _joint_of(column: str) -> str:
+    """The joint of a column, which may be one of a log of poses, such as `theta.elbow [rad]`."""
+    name = column.partition("[")[0].strip()
+    return name.removeprefix("theta.").removeprefix("q.")
 
 
 class Follower:
