@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.core.config import Model, quantity
+from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.hardware.buses.packets import RANGE_OF_RATES, require_ids
 from elastic_env.hardware.buses.protocols import BUSES
@@ -26,6 +26,7 @@ from elastic_env.hardware.safety.checks import Check as BusCheck
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
+from train.commands.hardware_arm import KnownArm, OnArm, emulated
 from train.commands.hardware_compensate import Compensate, LogPoses
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
@@ -207,8 +208,17 @@ class Emulate(Model):
 
     Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
     emulate --lost 0.01
+
+    An arm behind them: elastic hardware emulate --robot docs/hardware/so101.xml --joints
+    docs/hardware/so101_joints.yaml --mounting docs/hardware/so101_mounting.yaml
     """
 
+    robot: Locator | None = None
+    """Model of an arm behind the servos, MJCF or URDF; ids and servos are those of --mounting."""
+    joints: Path | None = None
+    """YAML file of its joints."""
+    mounting: Path | None = None
+    """YAML file of its ids, signs and zeros."""
     ids: list[int] = [1]
     """Ids of the servos; the IMU is on the link of the first."""
     model_number: int = 54024
@@ -247,31 +257,51 @@ class Emulate(Model):
         switches = [name for name in known if known[name].annotation is bool]
         require_known("fault", self.fault, switches)
         shares = self.model_dump(include=set(known))
-        config = EmulatorConfig(
+        config = self._arm() or EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
             baudrate=self.baudrate,
-            faults=Faults(**shares, latency_s=1e-3 * self.latency_ms),
-            seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )
+        faults = Faults(**shares, latency_s=1e-3 * self.latency_ms)
+        config = config.replace(faults=faults, seed=self.seed)
         ends = contextlib.suppress(KeyboardInterrupt)
         with RunningEmulator(config) as emulator, ends:
-            console.print(f"servos {', '.join(map(str, self.ids))} at {emulator.port}")
-            console.print(f"IMU at {emulator.imu_port}")
-            check = f"elastic hardware check {emulator.port}"
-            model = servo_model(self.model_number)
+            ids = " ".join(map(str, config.ids))
+            console.print(f"servos {ids} at {emulator.port}")
+            check = f"elastic hardware check {emulator.port} --ids {ids}"
+            model = servo_model(config.model_number)
             if model.protocol != "dynamixel":
                 check += f" --protocol {model.protocol}"
-            console.print(
-                f"for example: {check}, or\nelastic identify --port"
-                f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it."
-            )
+            console.print(f"for example: {check}")
+            if config.arm is None:
+                console.print(f"IMU at {emulator.imu_port}")
+                console.print(
+                    f"or: elastic identify --port {emulator.port} --imu-port {emulator.imu_port}"
+                    " --yes --patient"
+                )
+            else:
+                console.print(f"or: elastic hardware compensate --port {emulator.port} ...")
+            console.print("Ctrl-C ends it.")
             if self.fault:
                 time.sleep(self.fault_after_s)
                 emulator.faults(**dict.fromkeys(self.fault, True))
                 console.print(f"from now on: {', '.join(self.fault)}")
             emulator.wait()
+
+    def _arm(self) -> EmulatorConfig | None:
+        """The emulated arm; None where no model of one is named.
+
+        Raises:
+            ConfigurationError: A file is missing, or cannot be used.
+        """
+        given = (self.robot, self.joints, self.mounting)
+        if given == (None, None, None):
+            return None
+        if self.robot is None or self.joints is None or self.mounting is None:
+            raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
+        arm = OnArm(robot=self.robot, mounting=self.mounting, dry_run=True)
+        return emulated(KnownArm(arm, self.joints))
 
 
 class Hardware(Model):

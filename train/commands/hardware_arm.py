@@ -439,8 +439,9 @@ class Log:
 def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
     """A log of each servo for `elastic identify --log`: time, goal, position, and its load.
 
-    The load is that of the model at the encoders' angles; it turns the joint forward, so that it is
-    the negative of the torque that holds it.
+    Servos that no weight loads are left out: nothing tells their torque. The load is that of the
+    model at the encoders' angles. It turns the joint forward, so that it is the negative of the
+    torque that holds it.
     """
     table = pd.read_csv(log, nrows=_MOST_ROWS)
     theta = table[[f"theta.{joint} [rad]" for joint in known.joints]]
@@ -452,6 +453,8 @@ def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
     load = -known.links.gravity_torque(angles)
     files = []
     for column, joint in enumerate(known.joints):
+        if np.abs(load[:, column]).max() < _TOLD_NM:
+            continue
         content = {
             "time [s]": table["time [s]"],
             "goal [rad]": table[f"command.{joint} [rad]"],
