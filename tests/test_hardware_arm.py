@@ -26,7 +26,7 @@ from baselines.identification.servo_log import read_servo_log
 from elastic_env.core.config import load_yaml, read_mapping
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.hardware.arm_settings import ARM_LIMITS, ArmSettings
+from elastic_env.hardware.arm_settings import ARM_LIMITS, ArmSettings, ServoPlace
 from elastic_env.hardware.emulator.joints import EmulatedArm
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import FaultError, HardwareError
@@ -368,9 +368,11 @@ def test_lines_of_a_stream_are_targets_and_bad_ones_change_nothing() -> None:
     np.testing.assert_array_equal(send("0.1,-0.4,0.4,0.2,0,0.2\n"), [0.1, -0.4, 0.4, 0.2, 0, 0.2])
     assert send('{"elbow_flex": 0.7}\n{"wrist_fl')[2] == 0.7
     assert send('ex": 0.1}\n')[3] == 0.1
-    for bad in ("1,2\n", "nan,0,0,0,0,0\n", '{"elbow": 1}\n', "what\n", '{"elbow_flex": 40}\n'):
-        assert send(bad)[2] == 0.7
-    assert stream.refused == 5
+    bad = ["1,2", "nan,0,0,0,0,0", '{"elbow": 1}', "what", '{"elbow_flex": 40}', "\x00"]
+    bad += ['{"elbow_flex": null}', '{"elbow_flex": [1]}', '{"elbow_flex": 1', '{"a":' * 5000]
+    for line in bad:
+        assert send(line + "\n")[2] == 0.7
+    assert stream.refused == len(bad)
     os.close(source)
     assert stream.next(HOME, 0.01) is None
     os.close(end)
@@ -517,9 +519,18 @@ def test_the_live_table_has_a_line_for_each_joint(clocks: Any) -> None:
     assert "1 cycles, 0 late" in lines[-1]
 
 
-def emulator(**changes: Any) -> RunningEmulator:
-    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated(), **changes)
+def emulator() -> RunningEmulator:
+    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
     return RunningEmulator(config)
+
+
+def two_arms() -> tuple[str, tuple[str, ...]]:
+    """Two SO-101 side by side as text, and their twelve joints."""
+    spec = mujoco.MjSpec.from_file(ROBOT)
+    other = mujoco.MjSpec.from_file(ROBOT)
+    spec.attach(other, prefix="other_", frame=spec.worldbody.add_frame(pos=[0.0, 0.5, 0.0]))
+    spec.compile()
+    return spec.to_xml(), (*NAMES, *(f"other_{name}" for name in NAMES))
 
 
 @pytest.mark.slow
@@ -579,26 +590,39 @@ def test_an_arm_sinks_when_its_program_ends(how: signal.Signals) -> None:
     ],
 )
 def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) -> None:
-    """Catches an arm that goes on with a servo that is hot, gone, or answers for another."""
-    with emulator() as running:
-        placed_at = SETTINGS.servos(NAMES)
+    """Catches an arm that goes on with a servo that is hot, gone, or answers for another: twelve
+    servos on one bus, in motion."""
+    model, names = two_arms()
+    home = dict(zip(names, [*HOME, *HOME], strict=True))
+    zeros = {"direction": (1,) * 12, "zero_rad": (0.0,) * 12}
+    twins = emulated(model=model, order=names, home=home, **zeros)
+    ids = tuple(range(1, 13))
+    config = EmulatorConfig(model_number=777, ids=ids, arm=twins)
+    lowest, highest = np.tile(LOWEST, 2), np.tile(HIGHEST, 2)
+    with RunningEmulator(config) as running:
         limits = ARM_LIMITS.replace(patience_cycles=10, release_s=0.3)
-        settings = SETTINGS.replace(port=running.port, limits=limits)
-        ranges = placed_at.servo_ranges(LOWEST, HIGHEST, limits)
+        joints = {name: ServoPlace(id=i) for i, name in enumerate(names, 1)}
+        settings = ArmSettings(port=running.port, joints=joints, limits=limits, rate_hz=50.0)
+        placed_at = settings.servos(names)
+        ranges = placed_at.servo_ranges(lowest, highest, limits)
         bus = SupervisedBus({running.port: placed_at.ids}, protocol="feetech")
         with contextlib.suppress(HardwareError), bus:
-            arm = live.Arm(bus, settings, placed_at, compensator(), ranges)
+            arm = live.Arm(bus, settings, placed_at, Plain(), ranges)
             arm.begin()
-            targets = Poses(drawn(5), 1.0)
+            targets = Poses(np.tile(drawn(5), 2), 1.0)
             for number, _ in zip(range(50), arm.play(targets), strict=False):
                 assert number < 50
             running.faults(**fault)
             with pytest.raises(HardwareError, match=words):
                 list(arm.play(targets))
             running.faults(**Faults(**{"unplugged": "unplugged" in fault}).model_dump())
-        highest = {i: 2048 + HIGHEST[i - 1] * 4096 / 2 / np.pi for i in range(1, 7)}
-        goals = [(i, v) for _, i, name, v in running.events() if name == "goal_position"]
-        assert all(value <= highest[i] + 1 for i, value in goals)
+        counts = 2048 + ranges * 4096 / (2.0 * np.pi)
+        events = running.events()
+        goals = [(i - 1, v) for _, i, name, v in events if name == "goal_position"]
+        assert all(counts[i, 0] - 1 <= value <= counts[i, 1] + 1 for i, value in goals)
+        if "unplugged" not in fault:
+            assert {i for _, i, *change in events if change == ["torque_enable", 0]} == set(ids)
+            assert not any(running.state()["torque_on"])
 
 
 @pytest.mark.slow

@@ -238,8 +238,11 @@ def _play(
         except KeyboardInterrupt:
             console.print("stopped; torque falls")
         finally:
-            file.flush()
-            files = [path, *write_servo_logs(path, known)]
+            try:
+                arm.close()  # before what takes its time
+            finally:
+                file.flush()
+                files = [path, *write_servo_logs(path, known)]
     counts = arm.counts
     console.print(
         f"{counts.cycles} cycles at {arm.settings.rate_hz:g} Hz: {counts.late} late,"

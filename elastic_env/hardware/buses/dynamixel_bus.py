@@ -20,6 +20,8 @@ class DynamixelBus(ServoBus):
     position_mode = 3
     full_replies = 2
     status_bytes = 11
+    patience_s = 0.003
+    slowest_trip_s = 2.5e-3
 
     def __init__(self, port: str, baudrate: int | None = None) -> None:
         super().__init__(port, baudrate)
@@ -35,6 +37,10 @@ class DynamixelBus(ServoBus):
     def ping(self, servo_id: int) -> ServoInfo:
         reply = self._request(servo_id, packets.PING, b"", length=3)
         return ServoInfo(servo_id, int.from_bytes(reply[:2], "little"), reply[2])
+
+    @override
+    def knock(self, servo_id: int) -> None:
+        self.ping(servo_id)
 
     @override
     def _place(self, address: int, length: int) -> bytes:

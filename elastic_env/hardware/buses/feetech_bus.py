@@ -28,6 +28,8 @@ class FeetechBus(ServoBus):
     position_mode = 0
     full_replies = 1
     status_bytes = 6
+    patience_s = 0.006
+    slowest_trip_s = 5e-3
 
     def __init__(self, port: str, baudrate: int | None = None) -> None:
         super().__init__(port, baudrate)
@@ -49,10 +51,14 @@ class FeetechBus(ServoBus):
 
     @override
     def ping(self, servo_id: int) -> ServoInfo:
-        self._request(servo_id, packets.PING, b"", length=0)
+        self.knock(servo_id)
         place = self._place(self._who.start, len(self._who))
         reply = self._request(servo_id, packets.READ, place, len(self._who))
         return ServoInfo(servo_id, int.from_bytes(reply[-2:], "little"), reply[0])
+
+    @override
+    def knock(self, servo_id: int) -> None:
+        self._request(servo_id, packets.PING, b"", length=0)
 
     @override
     def _place(self, address: int, length: int) -> bytes:

@@ -74,6 +74,10 @@ class ServoBus(ABC):
     """Status return level of a servo that answers every instruction."""
     status_bytes: ClassVar[int]
     """Length of a reply without data."""
+    patience_s: ClassVar[float]
+    """How long replies in motion may take beyond the time on the wire [s]."""
+    slowest_trip_s: ClassVar[float]
+    """Round trip of a ping from which on nothing may move [s]."""
 
     def __init__(self, port: str, baudrate: int | None = None) -> None:
         self.name = port
@@ -120,6 +124,14 @@ class ServoBus(ABC):
     @abstractmethod
     def ping(self, servo_id: int) -> ServoInfo:
         """Model number and firmware of one servo.
+
+        Raises:
+            ReplyError: It does not answer.
+        """
+
+    @abstractmethod
+    def knock(self, servo_id: int) -> None:
+        """One request and its answer, as short as there are.
 
         Raises:
             ReplyError: It does not answer.

@@ -201,6 +201,14 @@ class Arm:
         self._bus.stop_keeping()
         self._pace.restart()
 
+    def close(self) -> None:
+        """Torque falls; the port is given back.
+
+        Raises:
+            HardwareError: It is not certain that torque is off.
+        """
+        self._bus.close()
+
     def nudge(self, joint: int, way_rad: float) -> tuple[Array, Array]:
         """Move one joint a little from where it stands, by its servo alone, and let it rest.
 

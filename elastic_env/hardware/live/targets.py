@@ -14,11 +14,13 @@ from typing_extensions import override
 
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, quote, require_known
+from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array
 from elastic_env.motion.arm_references import Csv, Workspace
 
 _MOST_POSES = 10_000
 _MOST_PENDING = 1_000_000
+_LONGEST_LINE = 100_000
 _REACHED_RAD = 1e-3
 _LAST_RAD = 1e-9
 """A way that is no step [rad]."""
@@ -136,7 +138,10 @@ class Stream(Targets):
         if self._target is None:
             self._target = desired.copy()
         while not self._is_over and select.select([self._descriptor], [], [], 0.0)[0]:
-            data = os.read(self._descriptor, 65536)
+            try:
+                data = os.read(self._descriptor, 65536)
+            except OSError:  # the client is gone
+                data = b""
             self._is_over = not data
             self._pending += data
             if len(self._pending) > _MOST_PENDING:
@@ -153,7 +158,7 @@ class Stream(Targets):
         try:
             target = parse_target(line.decode(), self._joints, self._target)
             require_in_range("the line", self._joints, target, self._lowest, self._highest)
-        except (ValueError, ConfigurationError) as error:
+        except (TypeError, ValueError, ConfigurationError) as error:
             self._refuse(str(error))
             return
         self._target = target
@@ -229,7 +234,7 @@ def parse_target(line: str, joints: Sequence[str], before: Array) -> Array:
     """
     n = len(joints)
     if line.lstrip().startswith("{"):
-        angles = json.loads(line)
+        angles = parse_json(line, most=_LONGEST_LINE)
         require_known("joint", angles, joints)
         target = before.copy()
         for name, angle in angles.items():

@@ -18,11 +18,10 @@ _WARM_SHARE = 0.8
 _PINGS = 50
 _LOST = 2
 """Replies lost or damaged from which a line counts as bad; a busy computer may cost one."""
-_SLOW_S = 2.5e-3
 _FINE_SPEED = 1 << 2
 """Bit of Feetech's `phase` with which a count of velocity is 1 pulse/s, not 50."""
 _FASTER = (
-    "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to 0, "
+    "too slow: set the adapter's latency timer to 1 ms, the servos' return delay to 0, "
     "and the bus to 1 Mbit/s or more"
 )
 _BETTER_LINE = (
@@ -74,7 +73,7 @@ def _check_line(bus: ServoBus, servo_id: int) -> list[Check]:
     retries = bus.num_retries
     for _ in range(_PINGS):
         begin = time.monotonic()
-        bus.ping(servo_id)
+        bus.knock(servo_id)
         times.append(time.monotonic() - begin)
     lost = bus.num_retries - retries
     typical = statistics.median(times)
@@ -82,7 +81,7 @@ def _check_line(bus: ServoBus, servo_id: int) -> list[Check]:
     losses = f"{lost} of {_PINGS} pings"
     return [
         Check("latency timer", told, (latency or 0) <= 1, cure, is_vital=False),
-        Check("round trip of a ping", trip, typical < _SLOW_S, _FASTER),
+        Check("round trip of a ping", trip, typical < bus.slowest_trip_s, _FASTER),
         Check("lost replies", losses, lost < _LOST, _BETTER_LINE, is_vital=False),
     ]
 

@@ -32,7 +32,6 @@ from elastic_env.hardware.safety.processes import Channel, is_ending
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.settings import SafetyLimits
 
-_REPLY_TIMEOUT_S = 0.003
 _GLANCE_S = 0.005
 """Silence after which to look whether the program lives; a command comes every 4 ms [s]."""
 _REST_RAD_S = 0.2
@@ -173,7 +172,7 @@ class Supervisor:
         self._commanded_s = time.monotonic()
         self._served_s = self._commanded_s
         for bus in self._buses:
-            bus.reply_timeout_s = _REPLY_TIMEOUT_S
+            bus.reply_timeout_s = bus.patience_s
         return {"position": positions.tolist()}
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
@@ -194,7 +193,7 @@ class Supervisor:
         self._commanded_s = now
         realtime.sleep_until(at)
         begin = time.monotonic()
-        states = self._servos.read_states(_REPLY_TIMEOUT_S)
+        states = self._servos.read_states(self._buses[0].patience_s)
         reason = guard.check(states)
         if reason:
             fault = self._stop(reason)
