@@ -43,6 +43,7 @@ from tests.lines import VirtualArm, looped
 from tests.test_hardware_arm_servos import servos
 from train.commands import hardware_arm as command
 from train.commands.cli import main
+from train.commands.hardware import Emulate
 from train.commands.hardware_arm import KnownArm
 from train.commands.hardware_compensate import Compensate, approached, write_rests
 from train.runs.console import PlainConsole
@@ -494,6 +495,17 @@ def test_options_that_contradict_are_refused(changes: dict[str, Any], words: str
     """Catches a dry run that moves a real arm."""
     with pytest.raises(ConfigurationError, match=words):
         OPTIONS.replace(**changes).run(PlainConsole(file=io.StringIO()))
+
+
+def test_an_emulated_arm_needs_all_its_files() -> None:
+    """Catches pendulums behind the servos where somebody asked for an arm."""
+    with pytest.raises(ConfigurationError, match="needs --robot, --joints and --mounting"):
+        Emulate(robot=ROBOT)._arm()
+    config = Emulate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING)._arm()
+    assert config is not None
+    assert config.arm is not None
+    assert config.arm.order == NAMES
+    assert (config.model_number, config.ids, config.rate) == (777, (1, 2, 3, 4, 5, 6), 1_000_000)
 
 
 def test_nobody_at_the_terminal_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
