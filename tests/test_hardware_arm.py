@@ -227,11 +227,11 @@ def test_a_turned_joint_is_found_by_its_load(clocks: Any) -> None:
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
     known = KnownArm(OPTIONS, JOINTS)
     with pytest.raises(HardwareError, match=r"'elbow_flex' holds .*write direction: -1 for it"):
-        command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.friction)
+        command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.joint_settings)
     right = VirtualArm(emulated())
     arm = begun(right, clocks, compensator())
     weighed = [live.weigh(arm, joint, 0.08) for joint in range(6)]
-    command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.friction)
+    command.require_signs(arm.servos, weighed, known.links.gravity_torque, known.joint_settings)
     assert weighed[1].gain == pytest.approx(11.95, rel=0.1)
     assert all(0.5 < own.moved < 1.0 for own in weighed)
 
@@ -251,6 +251,23 @@ def test_loads_tell_which_sign_is_wrong(seed: int, turned: int | None) -> None:
     assert found in (None, turned)
     if turned is not None and abs(true[turned]) > 0.4:
         assert found == turned
+
+
+def test_a_wrong_zero_shows_in_the_loads(clocks: Any) -> None:
+    """Catches a zero that is off by a quarter turn without a word, and a right one with one."""
+    said = []
+    for zero in (0.0, 1.4):
+        zeros = (0.0, zero, 0.0, 0.0, 0.0, 0.0)
+        virtual = VirtualArm(emulated(zero_rad=zeros))
+        joints = dict(SETTINGS.joints)
+        known = KnownArm(OPTIONS, JOINTS)
+        arm = begun(virtual, clocks, compensator(), SETTINGS.replace(joints=joints))
+        text = io.StringIO()
+        command._check_joints(arm, known, PlainConsole(file=text, width=120))
+        said.append(text.getvalue())
+    assert "zero_rad" not in said[0]
+    assert "light: its load does not tell the sign" in said[0]
+    assert "look at zero_rad" in said[1]
 
 
 def test_a_blocked_joint_is_named(clocks: Any) -> None:

@@ -58,6 +58,8 @@ _EMULATED = {"feetech": "STS3215", "dynamixel": "XM430-W350"}
 _PATIENT_CYCLES = 10
 _FAR_GAIN = 1.4
 """A gain that is so many times another one is worth a word."""
+_OFF = 0.2
+"""Share by which the load of a servo may differ from that of the model, beside friction."""
 _TOLD_NM = 0.05
 """Load by the model from which it tells the sign of a joint [N·m]."""
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
@@ -146,7 +148,7 @@ class KnownArm:
         self.tool = EndEffector(self.model, self.joints, tool, held)
 
     @property
-    def friction(self) -> dict[str, JointSettings]:
+    def joint_settings(self) -> dict[str, JointSettings]:
         """Settings of the joints by name."""
         found = read_joints(self.mapping, self.joints, _others(self.model, self.joints))
         return {name: own for name, own in found.items() if own is not None}
@@ -210,6 +212,7 @@ def move_arm(
         start = arm.begin()
         if options.check:
             _check_joints(arm, known, console)
+        arm.hold()
         targets = make_targets(start)
         stack.callback(targets.close)
         if isinstance(targets, Socket):
@@ -226,6 +229,7 @@ def _play(
     path = folder / "log.csv"
     with path.open("w", newline="", encoding="utf-8") as file, _shown(console) as show:
         log = Log(file, known.joints)
+        arm.resume()
         try:
             for state in arm.play(targets):
                 log.write(state, targets.number)
@@ -327,14 +331,17 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
         weighed_torque = abs(float(known.links.gravity_torque(arm.start)[joint]))
         if weighed_torque < _TOLD_NM:
             _ask(arm, known, joint)
-    require_signs(known.servos, weighed, known.links.gravity_torque, known.friction)
+    arm.hold()  # while tables are drawn
+    require_signs(known.servos, weighed, known.links.gravity_torque, known.joint_settings)
     rows = []
     for joint, own in enumerate(weighed):
         name = known.joints[joint]
         load = float(known.links.gravity_torque(own.theta)[joint])
-        gain = known.friction[name].servo.sagging_gain(name)
+        gain = known.joint_settings[name].servo.sagging_gain(name)
         is_far = max(own.gain / gain, gain / own.gain) > _FAR_GAIN if own.gain > 0.0 else False
         remark = "" if abs(load) >= _TOLD_NM else "light"
+        if abs(own.torque - load) > _hidden(known.joint_settings[name], load) + _OFF * abs(load):
+            remark = "load"
         if is_far:
             remark = "k_p"
         gains = ["-" if not math.isfinite(one) else f"{one:.3g}" for one in (own.gain, gain)]
@@ -345,11 +352,21 @@ def _check_joints(arm: Arm, known: KnownArm, console: Console) -> None:
     remarks = {row[-1] for row in rows}
     if "light" in remarks:
         console.print("light: its load does not tell the sign; see whether it turns as the model")
+    if "load" in remarks:
+        console.print(
+            "load: the servo holds another torque than the model says; look at zero_rad, at the"
+            " masses of the model, and at what the arm touches"
+        )
     if "k_p" in remarks:
         console.print(
             "k_p: the servo gives way otherwise than the file of joints says [N·m/rad]; is that"
             " a register in place of N·m/rad? elastic identify --log finds it"
         )
+
+
+def _hidden(joint: JointSettings, load: float) -> float:
+    """Torque of a load that friction may hide [N·m]."""
+    return (joint.coulomb_friction or 0.0) + joint.load_friction * abs(load)
 
 
 def require_signs(
@@ -372,9 +389,8 @@ def require_signs(
     theta = weighed[-1].theta
     known = torque(theta)
     held = np.array([own.torque for own in weighed])
-    rubbed = [settings[name] for name in servos.joints]
-    hidden = np.array([one.coulomb_friction or 0.0 for one in rubbed])
-    hidden += np.array([one.load_friction for one in rubbed]) * np.abs(known)
+    loads = zip(servos.joints, known.tolist(), strict=True)
+    hidden = np.array([_hidden(settings[name], load) for name, load in loads])
     wrong = wrong_sign(held, theta, torque, hidden)
     if wrong is not None:
         name = servos.joints[wrong]

@@ -14,9 +14,6 @@ from elastic_env.hardware.live.arm import ArmState
 from elastic_env.hardware.live.targets import Poses, Socket, Stream, Targets, read_targets
 from train.commands.hardware_arm import KnownArm, OnArm, Plain, move_arm
 
-_MARGIN = 0.1
-"""Share of a joint's range that drawn poses keep from its ends."""
-
 
 class Compensate(OnArm):
     """Move a real arm with compensated commands: its links go where the targets are.

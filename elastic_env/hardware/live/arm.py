@@ -7,10 +7,10 @@ link estimate  └── motor encoders  ←──────┘
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -338,7 +338,9 @@ def weigh(arm: Arm, joint: int, way_rad: float) -> Weighed:
     return Weighed(moved, float(torque), float(gain), 0.5 * (above + below))
 
 
-def wrong_sign(measured: Array, theta: Array, torque: Any, tolerance: Array) -> int | None:
+def wrong_sign(
+    measured: Array, theta: Array, torque: Callable[[Array], Array], tolerance: Array
+) -> int | None:
     """Joint whose direction is wrong, by the loads that the servos hold; None if none is.
 
     With a direction that is wrong, angle and load of that joint have the other sign. The model's
