@@ -148,6 +148,7 @@ def changes_table(
         if any(row["metric"] == metric for row in own)
     }
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
+    whom = "base" if against == BASE else f"`{own[0]['base']}`"
     lines = []
     for place, found in group_by(
         own, lambda row: (*(row[name] for name in names), row["scope"])
@@ -165,7 +166,7 @@ def changes_table(
         *(
             text
             for title, unit in titles.values()
-            for text in (f"base: {title} [{unit}]", "change")
+            for text in (f"{whom}: {title} [{unit}]", "change")
         ),
     ]
     return page_table(head, lines, words=len(names) + 1)

@@ -206,6 +206,7 @@ PARTS: Mapping[str, Part] = {
         "learned_posture_1600ms",
         "learned_posture_1100ms",
     ),
+    "learning at 3 s": _of(learning_in_short, "learned_walker"),
     "published controllers": _of_standings(walks.published_controllers),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
