@@ -1,7 +1,7 @@
 """How this project is installed: from a checkout or as a package, and what of it is where."""
 
 import re
-from importlib.metadata import PackageNotFoundError, PackagePath, files, requires
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 _DISTRIBUTION = "elastic-env"
@@ -35,31 +35,3 @@ def _packages_of(extra: str) -> list[str]:
     parts = [requirement.partition(";") for requirement in known]
     of_extra = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
     return [f"'{name.strip()}'" for name, _, marker in parts if of_extra.search(marker)]
-
-
-def configurations_are(file: Path) -> str:
-    """Sentence for an error about a missing file: where the configurations are, or empty.
-
-    Args:
-        file: The one that was named.
-    """
-    root = checkout()
-    own = None if root is None else root / "configs" / file.name
-    if own is not None and own.is_file():
-        return f"; that of elastic-env is {own}"
-    if file.parent.name != "configs":
-        return ""
-    if own is not None:
-        return f"; those of elastic-env are in {own.parent}"
-    shipped = [str(found.locate()) for found in _files() if found.suffix == ".yaml"]
-    return (
-        "; the folder configs is in the source of elastic-env and not in the installed package:"
-        f" copy it from there. With the package come {', '.join(shipped) or 'none'}"
-    )
-
-
-def _files() -> list[PackagePath]:
-    try:
-        return list(files(_DISTRIBUTION) or [])
-    except PackageNotFoundError:
-        return []
