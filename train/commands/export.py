@@ -7,7 +7,6 @@ import tyro
 from rich.console import Console
 
 from elastic_env.core.config import Model, load_yaml
-from train.learn.export import export_zip
 from train.learn.train_config import TrainConfig
 from train.runs.folders import own_folder
 from train.runs.presets import find_configuration
@@ -35,6 +34,8 @@ class Export(Model):
 
     def run(self, console: Console) -> None:
         """Export."""
+        from train.learn.export import export_zip  # help comes without torch
+
         config = load_yaml(find_configuration(self.config, "training"), TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
