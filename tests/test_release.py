@@ -5,7 +5,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
+import elastic_env
 from elastic_env.core.errors import ConfigurationError
 from tests.release import NOWHERE, absolute_links, require_absolute_links, version_of
 
@@ -60,3 +62,14 @@ def test_the_tag_is_that_of_the_version() -> None:
     for tag in (version, "v0.0.0"):
         with pytest.raises(ConfigurationError, match=rf"has the tag v{version}, got '{tag}'"):
             version_of(tag)
+    assert version == elastic_env.__version__
+
+
+def test_hooks_check_with_the_pinned_ruff() -> None:
+    """Catches hooks that format as another version does."""
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    revisions = {
+        repository["repo"].rpartition("/")[2]: repository["rev"] for repository in hooks["repos"]
+    }
+    pinned = re.findall(r"^ruff==(.+)$", (ROOT / "constraints.txt").read_text(), flags=re.MULTILINE)
+    assert [revisions["ruff-pre-commit"]] == [f"v{version}" for version in pinned]
