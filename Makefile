@@ -13,12 +13,12 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format typecheck bench residuals docs clean
+.PHONY: help demo test test-all lint format typecheck bench residuals docs release-check clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
 	@echo
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 	@echo
 	@echo "The first call sets up $(VENV), which takes some minutes; later calls install nothing. Variables:"
 	@echo
@@ -62,6 +62,9 @@ docs: $(STAMP) ## Build the site into docs/_build/html and run the tutorials; wa
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[docs]'
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
+
+release-check: $(STAMP) ## Build sdist and wheel into dist/, and try the wheel in an empty environment
+	$(if $(REPOSITORY),REPOSITORY=$(REPOSITORY)) $(BIN)/python -m tests.release $(ARGS)
 
 clean: ## Remove the virtual environment and all caches; results under runs/ stay
 	rm -rf $(VENV) build dist docs/_build docs/generated *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from elastic_env.core.installed import own_package
 from elastic_env.rendering.headless import prefer_egl
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ _HOMES = {
     "make_elastic": "elastic_env.joint.make_elastic",
     "small_servo": "elastic_env.joint.small_servos",
 }
+_BESIDE = ("baselines", "train")
+"""Packages that are here by name too: `from elastic_env import baselines`."""
 
 
 def __getattr__(name: str) -> Any:
@@ -62,6 +65,8 @@ def __getattr__(name: str) -> Any:
 
     A process beside the control loop imports this package too.
     """
+    if name in _BESIDE:
+        return own_package(name)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -9,7 +9,7 @@ import yaml
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.commands.bench import BenchConfig, configuration
+from train.commands.bench import BenchConfig, annotation, configuration
 from train.commands.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -21,6 +21,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results of a test go to its own folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
+    monkeypatch.delenv("GITHUB_ACTIONS", raising=False)
 
 
 def written(**case: Any) -> Path:
@@ -71,6 +72,40 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     assert f"link_error_rms_rad is {accepted:.4g}, at most" in capsys.readouterr().out
     assert Path("summary.md").read_text().count("## elastic bench") == 2
     assert "falls short" in Path("summary.md").read_text()
+
+
+def test_what_falls_short_stands_first_and_is_an_annotation(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a failure at the end of a long table, a change of the wrong sign, and options that
+    the policy does not get."""
+    kept = {"env": "testbed", "policy": "input", "reference": QUICK}
+    kept["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 9.0}
+    soft = {**kept, "options": {"stiffness_scale": 0.5}}
+    soft["figures"] = {"link_error_rms_rad": 9.0, "link_error_peak_rad": 1e-4}
+    Path("bench.yaml").write_text(yaml.safe_dump({"cases": [kept, soft]}))
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    assert failed(["bench.yaml"])
+    said = capsys.readouterr().out.splitlines()
+    (error,) = (line for line in said if line.startswith("::error file=bench.yaml,title="))
+    assert "link_error_peak_rad is" in error
+    figures = json.loads(Path("runs/bench/bench.json").read_text())
+    plain, scaled = (one["measured"] for one in figures if one["metric"] == "link_error_peak_rad")
+    assert scaled != plain  # the same episode, so the options alone differ
+    table = Path("runs/bench/bench.md").read_text().splitlines()
+    rows = [line for line in table if "link_error" in line or "testbed" in line]
+    assert "stiffness_scale" in rows[0]
+    assert "falls short" in rows[1]
+    assert f"+{100 * (scaled / 1e-4 - 1):.1f} %" in rows[1]
+    assert all("kept" in line for line in rows[2:] if "link_error" in line)
+    assert all("-99.9 %" in line for line in rows[2:] if "link_error" in line)
+
+
+def test_an_annotation_is_one_command_whatever_it_says() -> None:
+    """Catches a path or a message that ends the command early."""
+    made = annotation("50 % of\na: b, c", Path("a,b:c.yaml"))
+    place, message = "a%2Cb%3Ac.yaml", "50 %25 of%0Aa: b, c"
+    assert made == f"::error file={place},title=elastic bench::{message}"
 
 
 def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
-from train.commands.cli import main
+from train.commands.cli import COMMANDS, main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import PolicyFailedError, policy_errors
 from train.runs.failures import EndedError, explain
@@ -406,3 +406,9 @@ def test_an_extra_that_is_not_installed_is_one_sentence(tmp_path: Path) -> None:
         assert said.endswith("ended with 2"), said
         assert f"pip install -c constraints.txt '.[{extra}]'" in said
         assert "Traceback" not in said
+
+
+def test_help_comes_without_any_extra(tmp_path: Path) -> None:
+    """Catches a command whose options import what only its work needs."""
+    asked = [(None, [command, "--help"]) for command in COMMANDS.split()]
+    assert several(*asked, first=BLOCKED, cwd=tmp_path) == ["ended with 0"] * len(asked)

@@ -1,9 +1,7 @@
 """Messages: a user's text stays short in them, and what is missing is where they say."""
 
 import difflib
-import os
 from collections.abc import Callable
-from importlib.metadata import PackagePath
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -173,34 +171,4 @@ def test_an_extra_is_installed_as_this_project_is(monkeypatch: pytest.MonkeyPatc
     assert (
         said == "training needs the package torch; install it with: pip install 'torch>=2.13'"
         " 'cmaes>=0.13'"
-    )
-
-
-def test_configurations_are_where_a_message_says(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Catches a user outside of the checkout who is told that there is no file, and not where
-    they are."""
-    monkeypatch.chdir(tmp_path)
-    root = Path(__file__).parents[1]
-
-    def said(file: str) -> str:
-        with pytest.raises(ElasticError) as caught:
-            load_yaml(file, CompareConfig)
-        return str(caught.value)
-
-    found = said("configs/paper.yaml")
-    assert (
-        found == "no configuration file at configs/paper.yaml; that of elastic-env is"
-        f" {root / 'configs/paper.yaml'}"
-    )
-    assert said("configs/papr.yaml").endswith(f"; those of elastic-env are in {root / 'configs'}")
-    assert said("mine.yaml") == "no configuration file at mine.yaml"
-    monkeypatch.setattr(installed, "checkout", lambda: None)
-    own = PackagePath("train/commands/bench.yaml")
-    own.dist = SimpleNamespace(locate_file=lambda path: Path(os.sep, "site", path))  # type: ignore[assignment]
-    monkeypatch.setattr(installed, "files", lambda _: [own])
-    assert "the folder configs is in the source of elastic-env" in said("configs/paper.yaml")
-    assert said("configs/paper.yaml").endswith(
-        "With the package come /site/train/commands/bench.yaml"
     )

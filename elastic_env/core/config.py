@@ -19,7 +19,6 @@ from pydantic_core.core_schema import no_info_before_validator_function
 from elastic_env.core.config_problems import ModelError, problems_of
 from elastic_env.core.errors import ConfigurationError, list_names, quote, shorten
 from elastic_env.core.files import read_bounded
-from elastic_env.core.installed import configurations_are
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
@@ -260,6 +259,4 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
 def _found_beside(file: Path) -> str:
     """Files beside one that is not there."""
     known = sorted(map(str, file.parent.glob("*.yaml"))) if file.parent.is_dir() else []
-    if not known:
-        return configurations_are(file)
-    return f"; found beside it: {list_names(known)}"
+    return f"; found beside it: {list_names(known)}" if known else ""

@@ -1,8 +1,11 @@
 """How this project is installed: from a checkout or as a package, and what of it is where."""
 
 import re
-from importlib.metadata import PackageNotFoundError, PackagePath, files, requires
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, requires
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 _DISTRIBUTION = "elastic-env"
 _ROOT = Path(__file__).resolve().parents[2]
@@ -37,29 +40,21 @@ def _packages_of(extra: str) -> list[str]:
     return [f"'{name.strip()}'" for name, _, marker in parts if of_extra.search(marker)]
 
 
-def configurations_are(file: Path) -> str:
-    """Sentence for an error about a missing file: where the configurations are, or empty.
+def own_package(name: str) -> ModuleType:
+    """A package of this project beside `elastic_env`, whose name other files may have too.
 
     Args:
-        file: The one that was named.
+        name: baselines or train.
+
+    Raises:
+        ImportError: Another module of that name stands before it on the path.
     """
-    root = checkout()
-    own = None if root is None else root / "configs" / file.name
-    if own is not None and own.is_file():
-        return f"; that of elastic-env is {own}"
-    if file.parent.name != "configs":
-        return ""
-    if own is not None:
-        return f"; those of elastic-env are in {own.parent}"
-    shipped = [str(found.locate()) for found in _files() if found.suffix == ".yaml"]
-    return (
-        "; the folder configs is in the source of elastic-env and not in the installed package:"
-        f" copy it from there. With the package come {', '.join(shipped) or 'none'}"
-    )
-
-
-def _files() -> list[PackagePath]:
-    try:
-        return list(files(_DISTRIBUTION) or [])
-    except PackageNotFoundError:
-        return []
+    own = _ROOT / name / "__init__.py"
+    spec = find_spec(name)
+    found = spec and spec.origin
+    if found is None or Path(found).resolve() != own:
+        raise ImportError(
+            f"{found or name} stands in the place of the package {name} of elastic-env,"
+            f" {own.parent}; rename it, or take its folder out of the path of imports"
+        )
+    return import_module(name)

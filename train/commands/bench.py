@@ -43,6 +43,8 @@ class BenchCase(Model):
     env: str
     policy: Locator
     """A baseline, residual:PATH, "FILE.py:function" or "module:function"."""
+    options: dict[str, Any] = {}
+    """Options of the policy."""
     scenario: Title = "nominal"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
@@ -54,7 +56,7 @@ class BenchCase(Model):
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        return cell_of(self, PolicySpec(name=self.policy))
+        return cell_of(self, PolicySpec(name=self.policy, options=self.options))
 
 
 class BenchConfig(CodeNamingModel):
@@ -76,8 +78,10 @@ class BenchConfig(CodeNamingModel):
 class Bench(Model):
     """Guard figures in CI: short rollouts of both environments against what was accepted.
 
-    Exit code 1, and a line for every figure that falls short. Appends its table to the file that
-    $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench --update
+    Exit code 1, and a line for every figure that falls short, which stand first in the table. In
+    GitHub's workflows these lines are annotations of the configuration, and the table is appended
+    to the file that $GITHUB_STEP_SUMMARY names. Example, to accept new figures: elastic bench
+    --update
     """
 
     config: Annotated[Path | None, tyro.conf.Positional] = None
@@ -121,10 +125,23 @@ class Bench(Model):
         short = [one for one in figures if one["problem"]]
         if self.update:
             short = [one for one in figures if one["measured"] is None]
+        in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
         for one in short:
-            console.print(f"{one['case']}: {one['problem']}")
+            problem = f"{one['case']}: {one['problem']}"
+            console.print(annotation(problem, path) if in_workflow else problem)
         if short:
             sys.exit(1)
+
+
+def annotation(problem: str, file: Path) -> str:
+    """The command by which GitHub shows a problem at a file of a pull request.
+
+    Its escapes are those of docs.github.com, "Workflow commands": a property may hold neither
+    colons nor commas.
+    """
+    message = problem.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+    place = str(file).replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
+    return f"::error file={place},title=elastic bench::{message}"
 
 
 def configuration(path: Path, update: bool = False) -> Path:
@@ -151,13 +168,14 @@ _Figure = dict[str, Any]
 def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
     (episode,) = found.episodes
     motion = found.condition.reference_name
+    policy = f"{case.policy} {case.options}" if case.options else case.policy
     for metric, accepted in case.figures.items():
         measured = None if episode["termination"] else episode.get(metric)
         if measured is not None and np.isnan(measured):
             measured = None
         bound = None if accepted is None else accepted + margin * abs(accepted)
         yield {
-            "case": f"{case.env}, {motion}, {case.scenario}, {case.policy}",
+            "case": f"{case.env}, {motion}, {case.scenario}, {policy}",
             "metric": metric,
             "measured": measured,
             "accepted": accepted,
@@ -204,9 +222,11 @@ def _child(node: Any, name: str) -> Any:
 
 
 def _table(figures: list[_Figure]) -> Table:
-    titles = ("rollout and figure", "measured", "accepted", "at most", "")
-    heads = [Head(title, is_number=0 < n < 4) for n, title in enumerate(titles)]
+    titles = ("rollout and figure", "measured", "accepted", "at most", "change", "")
+    heads = [Head(title, is_number=0 < n < 5) for n, title in enumerate(titles)]
     rows = []
+    failed = {figure["case"] for figure in figures if figure["problem"]}
+    figures = sorted(figures, key=lambda one: (one["case"] not in failed, not one["problem"]))
     for case, own in group_by(figures, lambda figure: figure["case"]).items():
         rows.append(Row((case,), kind="heading"))
         for figure in own:
@@ -215,6 +235,14 @@ def _table(figures: list[_Figure]) -> Table:
             if figure["bound"] is None and figure["measured"] is not None:
                 verdict = "new"
             texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
-            rows.append(Row((metric, *texts, verdict)))
+            rows.append(Row((metric, *texts, _change(figure), verdict)))
     title = "short rollouts against what was accepted"
     return Table(tuple(heads), tuple(rows), title=title)
+
+
+def _change(figure: _Figure) -> str:
+    """Change of a figure against what was accepted, in per cent; a dash where there is none."""
+    measured, accepted = figure["measured"], figure["accepted"]
+    if measured is None or not accepted:
+        return "-"
+    return f"{100.0 * (measured - accepted) / abs(accepted):+.1f} %"

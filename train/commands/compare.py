@@ -44,6 +44,7 @@ from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
 from train.runs.folders import describe, lock_run, require_run, run_folder
+from train.runs.presets import find_configuration, print_presets
 from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
 from train.workers.executors import LOCAL_EXECUTORS, Executors
@@ -425,23 +426,27 @@ class Compare(Model):
     if it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of
     the package. Intervals are over training seeds, and over the robots of scenarios that draw them.
 
-    Example, one joint: elastic compare configs/testbed.yaml
+    Example, one joint: elastic compare testbed
 
-    Example, the paper's walks: elastic compare configs/paper.yaml
+    Example, the paper's walks: elastic compare paper
 
-    Example, trained residuals: elastic compare configs/learned_testbed.yaml
+    Example, trained residuals: elastic compare learned_testbed
 
-    Example, all policies in tracks by what they need: elastic compare configs/leaderboard.yaml
+    Example, all policies in tracks by what they need: elastic compare leaderboard
 
-    Example, heat maps over two axes: elastic compare configs/map_payload_slope.yaml
+    Example, heat maps over two axes: elastic compare map_payload_slope
     """
 
     config: Annotated[Path | None, tyro.conf.Positional] = None
-    """YAML configuration, see configs/; with --resume the one of the run unless another is
+    """YAML file, or name of a preset; with --resume the configuration of the run unless another is
     named.
     """
+    list_presets: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """List the presets, which are the configurations of the package, and play none."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
+    episodes: int | None = None
+    """Episodes per cell, in place of what the configuration says: 1 for a first look."""
     jobs: int = 0
     """Conditions that run at the same time, 0 for one per core; on hardware they come one after
     the other.
@@ -459,7 +464,10 @@ class Compare(Model):
     hardware: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
-        """Compare."""
+        """Compare, or list the presets."""
+        if self.list_presets:
+            print_presets("comparison", console)
+            return
         if self.resume is not None and self.output is not None:
             problem = "a run goes on in its own folder: --resume takes no --output"
             raise ConfigurationError(problem)
@@ -467,12 +475,18 @@ class Compare(Model):
             problem = "--fresh needs --resume; a new run plays all of its cells"
             raise ConfigurationError(problem)
         if self.config is not None:
-            config = load_yaml(self.config, CompareConfig)
+            config = load_yaml(find_configuration(self.config, "comparison"), CompareConfig)
         elif self.resume is not None:
             config = recorded_config(self.resume, CompareConfig, self.trust_code)
         else:
-            problem = "name a configuration or, with --resume, the run to go on with"
+            problem = (
+                "name a configuration or a preset, which --list shows, or, with --resume, the run"
+                " to go on with"
+            )
             raise ConfigurationError(problem)
+        if self.episodes is not None:
+            with name_options():
+                config = config.replace(episodes=self.episodes, scenario_episodes={})
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}

@@ -223,14 +223,14 @@ class Sb3(Model):
 
     Loading that folder runs no code.
 
-    Example: elastic export sb3 model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl
+    Example: elastic export sb3 model.zip train_walker_3s --normaliser normaliser.pkl
         --trust-pickle
     """
 
     model: Annotated[Path, tyro.conf.Positional]
     """Zip of model.save()."""
     config: Annotated[Path, tyro.conf.Positional]
-    """Configuration of its training: algorithm, base, settings."""
+    """Configuration of its training, a file or a preset: algorithm, base, settings."""
     normaliser: Path | None = None
     """File of VecNormalize.save(); leave it out where observations were not normalised."""
     trust_pickle: bool = False
@@ -245,8 +245,9 @@ class Sb3(Model):
         from train.learn.export import export_zip
         from train.learn.train_config import TrainConfig
         from train.runs.folders import own_folder
+        from train.runs.presets import find_configuration
 
-        config = load_yaml(self.config, TrainConfig)
+        config = load_yaml(find_configuration(self.config, "training"), TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         console.print(f"play it as residual:{folder}")

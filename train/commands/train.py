@@ -11,13 +11,14 @@ from elastic_env.core.errors import ConfigurationError
 from train.commands.options import name_options
 from train.learn.run_training import resume, start
 from train.learn.train_config import TrainConfig
+from train.runs.presets import find_configuration, print_presets
 from train.workers.executors import Executors
 
 
 class Train(Model):
     """Train a residual on top of a base policy, for every training seed of a configuration.
 
-    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train
+    Example: elastic train train_walker_3s, and if it was interrupted: elastic train
     --resume runs/NAME. The seeds of several configurations share the workers: elastic train a.yaml
     b.yaml --jobs 4. Each configuration has a run of its own. It keeps, for every seed, checkpoint/
     to go on from, best/ and last/ as policies, which elastic evaluate and compare take as
@@ -25,7 +26,9 @@ class Train(Model):
     """
 
     config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Configurations, one or more; those in configs/train_*.yaml are examples."""
+    """YAML files or names of presets, one or more."""
+    list_presets: Annotated[bool, tyro.conf.arg(name="list")] = False
+    """List the presets, which are the configurations of the package, and train none."""
     resume: tuple[Path, ...] = ()
     """Folders of runs to go on with."""
     seeds: list[int] | None = None
@@ -50,10 +53,14 @@ class Train(Model):
     """
 
     def run(self, console: Console) -> None:
-        """Train, or go on with it."""
+        """Train, go on with it, or list the presets."""
+        if self.list_presets:
+            print_presets("training", console)
+            return
         if bool(self.config) == bool(self.resume):
             raise ConfigurationError(
-                "name either configurations or, with --resume, the runs to go on with"
+                "name either configurations or presets, which --list shows, or, with --resume, the"
+                " runs to go on with"
             )
         given = {"seeds": self.seeds, "decisions": self.decisions}
         changes = {name: value for name, value in given.items() if value is not None}
@@ -67,7 +74,8 @@ class Train(Model):
         if self.resume:
             folders = resume(self.resume, console, executors, self.trust_code)
         else:
-            configs = [load_yaml(file, TrainConfig) for file in self.config]
+            files = [find_configuration(file, "training") for file in self.config]
+            configs = [load_yaml(file, TrainConfig) for file in files]
             with name_options():
                 configs = [config.replace(**changes) for config in configs]
             folders = start(configs, console, self.output, executors)

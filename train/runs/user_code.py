@@ -10,7 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
@@ -38,6 +38,16 @@ TELLING = {
 """Command of each kind, and keys that no other kind has."""
 
 
+def kind_of(values: Mapping[str, Any]) -> str:
+    """The kind of configuration, one of `TELLING`, that most of the keys tell of."""
+    return max(TELLING, key=lambda kind: _count_telling(values, kind))
+
+
+def _count_telling(values: Mapping[str, Any], kind: str) -> int:
+    """How many of the keys only configurations of a kind have."""
+    return len(set(values).intersection(TELLING[kind][1].split()))
+
+
 def is_a(kind: str) -> Callable[[Any], Any]:
     """A check of raw parameters: they are of a kind, or of none in particular.
 
@@ -46,13 +56,9 @@ def is_a(kind: str) -> Callable[[Any], Any]:
     """
 
     def check(values: Any) -> Any:
-        given = set(values) if isinstance(values, dict) else set()
-
-        def count(name: str) -> int:
-            return len(given.intersection(TELLING[name][1].split()))
-
-        likely = max(TELLING, key=count)
-        if count(likely) > count(kind):
+        given = values if isinstance(values, dict) else {}
+        likely = kind_of(given)
+        if _count_telling(given, likely) > _count_telling(given, kind):
             command = f"{TELLING[likely][0]} FILE"
             raise ValueError(f"this is the configuration of a {likely}: {command}")
         return values
