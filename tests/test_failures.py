@@ -384,7 +384,9 @@ BLOCKED = """
 import sys
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "stable_baselines3", "imageio", "matplotlib"):
+        if name.split(".")[0] in (
+            "torch", "stable_baselines3", "imageio", "matplotlib", "dynamixel_sdk", "distributed"
+        ):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Blocked())
 """

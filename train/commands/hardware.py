@@ -17,13 +17,10 @@ from rich.markup import escape
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import RANGE_OF_RATES, RATES, require_ids
 from elastic_env.hardware.buses.servo_models import servo_models
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.imu import AttitudeStream
-from elastic_env.hardware.safety.checks import Check as BusCheck
-from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from train.commands.options import MotionOrDefault, OnHardware
@@ -48,6 +45,9 @@ class Scan(Model):
 
     def run(self, console: Console) -> None:
         """Scan; exit code 3 where no servo answers."""
+        # help comes without the SDK of the servos
+        from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+
         rows = []
         for rate in RATES if self.baudrate is None else (self.baudrate,):
             with DynamixelBus(self.port, rate) as bus:
@@ -88,6 +88,11 @@ class Check(Model):
 
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
+        # help comes without the SDK of the servos
+        from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+        from elastic_env.hardware.safety.checks import Check as BusCheck
+        from elastic_env.hardware.safety.checks import check_bus
+
         HardwareSettings(**self.model_dump(exclude={"ids"}))  # checks them
         require_ids(self.ids)
         with DynamixelBus(self.port, self.baudrate) as bus:
