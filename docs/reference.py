@@ -20,8 +20,8 @@ from elastic_env.core.signals import Signal
 from elastic_env.world.scenario import scenario_names
 from train.commands.cli import COMMANDS, main
 
-HARDWARE = ("scan", "check", "run", "emulate")
-"""Parts of the command `hardware`, which have its help."""
+PARTS = {"hardware": ("scan", "check", "run", "emulate"), "export": ("c", "onnx", "sb3")}
+"""Parts of commands, which have their help."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -95,8 +95,8 @@ def commands_page() -> str:
         "Output of `--help`. [Commands](../commands.md) has examples and durations.",
     ]
     for words in [
-        *((command,) for command in COMMANDS.split() if command != "hardware"),
-        *(("hardware", part) for part in HARDWARE),
+        *((command,) for command in COMMANDS.split() if command not in PARTS),
+        *((command, part) for command, parts in PARTS.items() for part in parts),
     ]:
         parts += [f"## elastic {' '.join(words)}", f"```text\n{help_of(*words)}\n```"]
     return "\n\n".join(parts) + "\n"

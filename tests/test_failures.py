@@ -384,9 +384,7 @@ BLOCKED = """
 import sys
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in (
-            "torch", "stable_baselines3", "imageio", "matplotlib", "dynamixel_sdk", "distributed"
-        ):
+        if name.split(".")[0] in ("torch", "stable_baselines3", "imageio", "matplotlib", "onnx"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Blocked())
 """
@@ -395,7 +393,8 @@ sys.meta_path.insert(0, Blocked())
 EXTRAS = [
     (["train", str(CONFIGS / "train_testbed.yaml")], "train"),
     (["speed", "--env", "testbed"], "train"),
-    (["export", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
+    (["export", "sb3", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
+    (["export", "onnx", "residual:x"], "onnx"),
     (["play", "--video", "x.mp4"], "report"),
 ]
 

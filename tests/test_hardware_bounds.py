@@ -43,7 +43,7 @@ def test_only_what_is_known_to_be_within_does_not_exceed(value: float, limit: fl
 
 
 @no_number
-@pytest.mark.parametrize("what", ["position", "velocity", "current"])
+@pytest.mark.parametrize("what", ["position", "velocity", "torque"])
 def test_a_state_that_is_no_number_stops_the_motion_at_once(what: str, value: float) -> None:
     """Catches a measurement that no limit is exceeded by: `abs(nan) > limit` is False."""
     measured = states([0.0, 0.0])
@@ -264,7 +264,7 @@ def _step(env: Any, times: int) -> None:
 
 TINY = 5e-324
 HUGE = 1e39
-ALLOWED_NEAR_ZERO = ("lowest_rad", "highest_rad", "margin_rad", "patience_cycles")
+ALLOWED_NEAR_ZERO = ("lowest_rad", "highest_rad", "margin_rad", "patience_cycles", "release_s")
 LIMITS = [
     (name, info)
     for name, info in SafetyLimits.model_fields.items()

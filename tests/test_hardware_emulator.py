@@ -157,7 +157,7 @@ def test_emulated_joint_is_the_testbeds_own() -> None:
     """Catches a second model of the plant: at rest the spring carries what gravity asks for."""
     config = TestbedConfig(scenario=make_scenario("ideal"))
     joints = Joints(config, 2, start_s=0.0)
-    joints.set_torque(0, is_on=True)
+    joints.set_torque(0, 1.0)
     for step, share in enumerate(quintic(np.arange(1200) / 500)[0]):
         joints.command(0, 0.5 * float(share))
         joints.advance(0.004 * step)
@@ -168,7 +168,7 @@ def test_emulated_joint_is_the_testbeds_own() -> None:
     assert joints.motion(0)[0] == joints.theta[0]
     assert joints.motion(0)[2] == pytest.approx(torque[0], rel=0.1)
     assert joints.q[1] == 0.0
-    joints.set_torque(0, is_on=False)
+    joints.set_torque(0, 0.0)
     joints.advance(4.9)
     assert joints.motion(0)[2] == 0.0
 

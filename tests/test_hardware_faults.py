@@ -69,6 +69,7 @@ SERVO = [
     Case({"overload": True}, stops="reports a hardware error.*overload"),
     Case({"hot": True}, stops=r"too hot: servo 1 at .*: 95.000 °C, at most 80 °C"),
     Case({"silent": True}, stops="no usable reply"),
+    Case({"same_id": True}, stops="no usable reply"),
     Case({"unplugged": True}, stops="is gone"),
 ]
 IMU = [

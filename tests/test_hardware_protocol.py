@@ -13,17 +13,18 @@ from hypothesis import strategies as st
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.servo_bus import Status
 from elastic_env.hardware.buses.servo_models import (
+    LARGEST_TORQUE_NM,
     NUM_BLOCKS,
-    current_of_torque,
-    explain_errors,
     servo_model,
     servo_models,
-    torque_of_current,
 )
 from elastic_env.hardware.emulator.imu import attitude_packet, checksum
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.settings import SafetyLimits
+from elastic_env.joint.dynamixel import LOSS_NM, TORQUE_PER_CURRENT
+from elastic_env.joint.small_servos import SMALL_SERVOS
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
 EXAMPLES = [
@@ -153,7 +154,7 @@ def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int)
     for block in model.blocks:
         assert block.start in {register.address for register in registers}
         assert block.stop in {register.end for register in registers}
-        for name in ("present_position", "present_velocity", "present_current"):
+        for name in ("present_position", "present_velocity", model.load_register):
             assert block.start <= model.table[name].address < model.table[name].end <= block.stop
 
 
@@ -170,7 +171,7 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
 
         requests = 0
 
-        def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        def _transmit(self, servo_id: int, instruction: int, parameters: bytes) -> None:
             assert (servo_id, instruction) == (packets.BROADCAST, packets.SYNC_READ)
             start, length = (int.from_bytes(parameters[i : i + 2], "little") for i in (0, 2))
             reply = bytearray(length)
@@ -178,12 +179,12 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
             reply[at : at + position.size] = position.encode(self.requests)
             on_the_way.setdefault(self.requests + lateness[self.requests], []).append(bytes(reply))
 
-        def _receive(self) -> tuple[int, int, bytes] | None:
+        def _receive(self) -> Status | None:
             waiting = on_the_way.get(self.requests)
-            return (1, 0, waiting.pop(0)) if waiting else None
+            return Status(1, 0, False, waiting.pop(0)) if waiting else None
 
     bus = Line("nowhere")
-    bus.models = {1: model}
+    bus.attach_known({1: model.number})
     for bus.requests, late in enumerate(lateness):
         states = bus.read_states(0.0)
         assert states.is_fresh.tolist() == [late == 0]
@@ -206,19 +207,35 @@ def test_units_are_the_makers() -> None:
 def test_unknown_names_are_answered_with_those_that_exist() -> None:
     """Catches a KeyError in place of a message."""
     with pytest.raises(HardwareError, match="54024"):
-        servo_model(1020)
+        servo_model(1021)
     with pytest.raises(ConfigurationError, match="goal_position"):
         servo_models()[54024].table["goal_positon"]
     with pytest.raises(HardwareError, match="does not fit"):
         servo_models()[54024].table["goal_torque"].encode(40_000)
-    assert explain_errors(0b100100) == "overheating, overload"
+    assert servo_model(54024).explain_errors(0b100100) == "overheating, overload"
+    assert servo_model(777).explain_errors(0b101000) == "overcurrent, overload"
 
 
-def test_torque_line_runs_both_ways() -> None:
+@pytest.mark.parametrize("number", sorted(servo_models()))
+def test_torque_line_runs_both_ways(number: int) -> None:
     """Catches a sign or an offset that emulator and driver would not share."""
+    model = servo_model(number)
     for torque in (-52.5, -1.0, 0.5, 34.6):
-        assert torque_of_current(current_of_torque(torque)) == pytest.approx(torque)
-    assert torque_of_current(0.3) == 0.0
+        assert model.torque(model.current(torque)) == pytest.approx(torque)
+
+
+def test_the_torque_line_of_the_table_is_that_of_the_joint() -> None:
+    """Catches a figure that is changed in one of two places."""
+    model = servo_model(54024)
+    assert (model.torque_per_ampere, model.loss) == (TORQUE_PER_CURRENT, LOSS_NM)
+    assert model.torque(0.3) == 0.0
+    assert model.largest_torque == LARGEST_TORQUE_NM
+    for name in ("STS3215", "STS3250"):
+        (small,) = (one for one in servo_models().values() if one.name == name)
+        motor = SMALL_SERVOS[name].motor
+        assert small.torque_per_ampere == pytest.approx(motor.torque_constant, rel=1e-3)
+        assert 1e3 * small.current_unit == pytest.approx(motor.voltage / motor.resistance, rel=1e-3)
+        assert small.largest_torque == pytest.approx(0.8 * motor.stall_torque, rel=0.01)
 
 
 def test_ping_of_the_imus_protocol_has_the_makers_checksum() -> None:

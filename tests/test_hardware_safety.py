@@ -42,14 +42,14 @@ pytestmark = once_more
 
 
 def states(
-    position: list[float], velocity: float = 0.0, current: float = 0.0, fresh: bool = True
+    position: list[float], velocity: float = 0.0, torque: float = 0.0, fresh: bool = True
 ) -> States:
     n = len(position)
     values = np.array(position) if fresh else np.full(n, np.nan)
     return States(
         values,
         np.full(n, velocity),
-        np.full(n, current),
+        np.full(n, torque),
         np.full(n, fresh),
         np.zeros(n, dtype=np.bool_),
         0.0,
@@ -122,7 +122,7 @@ def test_what_is_measured_stops_the_motion(measured: States, words: str) -> None
 def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
     """Catches a stop at one spike of the current, and none under a load that stays."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
-    strained = states([0.0], current=-12.0)
+    strained = states([0.0], torque=-49.4)
     assert [
         guard.check(s) != ""
         for s in (strained, strained, states([0.0]), strained, strained, strained)
@@ -139,8 +139,8 @@ def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
 def test_missing_replies_do_not_hide_too_much_torque() -> None:
     """Catches a load that lasts for ever because every second reply is lost."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
-    strained = states([0.0], current=-12.0)
-    missing = states([np.nan], current=np.nan, fresh=False)
+    strained = states([0.0], torque=-49.4)
+    missing = states([np.nan], torque=np.nan, fresh=False)
     reasons = [guard.check(s) for s in (strained, missing, strained, missing, strained)]
     assert reasons[:4] == [""] * 4
     assert "torque exceeds 40 N·m: it: " in reasons[4]
@@ -481,10 +481,10 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
 
 def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
     """Catches registers of one model written to another."""
-    with RunningEmulator(EmulatorConfig(claimed_model_number=1020)) as strange:
+    with RunningEmulator(EmulatorConfig(claimed_model_number=1021)) as strange:
         with (
             DynamixelBus(strange.port) as bus,
-            pytest.raises(HardwareError, match="no control table for model number 1020"),
+            pytest.raises(HardwareError, match="no control table for model number 1021"),
         ):
             bus.attach([1])
         assert strange.events() == []

@@ -20,6 +20,7 @@ import pytest
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import Packet, Parser
+from elastic_env.hardware.buses.servo_bus import Status
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.errors import BusGoneError, ReplyError
@@ -84,7 +85,7 @@ class Line(DynamixelBus):
         if (name, value) == ("torque_enable", 1):
             self.goals_at_torque_on.append(self.servos[servo_id].goal - self.motions[servo_id][0])
 
-    def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+    def _transmit(self, servo_id: int, instruction: int, parameters: bytes) -> None:
         self._is_gone |= instruction == self.gone_at
         if self._is_gone:
             self._refusals += 1  # a lost port tells of its loss in other words the second time
@@ -102,11 +103,13 @@ class Line(DynamixelBus):
                 reply for reply in Parser().parse(wire) if reply.servo_id not in self.silent
             ]
 
-    def _receive(self) -> tuple[int, int, bytes] | None:
+    def _receive(self) -> Status | None:
         if not self._coming:
             return None
         reply = self._coming.popleft()
-        return reply.servo_id, reply.parameters[0], reply.parameters[1:]
+        error = reply.parameters[0]
+        has_alert = bool(error & packets.ALERT)
+        return Status(reply.servo_id, error & ~packets.ALERT, has_alert, reply.parameters[1:])
 
     def _wait_for_silence(self) -> None:
         pass
@@ -262,7 +265,7 @@ def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(
     other."""
     log: list[tuple[str, int]] = []
     lines = {"one": attached("one", 1, 2, log=log), "two": attached("two", 3, log=log)}
-    monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda port, _: lines[port])
+    monkeypatch.setitem(supervised_bus.BUSES, "dynamixel", lambda port, _: lines[port])
     ports = {"one": [1, 2], "two": [3]}
     for line in lines.values():
         line.write_all("torque_enable", dict.fromkeys(line.ids, 1))
@@ -281,7 +284,7 @@ def test_emergency_stop_without_models_takes_those_that_answer(
 ) -> None:
     """Catches one servo without power that keeps all others under torque."""
     line = attached("one", 1, 2)
-    monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda *_: line)
+    monkeypatch.setitem(supervised_bus.BUSES, "dynamixel", lambda *_: line)
     line.write_all("torque_enable", {1: 1, 2: 1})
     line.silent = {1}
     said = emergency_stop({"one": [1, 2]})
@@ -308,8 +311,8 @@ def test_an_error_number_that_nobody_knows_is_no_success() -> None:
     """Catches a refusal that passes as done because the protocol's list ends at 7."""
 
     class Strange(Line):
-        def _receive(self) -> tuple[int, int, bytes] | None:
-            return 1, 9, b""
+        def _receive(self) -> Status | None:
+            return Status(1, 9, False, b"")
 
     line = Strange("one", 1)
     line.attach_known({1: 54024})

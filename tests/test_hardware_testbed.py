@@ -22,7 +22,6 @@ import pytest
 import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses.bus import States
-from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, SharedSample
@@ -338,7 +337,7 @@ def test_the_last_step_tells_of_itself_and_not_of_the_way_back(still: StillBus) 
     assert still.goal == 0.0
     assert info["period"] == pytest.approx(0.004)
     assert torques[-1] == pytest.approx(torques[-2], abs=0.1)
-    assert torques[-1] == pytest.approx(torque_of_current(1.0 + info["reference_angle"] + 0.2))
+    assert torques[-1] == pytest.approx(1.0 + info["reference_angle"] + 0.2)
 
 
 def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(

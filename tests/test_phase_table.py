@@ -26,7 +26,16 @@ from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.world.robot_model import RobotModel
 from elastic_env.world.scenario import make_scenario
-from train.learn.phase_table import Harmonics, Search, Walks, corrected, find, probe
+from train.learn.phase_table import (
+    Harmonics,
+    Play,
+    Search,
+    Walks,
+    best,
+    corrected,
+    find,
+    probe,
+)
 
 PERIOD_S = 1.1
 PAIRS = np.random.default_rng(0).uniform(-0.01, 0.01, (4, 3, 2)).round(5)
@@ -190,6 +199,20 @@ def test_the_table_lowers_the_zmp_deviation_of_robots_that_it_was_not_found_on()
             deviations.append(info["zmp_deviation"])
         left[name] = float(np.sqrt(np.nanmean(np.square(deviations[250:]))))
     assert left["phase_table"] < 0.95 * left["foothold"]
+
+
+def test_the_best_table_counts_and_not_the_last_one() -> None:
+    """Catches a search that went too far, weights that forget a unit, and a robot that fell."""
+    none = Harmonics(np.zeros((2, 1, 2), dtype=np.complex128))
+    still = {"zmp_x": 5e-3, "zmp_y": 5e-3, "hip_roll": 1e-3, "hip_pitch": 1e-3, "fell": 0.0}
+    plays = [
+        Play(none, none, still),
+        Play(none, none, still | {"zmp_y": 4e-3}),
+        Play(none, none, still | {"zmp_y": 3e-3, "hip_roll": 1.5e-3}),
+        Play(none, none, still | {"zmp_y": 1e-3, "fell": 1.0}),
+    ]
+    assert plays[0].cost == pytest.approx(4.0)
+    assert best(plays) is plays[1]
 
 
 @pytest.mark.slow

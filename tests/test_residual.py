@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import subprocess
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -420,7 +419,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     venv.save("normaliser.pkl")
     given = {"env": "testbed", "base": "input", "settings": env.settings.model_dump(mode="json")}
     Path("c.yaml").write_text(json.dumps(given))
-    arguments = ["export", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
+    arguments = ["export", "sb3", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
     loaded = []
     monkeypatch.setattr(
         "train.learn.export.algorithm_class", lambda name: loaded.append(name) or PPO
@@ -447,7 +446,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     )
     Path("no.zip").write_bytes(b"nothing")
     with pytest.raises(SystemExit):
-        main(["export", "no.zip", "c.yaml", "--trust-pickle"])
+        main(["export", "sb3", "no.zip", "c.yaml", "--trust-pickle"])
     assert "no.zip is no model" in capsys.readouterr().err
 
 
@@ -582,8 +581,11 @@ def test_residuals_that_come_with_the_package_are_found_by_name(
     out."""
     monkeypatch.chdir(tmp_path)
     robot = read_description(Path(name)).robot
-    arm = partial(gymnasium.make, "elastic_env/Robot-v0", sensors=["link_encoder"])
-    policy: Any = baselines.make(f"residual:{name}", arm() if robot == "robot" else scalar(robot))
+    walk = {"step_period": 1.1, "num_steps": 1}  # which has a table over the phase
+    options = {"robot": {"sensors": ["link_encoder"]}, "walker": walk}
+    kinds = {"robot": "elastic_env/Robot-v0", "walker": WALKER, "testbed": TESTBED}
+    env = gymnasium.make(kinds[robot], **options.get(robot, {}))
+    policy: Any = baselines.make(f"residual:{name}", env)
     assert policy.corrected.settings == read_description(Path(name)).settings
 
 

@@ -787,12 +787,13 @@ NAMES = (
     "robot",
     "demo",
 )
-OF_HARDWARE = ("scan", "check", "run", "emulate")
-
-
-@pytest.mark.parametrize(
-    "command", [*((name,) for name in NAMES), *(("hardware", name) for name in OF_HARDWARE)]
+PARTS = (
+    *(("hardware", name) for name in ("scan", "check", "run", "emulate")),
+    *(("export", name) for name in ("c", "onnx", "sb3")),
 )
+
+
+@pytest.mark.parametrize("command", [*((name,) for name in NAMES), *PARTS])
 def test_every_command_has_help_and_refuses_what_it_does_not_know(
     command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -164,12 +164,12 @@ class GravityCompensator(Compensator):
         require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
         self.stiffness = model.stiffness
-        self._servo_compliance = model.servo_compliance
-        self._per_deflection = 1.0 + self.stiffness * self._servo_compliance
+        self.servo_compliance = model.servo_compliance
+        self._per_deflection = 1.0 + self.stiffness * self.servo_compliance
         self.gravity = make_gravity(model, method)
         """τ_g of the desired posture."""
         self._load: Any = self.gravity  # of the measured posture
-        self._output = output
+        self.output = output
         if output == "wrench":
             if not isinstance(model, WalkerModel):
                 raise ConfigurationError(
@@ -196,7 +196,7 @@ class GravityCompensator(Compensator):
 
     @override
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        compliance = self._servo_compliance
+        compliance = self.servo_compliance
         return input_offset(motion.q, self.stiffness, self.gravity, compliance), memory
 
     @override
@@ -207,14 +207,14 @@ class GravityCompensator(Compensator):
     @override
     def link_angle(self, theta: Array, memory: Array | None = None) -> Array:
         """Estimate of q from the encoders, (num_worlds, n) [rad]; it needs no memory."""
-        if self._output == "none":
+        if self.output == "none":
             return theta
-        solve = newton_link_angle if self._output == "newton" else taylor_link_angle
+        solve = newton_link_angle if self.output == "newton" else taylor_link_angle
         return solve(theta, self.stiffness, self._load)
 
     def deflection_by_tilt(self, theta: Array) -> Parameter:
         """What the measured tilt of a walker's pelvis adds to Eq. 12, (num_worlds, n) [rad]."""
-        if self._load is self.gravity or self._output == "wrench":
+        if self._load is self.gravity or self.output == "wrench":
             return 0.0
         tilted = self._load.solve(theta, self.stiffness)
         return tilted - self.gravity.solve(theta, self.stiffness)
@@ -225,7 +225,7 @@ class GravityCompensator(Compensator):
 
         It is the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇.
         """
-        if self._output == "none":
+        if self.output == "none":
             return theta_dot
         q = self.link_angle(theta)
         return _solve(self._load, q, self.stiffness, self.stiffness * theta_dot)
@@ -475,6 +475,8 @@ class CompensatedMemory(NamedTuple):
 class Compensated(PolicyAround):
     """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
 
+    Attribute `ramp` is the share of the compensation after 0, 1, ... control steps, up to 1.
+
     The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees
     the estimated link angle and rate where the observation has the encoder's; the compensator's
     offset for q_d is added to its action. The compensation grows from zero in the first `ramp_s` of
@@ -503,7 +505,7 @@ class Compensated(PolicyAround):
         self.compensator = compensator
         self._theta = model.observation_table.group("encoder_angle")
         self._corrects_policy = corrects_policy
-        self._ramp = Ramp(model, ramp_s).table
+        self.ramp = Ramp(model, ramp_s).table
         self._plan: tuple[WalkView, Any] | None = None
         if isinstance(model, WalkerModel):
             self._plan = WalkView(model.observation_table), planned_feet(model.plan)
@@ -548,7 +550,7 @@ class Compensated(PolicyAround):
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, own)
         steps = memory.steps + 1
-        total = wanted + self._ramp.take(steps, mode="clip") * offset
+        total = wanted + self.ramp.take(steps, mode="clip") * offset
         memory = CompensatedMemory(steps, links.copy(), own, inner)
         return total.astype(np.float32), memory
 

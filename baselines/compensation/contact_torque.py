@@ -110,6 +110,10 @@ LOADS = loads_type(2)
 class ContactGravity:
     """Gravity torque of a walker under the planned load share, by one of the methods of the module.
 
+    Attributes:
+        chains: Its legs.
+        contact: Row of `CONTACT`, (1,).
+
     Args:
         model: Assumed walker.
         method: "com", "ankle" or "lumped".
@@ -118,10 +122,10 @@ class ContactGravity:
     def __init__(self, model: WalkerModel, method: ContactMethod = "com") -> None:
         biped = model.biped
         self._view = WalkView(model.observation_table)
-        self._chains = biped.weightless_chains if method == "lumped" else biped.chains
+        self.chains = biped.weightless_chains if method == "lumped" else biped.chains
         robot = (biped.gravity, biped.chains.mass, biped.ankle_height)
         contact = (*robot, model.control_period_s, method == "com")
-        self._contact: Any = np.array([contact], CONTACT)
+        self.contact: Any = np.array([contact], CONTACT)
         self._feet = planned_feet(model.plan)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
@@ -137,8 +141,8 @@ class ContactGravity:
         """The gravity torques of `at` for a level pelvis, and for one tilted as the IMU says."""
         level = np.empty(len(rows), LOADS)
         tilted = np.empty(len(rows), LOADS)
-        planned_loads(self._view.fields(rows), self._contact, self._feet, level, tilted)
-        return LegTorque(self._chains, level), LegTorque(self._chains, tilted)
+        planned_loads(self._view.fields(rows), self.contact, self._feet, level, tilted)
+        return LegTorque(self.chains, level), LegTorque(self.chains, tilted)
 
 
 class WrenchTorque:

@@ -57,6 +57,10 @@ class FrictionMemory(NamedTuple):
 class FrictionCompensation:
     """Torque that moves links against the dry friction of their joints.
 
+    Attributes:
+        dead_zone: Displacement to either side that leaves the direction as it is, (n,) [rad]. The
+            arguments are attributes too.
+
     Args:
         coulomb: F₀, (n,) [N·m].
         load_ratio: c, (n,) [1].
@@ -67,11 +71,11 @@ class FrictionCompensation:
     def __init__(
         self, coulomb: Array, load_ratio: Array, static: Array, stribeck_speed: Array
     ) -> None:
-        self._coulomb = coulomb
-        self._load_ratio = load_ratio
-        self._static = static
-        self._stribeck_speed = stribeck_speed
-        self._dead_zone = DEAD_ZONE_RAD * ((load_ratio > 0.0) | (static > 0.0))
+        self.coulomb = coulomb
+        self.load_ratio = load_ratio
+        self.static = static
+        self.stribeck_speed = stribeck_speed
+        self.dead_zone = DEAD_ZONE_RAD * ((load_ratio > 0.0) | (static > 0.0))
 
     def begin(self, shape: tuple[int, ...]) -> FrictionMemory:
         """Memory before any motion, for links of this shape: friction holds neither side."""
@@ -81,9 +85,9 @@ class FrictionCompensation:
     def follow(self, displacement: Array, memory: FrictionMemory) -> FrictionMemory:
         """Memory after the reference has moved by Δq, (..., n) [rad]."""
         way = memory.slack + displacement
-        moved = way - way.clip(-self._dead_zone, self._dead_zone)
+        moved = way - way.clip(-self.dead_zone, self.dead_zone)
         return FrictionMemory(
-            coulomb=presliding_friction(memory.coulomb, moved, self._coulomb),
+            coulomb=presliding_friction(memory.coulomb, moved, self.coulomb),
             direction=presliding_friction(memory.direction, moved, 1.0),
             slack=way - moved,
         )
@@ -97,17 +101,17 @@ class FrictionCompensation:
             memory: After the displacement.
         """
         known = self._known(torque, speed, memory)
-        return passed_torque(known, memory.direction, 0.0, self._load_ratio)
+        return passed_torque(known, memory.direction, 0.0, self.load_ratio)
 
     def share(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """∂τ_J/∂τ, (..., n) [1]; arguments as of `passed`."""
         known = self._known(torque, speed, memory)
-        return 1.0 / (1.0 - memory.direction * self._load_ratio * np.sign(known))
+        return 1.0 / (1.0 - memory.direction * self.load_ratio * np.sign(known))
 
     def most_passed(self, torque: Array) -> Array:
         """Largest τ_J under loads of either sign at rest, (..., n) [N·m] to (..., n) [N·m]."""
-        friction = self._coulomb + self._static
-        return passed_torque(np.abs(torque), 1.0, friction, self._load_ratio)
+        friction = self.coulomb + self.static
+        return passed_torque(np.abs(torque), 1.0, friction, self.load_ratio)
 
     def _known(self, torque: Array, speed: Array, memory: FrictionMemory) -> Array:
         """Load with the friction that does not grow with it, (..., n) [N·m]."""
@@ -115,7 +119,7 @@ class FrictionCompensation:
             speed,
             load=torque,
             coulomb=0.0,
-            static=self._static,
-            stribeck_speed=self._stribeck_speed,
+            static=self.static,
+            stribeck_speed=self.stribeck_speed,
         )
         return torque + memory.coulomb + memory.direction * excess

@@ -19,6 +19,7 @@ servo is taken off, too.
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -92,6 +93,40 @@ _CALM_RAD_S = 0.02
 """Jump of a command that is worth a word, and a rate of the command that is not [rad], [rad/s]."""
 # without the checks of lu_factor, which take longer
 _factored, _solved = get_lapack_funcs(("getrf", "getrs"))
+
+
+@dataclass(frozen=True)
+class CompensatorConstants:
+    """What a compensator computes with, for programs in other languages.
+
+    Attributes:
+        model: Compiled rigid model.
+        body: Its links and springs; without a load they are `body.tree`.
+        tip: Number of the body that carries a payload where none is named.
+        compliance: 1/K, zero for a rigid joint, (n,) [rad/(N·m)].
+        of_command: The same and 1/k_p of the servo, (n,) [rad/(N·m)].
+        lowest, highest: Joint ranges, infinite without one, (n,) each [rad].
+        limit_rad: Largest offset [rad].
+        ramp_steps: Commands in which an offset or a payload is taken over; 0 for at once.
+        period_s: Time between two commands [s].
+        friction: What is known of dry friction; None where it is not compensated.
+        viscous: Viscous friction, used with dry friction alone, (n,) [N·m·s/rad].
+        lag_s: Lag of the servos, likewise, (n,) [s].
+    """
+
+    model: mujoco.MjModel
+    body: RigidBody
+    tip: int
+    compliance: Array
+    of_command: Array
+    lowest: Array
+    highest: Array
+    limit_rad: float
+    ramp_steps: int
+    period_s: float
+    friction: FrictionCompensation | None
+    viscous: Array
+    lag_s: Array
 
 
 class PositionCompensator:
@@ -197,6 +232,25 @@ class PositionCompensator:
         if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
             given = _of_file(compiled, Path(stiffness), options.get("joints"))
         return cls(compiled, given, **options)
+
+    @property
+    def constants(self) -> CompensatorConstants:
+        """What it computes with."""
+        return CompensatorConstants(
+            model=self._model,
+            body=self._links,
+            tip=self._tip,
+            compliance=self._compliance,
+            of_command=self._of_command,
+            lowest=self._lowest,
+            highest=self._highest,
+            limit_rad=self._limit,
+            ramp_steps=self._steps if self._ramp > 0.0 else 0,
+            period_s=self._period_s,
+            friction=self._friction,
+            viscous=self._viscous,
+            lag_s=self._lag_s,
+        )
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""

@@ -142,6 +142,8 @@ class Channels:
         signals: The numbers of a residual, (k,), as signals; those that left and right share have
             no side.
         bounds: Bound of every column, (width,); zero where the residual does not act.
+        source: Number of the residual that each column follows, (width,).
+        columns: What the columns are, (width,).
 
     Raises:
         ConfigurationError: A joint or an axis that does not exist, or a joint without a bound.
@@ -165,8 +167,10 @@ class Channels:
             bounds += of_input
             self._columns[name] = slice(first, len(bounds))
         self.bounds = np.array(bounds)
+        acts_on = [named_inputs.input_signals(name, model) for name in settings.acts_on]
+        self.columns = tuple(signal for of_input in acts_on for signal in of_input)
         order = {name: number for number, name in enumerate(signals)}
-        self._source = np.array([order.get(source or "", 0) for source in sources])
+        self.source = np.array([order.get(source or "", 0) for source in sources])
         named = [replace(signal, name=name) for name, signal in signals.items()]
         self.signals = tuple(replace(signal, low=-1.0, high=1.0) for signal in named)
 
@@ -178,7 +182,7 @@ class Channels:
             residual: Within [−1, 1], (num_worlds, k).
             share: 1 for all of the way.
         """
-        return values + share * (self.bounds * residual[:, self._source] - values)
+        return values + share * (self.bounds * residual[:, self.source] - values)
 
     def parts(self, values: Array) -> dict[str, Array]:
         """Values by input, (..., width) to (..., columns of the input)."""

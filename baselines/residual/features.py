@@ -17,6 +17,7 @@
 """  # noqa: E501
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +64,11 @@ class Features:
     Args:
         corrected: The base and its correction.
 
+    Attributes:
+        signals: Those of the decision.
+        columns: All of them; `NAME@-k` is a measurement of k decisions ago.
+        mirror: Shows steps on the right foot as steps on the left; None without.
+
     Raises:
         ConfigurationError: A name that does not exist, or not for this robot.
     """
@@ -84,11 +90,19 @@ class Features:
         commands = model.observation_table.signals_of("last_command")
         acts = rename_group(commands, BASE_ACTION) if self._acts else ()
         self.signals = (*seen, *acts)
-        self.width = len(self.signals) + self._history * len(self._measured)
-        self._mirror: LeftFirst | None = None
-        if settings.mirror:
-            measured = [seen[i] for i in self._measured]
-            self._mirror = LeftFirst(self.signals, measured, corrected)
+        measured = [seen[i] for i in self._measured]
+        earlier = [
+            replace(signal, name=f"{signal.name}@-{k + 1}")
+            for k in range(self._history)
+            for signal in measured
+        ]
+        self.columns = (*self.signals, *earlier)
+        self.mirror = LeftFirst(self.columns, corrected) if settings.mirror else None
+
+    @property
+    def width(self) -> int:
+        """Number of features."""
+        return len(self.columns)
 
     def begin(self, num_worlds: int) -> FeaturesMemory:
         """Memory before the first decision."""
@@ -133,8 +147,8 @@ class Features:
             action = self._corrected.base_action(rows, state, episode_start)
             parts.append(action.astype(np.float64))
         features = np.hstack([*parts, past])
-        if self._mirror is not None:
-            features = self._mirror(rows, features)
+        if self.mirror is not None:
+            features = self.mirror(rows, features)
         remembered = np.hstack([measured, past])[:, : past.shape[1]]
         return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
@@ -147,9 +161,9 @@ class Features:
             rows: Observations of the decision.
             residual: What was decided by their features.
         """
-        if self._mirror is None:
+        if self.mirror is None:
             return residual
-        return self._mirror.turn_back(rows, residual)
+        return self.mirror.turn_back(rows, residual)
 
 
 def _groups(model: RobotModel) -> list[str]:

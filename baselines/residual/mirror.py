@@ -20,7 +20,7 @@ import numpy as np
 from baselines.compensation.inputs import INPUTS
 from baselines.residual.correction import Corrected
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, Signal
+from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.world.robot_model import WalkerModel
 
 Signals = Sequence[Signal]
@@ -29,7 +29,11 @@ _SIDE = re.compile(r"(?<=\.)[lr]_")
 
 
 class Mirror:
-    """Image of a walker's signals in its mirror.
+    """Image of a walker's signals in its mirror: offset + sign · values[source].
+
+    Attributes:
+        source: Column that takes the place of each, (columns,).
+        sign, offset: What it is times, and what is added to it, (columns,) each.
 
     Args:
         signals: What the columns hold, with the sides l_ and r_ behind a dot.
@@ -47,32 +51,33 @@ class Mirror:
                 f"in the mirror left and right change places, but there is no {', '.join(lacking)};"
                 " observe both, or mirror: false"
             )
-        self._source = np.array([columns[name] for name in others], dtype=np.int64)
-        self._sign = np.array([_sign(signal) for signal in signals])
+        self.source = np.array([columns[name] for name in others], dtype=np.int64)
+        self.sign = np.array([_sign(signal) for signal in signals])
         complements = [signal.mirrored == "complement" for signal in signals]
-        self._offset = np.array(complements, dtype=np.float64)
+        self.offset = np.array(complements, dtype=np.float64)
 
     def __call__(self, values: Array) -> Array:
         """Values in the mirror, (..., columns)."""
-        return self._offset + self._sign * values[..., self._source]
+        return self.offset + self.sign * values[..., self.source]
 
 
 class LeftFirst:
     """Shows steps on the right foot in the mirror, as steps on the left.
 
     Args:
-        signals: The features, earlier measurements left out.
-        measured: The measurements of one earlier decision.
+        signals: All features, with those of earlier decisions.
         corrected: The base and what acts on it.
+
+    Attributes:
+        of_features, of_residual: The mirrors.
 
     Raises:
         ConfigurationError: No walker, a signal without a mirror image, or a joint corrected unlike
             the other leg's.
     """
 
-    def __init__(self, signals: Signals, measured: Signals, corrected: Corrected) -> None:
+    def __init__(self, signals: Signals, corrected: Corrected) -> None:
         model = corrected.model
-        settings = corrected.settings
         if not isinstance(model, WalkerModel):
             found = f"got a {type(model).__name__}; set mirror: false"
             raise ConfigurationError(f"mirror is for a walker, with legs that are alike, {found}")
@@ -88,11 +93,8 @@ class LeftFirst:
                 "mirror needs joints and bounds that are the same on both legs, they are not for"
                 f" {', '.join(unlike)}; name joints without l_ and r_, or mirror: false"
             )
-        self._now = Mirror(signals)
-        self._past = Mirror(measured)
-        self._residual = Mirror(corrected.channels.signals)
-        self._split = len(signals)
-        self._earlier = (settings.history, len(measured))
+        self.of_features = Mirror(signals)
+        self.of_residual = Mirror(corrected.channels.signals)
         self._support = model.observation_table.columns("clock.support")
 
     def __call__(self, rows: Array, features: Array) -> Array:
@@ -100,20 +102,20 @@ class LeftFirst:
 
         Args:
             rows: Observations, (num_worlds, m).
-            features: Of the same measurements, earlier ones last, (num_worlds, width).
+            features: Of the same measurements, (num_worlds, width).
 
         Returns:
             (num_worlds, width).
         """
-        now, past = np.split(features, [self._split], axis=1)
-        past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
-        mirrored = np.hstack([self._now(now), past])
-        return np.where(rows[:, self._support] == 1.0, mirrored, features)
+        return np.where(self.on_right(rows), self.of_features(features), features)
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
         """A residual as it acts, (num_worlds, k): a decision of the mirror is turned back."""
-        on_right = rows[:, self._support] == 1.0
-        return np.where(on_right, self._residual(residual), residual)
+        return np.where(self.on_right(rows), self.of_residual(residual), residual)
+
+    def on_right(self, rows: Array) -> BoolArray:
+        """Whether the step is on the right foot, (num_worlds, 1)."""
+        return rows[:, self._support] == 1.0
 
 
 def _other_side(name: str) -> str:

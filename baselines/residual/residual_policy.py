@@ -53,6 +53,9 @@ class ResidualPolicy(policies.BatchPolicy):
         corrected: The base and its correction.
         network: What decides.
 
+    Attributes:
+        features: What the network sees.
+
     Raises:
         ConfigurationError: The network does not fit the settings, or they do not fit the robot.
     """
@@ -61,9 +64,9 @@ class ResidualPolicy(policies.BatchPolicy):
         super().__init__(corrected.model)
         self.corrected = corrected
         self._network = network
-        self._features = Features(corrected)
+        self.features = Features(corrected)
         self._period = corrected.settings.decision_period
-        expected = (self._features.width, corrected.num_residuals)
+        expected = (self.features.width, corrected.num_residuals)
         if (network.num_features, network.num_outputs) != expected:
             raise ConfigurationError(
                 f"the network must take {expected[0]} features and give {expected[1]} residuals for"
@@ -75,7 +78,7 @@ class ResidualPolicy(policies.BatchPolicy):
         n = len(rows)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        return ResidualMemory(wait, residual, self._features.begin(n), self.corrected.begin(rows))
+        return ResidualMemory(wait, residual, self.features.begin(n), self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:
@@ -95,9 +98,9 @@ class ResidualPolicy(policies.BatchPolicy):
         """Memory after a decision, of the worlds that are due."""
         inner = memory.inner
         fresh = memory.wait == _UNDECIDED
-        seen, features = self._features.at(rows, memory.features, fresh, inner, None)
+        seen, features = self.features.at(rows, memory.features, fresh, inner, None)
         residual = memory.residual.copy()
-        residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
+        residual[due] = self.features.turn_back(rows[due], self._network(seen[due]))
         wait = np.full_like(memory.wait, self._period)
         return ResidualMemory(wait, residual, features, inner)
 

@@ -156,6 +156,11 @@ INPUTS = record_type(
 class WalkingController(BatchPolicy):
     """Commands a walker around its plan, see the module; its memory is rows of `MEMORY`.
 
+    Attributes:
+        constants: Row of `CONTROLLER`, (1,).
+        ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
+        plan: Rows of `PLAN`, one per control step.
+
     Args:
         model: Assumed walker.
         com_feedback: Whether the COM is fed back; force difference control always acts.
@@ -181,17 +186,17 @@ class WalkingController(BatchPolicy):
         self._attitude = table.group("imu_attitude")
         self._theta = table.group("encoder_angle")
         steps = max(round(ramp_s / model.control_period_s), 1)
-        self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
-        self._constants = _constants(model, com_feedback, gains or WalkingGains())
+        self.ramp = minimum_jerk(np.arange(steps + 1) / steps)
+        self.constants = _constants(model, com_feedback, gains or WalkingGains())
         plan = model.plan
         local = plan.local
-        self._plan: Any = np.zeros(plan.num_steps + 1, PLAN)
-        self._plan["share"] = plan.share
-        self._plan["com"] = local.com
-        self._plan["com_dot"] = local.com_dot
-        self._plan["soles"] = local.ankles[..., :2]
+        self.plan: Any = np.zeros(plan.num_steps + 1, PLAN)
+        self.plan["share"] = plan.share
+        self.plan["com"] = local.com
+        self.plan["com_dot"] = local.com_dot
+        self.plan["soles"] = local.ankles[..., :2]
         turned = (np.cos(local.foot_yaw), np.sin(local.foot_yaw))
-        self._plan["foot_yaw"] = np.stack(turned, axis=-1)
+        self.plan["foot_yaw"] = np.stack(turned, axis=-1)
         self._feet = planned_feet(plan)
         self._period_s = model.control_period_s
         self._stances = Stances.of(model)
@@ -215,9 +220,9 @@ class WalkingController(BatchPolicy):
         coming = np.empty(len(rows), dtype=np.int64)
         pelvis = np.empty((len(rows), 2))
         is_moved = control(
-            controller=self._constants,
-            plan=self._plan,
-            ramp=self._ramp,
+            controller=self.constants,
+            plan=self.plan,
+            ramp=self.ramp,
             observed=observed,
             com=com,
             soles=soles,

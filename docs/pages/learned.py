@@ -28,11 +28,13 @@ _METRICS = {
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
 ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
 """Metrics of an arm."""
-MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
+MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
-_BASE = "base of the residual"
+GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
+"""Groups of scenarios, and scenarios that stand for themselves."""
+BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
 
@@ -126,21 +128,27 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
 
 
-def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
-    """Paired changes of residuals over their bases in every scenario and group, from the rows of a
-    `statistics.csv`.
+def changes_table(
+    rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = BASE
+) -> str:
+    """Paired changes of residuals in every scenario and group, from the rows of a `statistics.csv`.
 
     Args:
         rows: Its rows.
         metrics: The metrics that are shown, where the table has them.
+        scopes: The scenarios and groups that are shown; empty for all.
+        against: What the residuals are compared with, as the rows say it.
     """
-    own = [row for row in rows if row["base_is"] == _BASE and row["metric"] in metrics]
+    own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
+    own = [row for row in own if row["kind"] == "residual"]
+    own = [row for row in own if row["scope"] in scopes or not scopes]
     titles = {
         metric: _METRICS[metric]
         for metric in metrics
         if any(row["metric"] == metric for row in own)
     }
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
+    whom = "base" if against == BASE else f"`{own[0]['base']}`"
     lines = []
     for place, found in group_by(
         own, lambda row: (*(row[name] for name in names), row["scope"])
@@ -158,15 +166,15 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
         *(
             text
             for title, unit in titles.values()
-            for text in (f"base: {title} [{unit}]", "change")
+            for text in (f"{whom}: {title} [{unit}]", "change")
         ),
     ]
     return page_table(head, lines, words=len(names) + 1)
 
 
 def learning_in_short(*tables: Rows) -> str:
-    """Gains of residuals over their bases, in groups of scenarios, on the motions that they are
-    compared on.
+    """Gains of residuals over their bases, and over the best policy without learning where that is
+    another, in groups of scenarios, on the motions that they are compared on.
 
     Args:
         tables: Rows of a `statistics.csv` each.
@@ -174,16 +182,17 @@ def learning_in_short(*tables: Rows) -> str:
     metrics = _JUDGED[:2]
     lines = []
     for rows in tables:
-        own = [row for row in rows if row["base_is"] == _BASE and row["scope"] in _SHORT]
-        for reference, found in group_by(own, lambda row: row["reference"]).items():
+        own = [row for row in rows if row["kind"] == "residual" and row["scope"] in _SHORT]
+        places = group_by(own, lambda row: (row["reference"], row["base"]))
+        for (reference, base), found in places.items():
             cells = {(row["scope"], row["metric"]): row for row in found}
             changes = [
                 _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
             ]
-            lines.append([reference, f"`{found[0]['base']}`", *changes])
+            lines.append([reference, f"`{base}`", *changes])
     head = [
         "step",
-        "base",
+        "against",
         *(f"{_METRICS[metric][0]}, {scope}" for metric in metrics for scope in _SHORT),
     ]
     return page_table(head, lines, words=2)

@@ -20,6 +20,7 @@ from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
+    GROUPS,
     MAPS,
     LearnedMap,
     changes_table,
@@ -31,6 +32,7 @@ from docs.pages.standings import claims_markdown, read_leaderboard
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
+from train.evaluate.changes import BEST_ANALYTIC
 from train.evaluate.standings import Standing
 from train.report.leaderboard import leaderboard_markdown
 from train.report.table_formats import Head, Row, Table, to_markdown
@@ -204,6 +206,7 @@ PARTS: Mapping[str, Part] = {
         "learned_posture_1600ms",
         "learned_posture_1100ms",
     ),
+    "learning at 3 s": _of(learning_in_short, "learned_walker"),
     "published controllers": _of_standings(walks.published_controllers),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
@@ -228,7 +231,8 @@ PARTS: Mapping[str, Part] = {
     "learned on the testbed": _of(changes_table, "learned_testbed"),
     "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
-    "learned on the walker": _of(changes_table, "learned_walker"),
+    "learned on the walker": _of(partial(changes_table, against=BEST_ANALYTIC), "learned_walker"),
+    "learned beyond a table": _of(partial(changes_table, scopes=GROUPS), "learned_walker"),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),

@@ -40,6 +40,8 @@ class SafetyLimits(Model):
     """Cycles without a reply, or too much torque [1]."""
     hang_s: float = quantity("s", 0.05, ge=0.005, le=0.09)
     """Time without a command that stops the motion [s]."""
+    release_s: float = quantity("s", 0.0, ge=0, le=5)
+    """Time in which torque falls before it is off [s]."""
 
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:

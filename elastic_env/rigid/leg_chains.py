@@ -31,6 +31,7 @@ class LegChains:
     Attributes:
         mass: Mass of the whole robot, without the weightless bodies [kg].
         loads_type: Type of the rows that say what loads a robot, to be filled.
+        links: The tree, rows of `elastic_env.rigid.tree.kernels.LINK`.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class LegChains:
             link["tip_place"] = tree.place[foot]
         self.mass = float(weighed.body_mass.sum())
         self.loads_type = kernels.loads_type(len(legs))
-        self._links = tree.links
+        self.links = tree.links
         self._legs = len(legs)
         self._no_torque = np.empty((0, len(joints)))
 
@@ -76,7 +77,7 @@ class LegChains:
         """
         com = np.empty((len(q), 3))
         feet = np.empty((len(q), self._legs, 3))
-        kernels.local_frames(self._links, _dense(q), _dense(attitude), point, com, feet)
+        kernels.local_frames(self.links, _dense(q), _dense(attitude), point, com, feet)
         return com, feet
 
     def sole_tilts(self, q: Array, attitude: Array, bending: Array) -> Array:
@@ -92,7 +93,7 @@ class LegChains:
         """
         tilts = np.empty((2, len(q), self._legs, 2))
         motion = (_dense(q), _dense(attitude), _dense(bending))
-        kernels.tip_tilts(self._links, *motion, *tilts)
+        kernels.tip_tilts(self.links, *motion, *tilts)
         return tilts
 
     def loads(
@@ -126,13 +127,13 @@ class LegChains:
     def torque(self, loads: Any, q: Array) -> Array:
         """Joint torques that hold the legs under loads, (rows,), from (rows, n) [rad] to [N·m]."""
         torque = np.empty(q.shape)
-        kernels.gravity_torques(self._links, loads, _dense(q), torque)
+        kernels.gravity_torques(self.links, loads, _dense(q), torque)
         return torque
 
     def gradient(self, loads: Any, q: Array) -> Array:
         """∂τ/∂q of `torque`, (rows, n, n) [N·m/rad]; symmetric without a wrench."""
         gradient = np.empty((*q.shape, q.shape[1]))
-        kernels.gravity_gradients(self._links, loads, _dense(q), gradient)
+        kernels.gravity_gradients(self.links, loads, _dense(q), gradient)
         return gradient
 
     def solve(
@@ -152,7 +153,7 @@ class LegChains:
         """
         x = np.empty(q.shape)
         own = self._no_torque if torque is None else _dense(torque)
-        is_small = kernels.solutions(self._links, loads, _dense(q), stiffness, own, x)
+        is_small = kernels.solutions(self.links, loads, _dense(q), stiffness, own, x)
         return x, is_small
 
 

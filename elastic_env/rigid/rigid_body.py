@@ -21,6 +21,10 @@ class RigidBody:
     k_s and q_s are stiffness and reference of the springs that the model's joints have. Damping and
     friction of the model are not in it.
 
+    Attributes:
+        tree: Links without a load.
+        spring, spring_rest: k_s and q_s, (n,) each [N·m/rad], [rad].
+
     Args:
         model: Compiled rigid model.
         joints: Hinges of the model, in the order of the last axis.
@@ -35,15 +39,15 @@ class RigidBody:
     ) -> None:
         held = held or {}
         require_hinge_tree(model, joints, but=list(held))
-        self._tree = Tree.of(model, joints, held)
-        self._links: Any = self._tree.links
+        self.tree = Tree.of(model, joints, held)
+        self._links: Any = self.tree.links
         self._loads: Any = np.zeros(1, kernels.loads_type(0))
         self._loads["gravity"] = model.opt.gravity
         self._n = len(joints)
         at = [int(model.joint(name).id) for name in joints]
-        self._spring = model.jnt_stiffness[at].copy()
-        self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
-        self._has_springs = bool(self._spring.any())
+        self.spring = model.jnt_stiffness[at].copy()
+        self.spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
+        self._has_springs = bool(self.spring.any())
         # the first command of a live robot cannot wait
         compile_now(self._compile, np.zeros((1, len(joints))))
 
@@ -60,7 +64,7 @@ class RigidBody:
         gradient = np.empty((*rows.shape, self._n))
         kernels.gravity_gradients(self._links, self._loads, rows, gradient)
         if self._has_springs:
-            np.einsum("...ii->...i", gradient)[...] += self._spring
+            np.einsum("...ii->...i", gradient)[...] += self.spring
         return gradient.reshape(*q.shape, self._n)
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
@@ -81,12 +85,12 @@ class RigidBody:
             mass: Of the load, 0 for none [kg].
             place: In the frame of the body, (3,) [m].
         """
-        self._links = self._tree.add_load(body, mass, place)
+        self._links = self.tree.add_load(body, mass, place)
 
     def _with_springs(self, torque: Array, q: Array) -> Array:
         torque = torque.reshape(q.shape)
         if self._has_springs:
-            torque = torque + self._spring * (q - self._spring_rest)
+            torque = torque + self.spring * (q - self.spring_rest)
         return torque
 
     def _rows(self, values: Array) -> Array:

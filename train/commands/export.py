@@ -1,23 +1,229 @@
-"""`elastic export`: a model of Stable-Baselines3 as a residual folder."""
+"""`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from elastic_env.core.config import Model, load_yaml
-from train.learn.train_config import TrainConfig
-from train.runs.folders import own_folder
-from train.runs.presets import find_configuration
+import baselines
+from baselines import PositionCompensator
+from baselines.residual.settings import RESIDUAL
+from elastic_env.core.config import Locator, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
+from elastic_env.core.files import write_whole
+from elastic_env.joint.model_text import is_file, name_of, read_bytes
+from train.commands.options import StiffnessOrFile, option_name
+from train.export.c_arm import c_example, c_header
+from train.export.c_text import prefix_of, require_prefix
+
+_OF_WALKER = "input_output"
+"""The only policy of a walker that is there in C."""
+_OF_ARMS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
 
 
-class Export(Model):
+class Output(Model):
+    """Where an exported file goes."""
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write; default the name of what is exported, in the working folder."""
+    overwrite: bool = False
+    """Replace files that are there."""
+
+    def write(self, files: Mapping[Path, str | bytes], console: Console) -> None:
+        """Write files, the first one into a folder that is there.
+
+        Raises:
+            ResultsExistError: One is there, and is not to be replaced; nothing is written.
+            ConfigurationError: The folder does not exist.
+        """
+        folder = next(iter(files)).parent
+        if not folder.is_dir():
+            problem = f"no folder {shorten(folder)}; make it, or name another by --output"
+            raise ConfigurationError(problem)
+        for path in files:
+            if path.exists() and not self.overwrite:
+                cure = "add --overwrite, or name another file by --output"
+                raise ResultsExistError(f"{shorten(path)} exists; {cure}")
+        for path, content in files.items():
+            path.parent.mkdir(exist_ok=True)
+            write_whole(path, content)
+            console.print(f"wrote {path}")
+
+
+class C(Output):
+    """A header in C99, without a heap: an arm's compensator, a walker's, a residual's network.
+
+    Of an arm it gives what `PositionCompensator` does: command, link_angle, torque, payload, ramp,
+    limits and friction. Call begin(&arm) once, then command(&arm, q, q_dot, q_ddot, out). The first
+    lines say units, signs, version and digests. The macro PREFIX_TEST adds a test vector, see
+    docs/export.md.
+
+    Example: elastic export c arm.urdf --joints joints.yaml -o arm.h
+
+    Example, with a program that checks and times it: elastic export c arm.urdf --joints joints.yaml
+        --ramp-s 1 --period-s 0.002 --example
+
+    Example, of a residual: elastic export c residual:testbed/seed_0 -o net.h
+
+    Example, of the walker's policy input_output: elastic export c input_output -o walker.h
+    """
+
+    model: Annotated[Locator, tyro.conf.Positional]
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, residual:PATH, or
+    input_output, a policy of the walker.
+    """
+    joints: StiffnessOrFile = None
+    """YAML file of the elastic joints of an arm (elastic identify --robot writes one), or one K of
+    all hinges [N·m/rad].
+    """
+    order: list[Title] = []
+    """Joints that are commanded, in the order of the arrays; default all that are not held, in
+    the order of the model.
+    """
+    position_gain: float | None = None
+    """k_p of servos that give way under a load [N·m/rad], one for all; default what the file of
+    joints says.
+    """
+    limit_rad: float = quantity("rad", 0.2, gt=0)
+    """Largest offset between command and desired angle [rad]."""
+    ramp_s: float = quantity("s", 0.0, ge=0)
+    """Time in which offsets grow from zero, and in which a payload is taken over [s]."""
+    period_s: float = quantity("s", 0.01, gt=0)
+    """Time between two commands [s]."""
+    friction: bool | None = None
+    """Whether dry friction is compensated; default where any of it grows with the load."""
+    prefix: str | None = None
+    """Begin of all names in the header; default the name of the model's file or the residual."""
+    env: Locator | None = None
+    """Environment of a residual or of a walker's policy, as of elastic export onnx."""
+    example: bool = False
+    """Write a folder PREFIX_example beside the header: a program that checks it against Python and
+    times it, and its CMakeLists.txt.
+    """
+
+    def run(self, console: Console) -> None:
+        """Export."""
+        export = self._arm
+        name = Path(self.model).stem
+        if self.model.startswith(RESIDUAL):
+            export = self._residual
+            name = _short_name(self.model)
+        elif self.model == _OF_WALKER:
+            export = self._walker
+            name = "walker"
+        self._refuse(["env"] if export == self._arm else _OF_ARMS)
+        prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
+        output = self.output or Path(f"{prefix}.h")
+        header, example = export(prefix, f"../{output.name}")
+        files = {output: header}
+        if self.example:
+            folder = output.with_name(f"{prefix}_example")
+            files |= {folder / name: text for name, text in example.items()}
+        self.write(files, console)
+
+    def _refuse(self, names: Sequence[str]) -> None:
+        """Refuse options that have no effect here."""
+        given = [
+            name for name in names if getattr(self, name) != type(self).model_fields[name].default
+        ]
+        if given:
+            listed = ", ".join(option_name((name,)) for name in given)
+            problem = f"{listed}: without effect on {shorten(self.model)}; leave it out"
+            raise ConfigurationError(problem)
+
+    def _residual(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of a residual."""
+        from train.export.c_residual import c_residual, c_residual_example
+        from train.export.residual_layout import ResidualLayout
+
+        layout = ResidualLayout.of(self.model, self.env)
+        return c_residual(layout, prefix), c_residual_example(prefix, header)
+
+    def _walker(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of a walker's policy."""
+        from train.evaluate.conditions import Condition, PolicySpec
+        from train.evaluate.rollout import make_vector_env
+        from train.export.c_walker import c_walker, c_walker_example
+
+        condition = Condition(env=self.env or "walker", policy=PolicySpec(name=self.model))
+        with closing(make_vector_env(condition, num_envs=1, num_threads=1)) as worlds:
+            policy = baselines.make(self.model, worlds)
+        return c_walker(policy, prefix), c_walker_example(prefix, header)
+
+    def _arm(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
+        """Header and example of an arm."""
+        if not is_file(self.model):
+            raise ConfigurationError(
+                f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
+            )
+        if self.joints is None:
+            raise ConfigurationError(
+                "an arm needs the stiffness of its joints: name a file by --joints joints.yaml, or"
+                " one K of all hinges [N·m/rad] by --joints 400"
+            )
+        compensator = PositionCompensator.from_model(
+            self.model,
+            self.joints,
+            joints=self.order or None,
+            position_gain=self.position_gain,
+            limit_rad=self.limit_rad,
+            ramp_s=self.ramp_s,
+            period_s=self.period_s,
+            friction=self.friction,
+        )
+        named = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
+        sources = {Path(name).name: read_bytes(Path(name)) for name in named}
+        return c_header(compensator, prefix, sources), c_example(prefix, header)
+
+
+class Onnx(Output):
+    """A residual as one graph of ONNX, with normalisation, mirror and bounds, and a test vector.
+
+    The input `features` has a column for each feature of the residual. Metadata of the file say
+    their names and units, the columns of the output, periods, version and digest. The file beside
+    it, .npz, has inputs and what Python makes of them. docs/export.md says what the program around
+    it has to do.
+
+    Example: elastic export onnx residual:testbed/seed_0 -o testbed.onnx
+
+    Example, of a robot of your own: elastic export onnx residual:runs/mine/seed_0 --env arm.yaml
+    """
+
+    residual: Annotated[Locator, tyro.conf.Positional]
+    """residual:PATH, a folder or the name of a residual that comes with the package."""
+    env: Locator | None = None
+    """Environment that it is for, ROBOT.yaml or FILE.py:ROBOT; default the one of the package that
+    the residual names.
+    """
+
+    def run(self, console: Console) -> None:
+        """Export."""
+        from train.export.onnx_residual import onnx_model, played_vector
+        from train.export.residual_layout import ResidualLayout
+
+        layout = ResidualLayout.of(self.residual, self.env)
+        output = self.output or Path(f"{_short_name(self.residual)}.onnx")
+        if output.suffix != ".onnx":
+            problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
+            raise ConfigurationError(problem)
+        files = {output: onnx_model(layout), output.with_suffix(".npz"): played_vector(layout)}
+        self.write(files, console)
+
+
+def _short_name(residual: str) -> str:
+    """A name from the last two folders of a residual, such as testbed_seed_0."""
+    return prefix_of("_".join(Path(residual.partition(":")[2]).parts[-2:]))
+
+
+class Sb3(Model):
     """Turn a model of Stable-Baselines3 into a residual folder, which plays without torch.
 
     Loading that folder runs no code.
 
-    Example: elastic export model.zip train_walker_3s --normaliser normaliser.pkl
+    Example: elastic export sb3 model.zip train_walker_3s --normaliser normaliser.pkl
         --trust-pickle
     """
 
@@ -34,9 +240,28 @@ class Export(Model):
 
     def run(self, console: Console) -> None:
         """Export."""
-        from train.learn.export import export_zip  # help comes without torch
+        # these need torch, the other exports do not
+        from elastic_env.core.config import load_yaml
+        from train.learn.export import export_zip
+        from train.learn.train_config import TrainConfig
+        from train.runs.folders import own_folder
+        from train.runs.presets import find_configuration
 
         config = load_yaml(find_configuration(self.config, "training"), TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         console.print(f"play it as residual:{folder}")
+
+
+class Export(Model):
+    """Give compensators and residuals to other programs, and models of SB3 to this one.
+
+    c: an arm's compensator as a header in C99. onnx: a residual as a graph. sb3: a model of
+    Stable-Baselines3 as a residual.
+    """
+
+    command: C | Onnx | Sb3
+
+    def run(self, console: Console) -> None:
+        """Do what was asked for."""
+        self.command.run(console)

@@ -1,4 +1,4 @@
-"""`elastic hardware`: scan, check, run, emulate."""
+"""`elastic hardware`: scan, check, log, compensate, run, emulate."""
 
 import contextlib
 import csv
@@ -15,14 +15,19 @@ from rich.console import Console
 from rich.markup import escape
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.core.config import Model, quantity
+from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.hardware.buses.packets import RANGE_OF_RATES, RATES, require_ids
-from elastic_env.hardware.buses.servo_models import servo_models
+from elastic_env.hardware.buses.packets import RANGE_OF_RATES, require_ids
+from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_models import Protocol, servo_model, servo_models
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety.checks import Check as BusCheck
+from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
+from train.commands.hardware_arm import KnownArm, OnArm, emulated
+from train.commands.hardware_compensate import Compensate, LogPoses
 from train.commands.options import MotionOrDefault, OnHardware
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import ControlStep, control_steps, make_policy
@@ -42,29 +47,31 @@ class Scan(Model):
     """Port, such as /dev/ttyUSB0."""
     baudrate: int | None = quantity("bit/s", None, **RANGE_OF_RATES)
     """Bits per second; default: the usual rates, one after the other."""
+    protocol: Protocol | None = None
+    """Protocol of the servos; default: one after the other."""
 
     def run(self, console: Console) -> None:
         """Scan; exit code 3 where no servo answers."""
-        # help comes without the SDK of the servos
-        from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-
         rows = []
-        for rate in RATES if self.baudrate is None else (self.baudrate,):
-            with DynamixelBus(self.port, rate) as bus:
-                for servo in bus.scan():
-                    number = servo.model_number
-                    model = servo_models().get(number)
-                    name = model.name if model is not None else "not known here"
-                    cells = (rate, servo.servo_id, number, name, servo.firmware)
-                    rows.append([str(cell) for cell in cells])
+        for protocol, kind in BUSES.items():
+            if self.protocol not in (None, protocol):
+                continue
+            for rate in kind.rates if self.baudrate is None else (self.baudrate,):
+                with kind(self.port, rate) as bus:
+                    for servo in bus.scan():
+                        number = servo.model_number
+                        model = servo_models().get(number)
+                        name = model.name if model is not None else "not known here"
+                        cells = (protocol, rate, servo.servo_id, number, name, servo.firmware)
+                        rows.append([str(cell) for cell in cells])
         if not rows:
             console.print(
                 f"no servo answers at {self.port}; check power, wiring and baud rate, and whether"
                 " it is the IMU's port"
             )
             sys.exit(3)
-        head = ["bit/s", "id", "model number", "model", "firmware"]
-        console.print(make_table(f"servos at {self.port}", head, rows, left=5))
+        head = ["protocol", "bit/s", "id", "model number", "model", "firmware"]
+        console.print(make_table(f"servos at {self.port}", head, rows, left=6))
 
 
 class Check(Model):
@@ -79,8 +86,10 @@ class Check(Model):
     """Port, such as /dev/ttyUSB0."""
     ids: list[int] = [1]
     """Ids of the servos."""
-    baudrate: int = 3_000_000
-    """Bits per second."""
+    baudrate: int | None = quantity("bit/s", None, **RANGE_OF_RATES)
+    """Bits per second; default the usual rate of the protocol."""
+    protocol: Protocol = "dynamixel"
+    """Protocol of the servos."""
     imu_port: str | None = None
     """Port of the IMU, another one than the servos'."""
     imu_baudrate: int = 115_200
@@ -88,14 +97,9 @@ class Check(Model):
 
     def run(self, console: Console) -> None:
         """Check; nothing moves, nothing is written."""
-        # help comes without the SDK of the servos
-        from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-        from elastic_env.hardware.safety.checks import Check as BusCheck
-        from elastic_env.hardware.safety.checks import check_bus
-
-        HardwareSettings(**self.model_dump(exclude={"ids"}))  # checks them
+        HardwareSettings(port=self.port, imu_port=self.imu_port, imu_baudrate=self.imu_baudrate)
         require_ids(self.ids)
-        with DynamixelBus(self.port, self.baudrate) as bus:
+        with BUSES[self.protocol](self.port, self.baudrate) as bus:
             checks = check_bus(bus, self.ids)
         if self.imu_port is not None:
             with AttitudeStream(self.imu_port, self.imu_baudrate) as stream:
@@ -204,14 +208,23 @@ class Emulate(Model):
 
     Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware
     emulate --lost 0.01
+
+    An arm behind them: elastic hardware emulate --robot docs/hardware/so101.xml --joints
+    docs/hardware/so101_joints.yaml --mounting docs/hardware/so101_mounting.yaml
     """
 
+    robot: Locator | None = None
+    """Model of an arm behind the servos, MJCF or URDF; ids and servos are those of --mounting."""
+    joints: Path | None = None
+    """YAML file of its joints."""
+    mounting: Path | None = None
+    """YAML file of its ids, signs and zeros."""
     ids: list[int] = [1]
     """Ids of the servos; the IMU is on the link of the first."""
     model_number: int = 54024
-    """Type of the servos: 54024, 54025 or 2020."""
-    baudrate: int = 3_000_000
-    """Bits per second; no other rate is heard."""
+    """Type of the servos, as docs/hardware.md lists them, such as 54024 or 777."""
+    baudrate: int | None = None
+    """Bits per second, no other rate is heard; default the usual rate of the protocol."""
     scenario: str = "nominal"
     """Scenario of the joint and of the IMU, as in elastic identify."""
     stiffness: float | None = None
@@ -231,8 +244,8 @@ class Emulate(Model):
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
     fault: list[str] = []
-    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf,
-    imu_out_of_range, imu_frozen."""
+    """Faults that begin later: overload, hot, silent, same_id, unplugged, imu_silent, imu_nan,
+    imu_inf, imu_out_of_range, imu_frozen."""
     fault_after_s: float = quantity("s", 20.0, ge=0, le=86_400)
     """When that happens, after the start [s]."""
     seed: int = 0
@@ -244,33 +257,64 @@ class Emulate(Model):
         switches = [name for name in known if known[name].annotation is bool]
         require_known("fault", self.fault, switches)
         shares = self.model_dump(include=set(known))
-        config = EmulatorConfig(
+        config = self._arm() or EmulatorConfig(
             ids=tuple(self.ids),
             model_number=self.model_number,
             baudrate=self.baudrate,
-            faults=Faults(**shares, latency_s=1e-3 * self.latency_ms),
-            seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )
+        faults = Faults(**shares, latency_s=1e-3 * self.latency_ms)
+        config = config.replace(faults=faults, seed=self.seed)
         ends = contextlib.suppress(KeyboardInterrupt)
         with RunningEmulator(config) as emulator, ends:
-            console.print(f"servos {', '.join(map(str, self.ids))} at {emulator.port}")
-            console.print(f"IMU at {emulator.imu_port}")
-            console.print(
-                f"for example: elastic hardware check {emulator.port}, or\nelastic identify --port"
-                f" {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it."
-            )
+            ids = " ".join(map(str, config.ids))
+            console.print(f"servos {ids} at {emulator.port}")
+            check = f"elastic hardware check {emulator.port} --ids {ids}"
+            model = servo_model(config.model_number)
+            if model.protocol != "dynamixel":
+                check += f" --protocol {model.protocol}"
+            console.print(f"for example: {check}")
+            if config.arm is None:
+                console.print(f"IMU at {emulator.imu_port}")
+                console.print(
+                    f"or: elastic identify --port {emulator.port} --imu-port {emulator.imu_port}"
+                    " --yes --patient"
+                )
+            else:
+                console.print(f"or: elastic hardware compensate --port {emulator.port} ...")
+            console.print("Ctrl-C ends it.")
             if self.fault:
                 time.sleep(self.fault_after_s)
                 emulator.faults(**dict.fromkeys(self.fault, True))
                 console.print(f"from now on: {', '.join(self.fault)}")
             emulator.wait()
 
+    def _arm(self) -> EmulatorConfig | None:
+        """The emulated arm; None where no model of one is named.
+
+        Raises:
+            ConfigurationError: A file is missing, or cannot be used.
+        """
+        given = (self.robot, self.joints, self.mounting)
+        if given == (None, None, None):
+            return None
+        if self.robot is None or self.joints is None or self.mounting is None:
+            raise ConfigurationError("an emulated arm needs --robot, --joints and --mounting")
+        arm = OnArm(robot=self.robot, mounting=self.mounting, dry_run=True)
+        return emulated(KnownArm(arm, self.joints))
+
 
 class Hardware(Model):
-    """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate."""
+    """Real servos, or an emulated bus: scan, check, compensate an arm, run the testbed, emulate."""
 
-    command: Scan | Check | Run | Emulate
+    command: (
+        Scan
+        | Check
+        | Compensate
+        | Annotated[LogPoses, tyro.conf.subcommand(name="log")]
+        | Run
+        | Emulate
+    )
 
     def run(self, console: Console) -> None:
         """Do what was asked for."""

@@ -14,6 +14,7 @@ learning control, with a damped inverse of G as the learning gain [Bristow2006],
 [Bristow2006]: see `baselines.adaptation.iterative_learning`.
 """
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeAlias
@@ -180,31 +181,57 @@ class Walks:
         return Harmonics.of(columns), rms
 
 
+class Play(NamedTuple):
+    """What a table left.
+
+    Attributes:
+        inputs: The table.
+        errors: Harmonics of the mean errors.
+        rms: Errors by channel [m], [rad], and the number of robots that `fell`.
+    """
+
+    inputs: Harmonics
+    errors: Harmonics
+    rms: dict[str, float]
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares of all errors in units of `_SCALE`; infinite where a robot fell."""
+        if self.rms["fell"] > 0.0:
+            return np.inf
+        return sum((self.rms[name] / _SCALE[name]) ** 2 for name in CHANNELS)
+
+
 def find(search: Search) -> PhaseTable:
-    """Find a table, and print the errors of every play."""
+    """Find a table, and print the errors of every play; the best one counts."""
     none = Harmonics(np.zeros((2, search.num_harmonics, 2), dtype=np.complex128))
     walks = Walks(search)
     with closing(walks.env):
 
-        def play(inputs: Harmonics, title: str) -> Harmonics:
+        def play(inputs: Harmonics, title: str) -> Play:
             errors, rms = walks.errors(inputs.table(search))
             shares = [f"{name} {1e3 * rms[name]:.2f}" for name in CHANNELS]
             Console().print(f"{title}: {', '.join(shares)} mm, mrad rms, {rms['fell']:g} falls")
-            return errors
+            return Play(inputs, errors, rms)
 
         before = play(none, "without")
         response = []
         for channel, title in enumerate(("ZMP", "hips")):
             known = probe(search.num_harmonics, channel)
-            change = play(known, f"probe of {title}").planes - before.planes
+            change = play(known, f"probe of {title}").errors.planes - before.errors.planes
             response.append(change / known.planes[:, :, channel, None])
         matrix = np.stack(response, axis=-1)
-        now = none
-        error = before
+        plays = [before]
         for number in range(search.plays):
-            now = corrected(now, error, matrix, search)
-            error = play(now, f"table {number + 1}")
-    return now.table(search)
+            last = plays[-1]
+            now = corrected(last.inputs, last.errors, matrix, search)
+            plays.append(play(now, f"table {number + 1}"))
+    return best(plays).inputs.table(search)
+
+
+def best(plays: Sequence[Play]) -> Play:
+    """The play of the least cost: a correction may be one too many."""
+    return min(plays, key=lambda own: own.cost)
 
 
 def main(search: Search) -> None:

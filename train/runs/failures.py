@@ -24,6 +24,7 @@ DEFECT = 70
 _EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "cmaes"),
     "report": ("matplotlib", "plotly", "jinja2", "imageio", "imageio_ffmpeg", "PIL"),
+    "onnx": ("onnx", "onnxruntime"),
     "cluster": ("dask", "distributed", "submitit"),
     "hardware": ("dynamixel_sdk", "serial", "mscl"),
     "robots": ("example_robot_data",),

@@ -1,5 +1,5 @@
 """Servos on buses: states and goals in SI units, packets, serial ports, servo types as data.
 
-A Dynamixel servo of Protocol 2.0 needs a row in models.csv and, if its registers are others, a
-control table. Another make needs a class with the methods of `dynamixel_bus.DynamixelBus`.
+A servo of a known protocol needs a row in models.csv and, if its registers are others, a control
+table. Another protocol needs a class that fills in `servo_bus.ServoBus`, and a name in `protocols`.
 """

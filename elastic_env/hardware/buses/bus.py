@@ -11,7 +11,7 @@ from elastic_env.core.signals import Array, BoolArray
 TEMPERATURE_CYCLES = 25
 """Cycles from one reading of the temperatures to the next: 0.1 s at 250 Hz."""
 
-_ARRAYS = ("position", "velocity", "current", "is_fresh", "has_alert", "temperature")
+_ARRAYS = ("position", "velocity", "torque", "is_fresh", "has_alert", "temperature")
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class States:
     """[rad], in the servo's own zero and sign."""
     velocity: Array
     """[rad/s]"""
-    current: Array
-    """Signed motor current [A]."""
+    torque: Array
+    """Torque at the output, by the motor's current or load [N·m]; in motion only about it."""
     is_fresh: BoolArray
     """True where the servo answered this very request, whole and intact."""
     has_alert: BoolArray
@@ -55,6 +55,15 @@ class States:
         values = [vars(part) for part in parts]
         arrays = {n: np.concatenate([own[n] for own in values]) for n in _ARRAYS}
         return States(**arrays, time_s=max(part.time_s for part in parts))
+
+
+@dataclass(frozen=True)
+class ServoInfo:
+    """A servo's answer to a ping."""
+
+    servo_id: int
+    model_number: int
+    firmware: int
 
 
 @dataclass(frozen=True)

@@ -1,330 +1,57 @@
-"""Dynamixel servos on one port or several: registers, goals in one packet, states in another.
+"""Dynamixel servos of Protocol 2.0, by dynamixel-sdk: PRO, P, X, and MX that are set to it."""
 
-A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none
-of the last ones still awaits. So a reply that comes late is known as old and left out. Temperatures
-lie farther off and change slowly: only every 25th request is for a block that reaches as far.
-"""
+import dynamixel_sdk as sdk
+from typing_extensions import override
 
-import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeVar
-
-import numpy as np
-
-from elastic_env.core.signals import Array
-from elastic_env.hardware.buses import packets, servo_models
+from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses import port as ports
-from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, Condition, States
+from elastic_env.hardware.buses.bus import ServoInfo
 from elastic_env.hardware.buses.packets import word
-from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE, bus_gone
-from elastic_env.hardware.buses.servo_models import ServoModel
-from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
-
-_TRIES = 3
-_QUIET_S = 0.03
-_REPLY_TIMEOUT_S = 0.05
-_WATCHDOG_COUNTS = 3  # of 20 ms
-_STATUS_BYTES = 11
-
-T = TypeVar("T")
+from elastic_env.hardware.buses.port import bus_gone
+from elastic_env.hardware.buses.servo_bus import DAMAGED, ServoBus, Status
+from elastic_env.hardware.errors import ReplyError
 
 
-@dataclass(frozen=True)
-class ServoInfo:
-    """A servo's answer to a ping."""
+class DynamixelBus(ServoBus):
+    """Dynamixel servos of Protocol 2.0 on a port, see `ServoBus`."""
 
-    servo_id: int
-    model_number: int
-    firmware: int
+    protocol = "dynamixel"
+    rates = packets.RATES
+    position_mode = 3
+    full_replies = 2
+    status_bytes = 11
+    patience_s = 0.003
+    slowest_trip_s = 2.5e-3
 
-
-class DynamixelBus:
-    """Dynamixel servos of Protocol 2.0 on a port.
-
-    Args:
-        port: Device, such as /dev/ttyUSB0.
-        baudrate: Bits per second.
-
-    Attributes:
-        models: Types of the attached servos, by id.
-        num_retries: Requests that were sent again because no reply came, or none that was intact.
-    """
-
-    def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
-        self.name = port
-        self.port = ports.Port(port, baudrate)
-        self.models: dict[int, ServoModel] = {}
-        self.reply_timeout_s = _REPLY_TIMEOUT_S
-        self.num_retries = 0
+    def __init__(self, port: str, baudrate: int | None = None) -> None:
+        super().__init__(port, baudrate)
         self._handler = ports.PacketHandler()
-        self._cycles_without_temperature = TEMPERATURE_CYCLES
-        self._awaited: deque[range | None] = deque(maxlen=servo_models.NUM_BLOCKS - 1)
-        """Blocks that the last requests asked for; None where all servos answered."""
 
-    def open(self) -> None:
-        """Open and lock the port.
-
-        Raises:
-            PortError: It cannot be had.
-        """
-        self.port.open()
-
-    def close(self) -> None:
-        """Give the port back."""
-        self.port.closePort()
-
-    def __enter__(self) -> "DynamixelBus":
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    @property
-    def ids(self) -> tuple[int, ...]:
-        """Ids of the attached servos, in order."""
-        return tuple(self.models)
-
+    @override
     def scan(self) -> list[ServoInfo]:
-        """All servos that answer a broadcast ping, by id."""
         with bus_gone(self.name):
             answers, _ = self._handler.broadcastPing(self.port)
         return [ServoInfo(i, *values) for i, values in sorted(answers.items())]
 
+    @override
     def ping(self, servo_id: int) -> ServoInfo:
-        """Model number and firmware of one servo.
-
-        Raises:
-            ReplyError: It does not answer.
-        """
         reply = self._request(servo_id, packets.PING, b"", length=3)
         return ServoInfo(servo_id, int.from_bytes(reply[:2], "little"), reply[2])
 
-    def attach(self, ids: Sequence[int]) -> None:
-        """Take servos into the cycle; each is asked for its model, which decides on its registers.
+    @override
+    def knock(self, servo_id: int) -> None:
+        self.ping(servo_id)
 
-        Raises:
-            ConfigurationError: Ids that no servo can have, or one twice.
-            ReplyError: A servo does not answer.
-            HardwareError: Its model is not known.
-        """
-        packets.require_ids(ids)
-        self.attach_known({i: self.ping(i).model_number for i in ids})
+    @override
+    def _place(self, address: int, length: int) -> bytes:
+        return word(address) + word(length)
 
-    def attach_known(self, numbers: Mapping[int, int]) -> None:
-        """Take servos into the cycle without asking them anything.
+    @override
+    def _place_to_write(self, address: int) -> bytes:
+        return word(address)
 
-        Args:
-            numbers: Model numbers by id.
-
-        Raises:
-            HardwareError: A model is not known, or they do not go together.
-        """
-        kinds = {i: servo_models.servo_model(number) for i, number in numbers.items()}
-        self.models = kinds
-        if len({model.blocks for model in self.models.values()}) > 1:
-            names = ", ".join(f"{i}: {model.name}" for i, model in self.models.items())
-            raise HardwareError(
-                f"the servos of one bus must have one control table, at {self.name} are {names}"
-            )
-
-    def read_register(self, servo_id: int, name: str) -> int:
-        """A register [count].
-
-        Raises:
-            ReplyError: No answer in three tries, or a refusal.
-        """
-        register = self.models[servo_id].table[name]
-        where = word(register.address) + word(register.size)
-        data = self._request(servo_id, packets.READ, where, register.size)
-        return register.decode(data)
-
-    def write_register(self, servo_id: int, name: str, value: int) -> None:
-        """Write a register [count].
-
-        Raises:
-            ReplyError: No answer in three tries, or a refusal, with the servo's reason.
-        """
-        register = self.models[servo_id].table[name]
-        data = word(register.address) + register.encode(value)
-        self._request(servo_id, packets.WRITE, data, length=0)
-
-    def write_all(self, name: str, values: Mapping[int, int]) -> None:
-        """Write a register of several servos, by id [count], in one packet, which nobody confirms.
-
-        Raises:
-            BusGoneError: The port is gone.
-        """
-        if not values:
-            return
-        register = self.models[next(iter(values))].table[name]
-        data = word(register.address) + word(register.size)
-        for servo_id, value in values.items():
-            data += bytes([servo_id]) + register.encode(value)
-        self._send(packets.BROADCAST, packets.SYNC_WRITE, data)
-        self.port.release()
-
-    def read_position(self, servo_id: int) -> float:
-        """Present position of one servo [rad]."""
-        count = self.read_register(servo_id, "present_position")
-        return count * self.models[servo_id].position_unit
-
-    def read_condition(self, servo_id: int) -> Condition:
-        """Velocity, temperature and hardware error of one servo."""
-        counts = self.read_register(servo_id, "present_velocity")
-        temperature = float(self.read_register(servo_id, "present_temperature"))
-        highest = float(self.read_register(servo_id, "temperature_limit"))
-        status = self.read_register(servo_id, "hardware_error_status")
-        error = servo_models.explain_errors(status)
-        unit = self.models[servo_id].velocity_unit
-        return Condition(counts * unit, temperature, highest, error)
-
-    def write_goal(self, servo_id: int, angle: float) -> None:
-        """Command one servo [rad], which confirms it.
-
-        Raises:
-            ReplyError: As `write`.
-        """
-        count = round(angle / self.models[servo_id].position_unit)
-        self.write_register(servo_id, "goal_position", count)
-
-    def write_goals(self, angles: Array) -> None:
-        """Command all servos at once.
-
-        Args:
-            angles: Goal positions in the order of `ids`, (n,) [rad].
-        """
-        units = np.array([model.position_unit for model in self.models.values()])
-        counts = np.rint(angles / units).astype(np.int64).tolist()
-        self.write_all("goal_position", dict(zip(self.ids, counts, strict=True)))
-
-    def write_torque(self, servo_id: int, is_on: bool) -> None:
-        """Switch the torque of one servo, which confirms it."""
-        self.write_register(servo_id, "torque_enable", int(is_on))
-
-    def write_watchdog(self, servo_id: int, is_on: bool) -> None:
-        """Set the bus watchdog of a servo to 60 ms, or clear it.
-
-        Nothing on models that have none.
-        """
-        if self.models[servo_id].has_watchdog:
-            self.write_register(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
-
-    def torque_off(self) -> None:
-        """Switch all torque off; also after a read that was interrupted.
-
-        Raises:
-            BusGoneError: The port is gone.
-        """
-        # nobody confirms a packet to all; a second one costs nothing
-        for _ in range(2):
-            self.port.release()
-            self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
-
-    def confirm_torque_off(self) -> list[str]:
-        """Names of the servos that do not say that their torque is off, after some tries each."""
-        return [servo_name(self, i) for i in self.ids if not self._is_off(i)]
-
-    def _is_off(self, servo_id: int) -> bool:
-        try:
-            if self.read_register(servo_id, "torque_enable") != 0:
-                self.write_torque(servo_id, False)
-        except ReplyError:
-            return False
-        return True
-
-    def read_states(self, timeout_s: float) -> States:
-        """Position, velocity and current of all servos, and now and then their temperature.
-
-        Args:
-            timeout_s: How long to wait for all replies together.
-
-        Raises:
-            BusGoneError: The port is gone.
-        """
-        block = self._next_block()
-        self._awaited.append(block)
-        asked = word(block.start) + word(len(block)) + bytes(self.ids)
-        self._send(packets.BROADCAST, packets.SYNC_READ, asked)
-        self.port.setPacketTimeoutMillis(1e3 * timeout_s)
-        replies: dict[int, bytes] = {}
-        alerts: set[int] = set()
-        while len(replies) < len(self.ids):
-            reply = self._receive()
-            if reply is None:
-                if self.port.getTimeSinceStart() >= 1e3 * timeout_s:
-                    break
-                continue
-            servo_id, error, data = reply
-            if error & packets.ALERT:
-                alerts.add(servo_id)
-            is_good = error & ~packets.ALERT == 0 and len(data) == len(block)
-            if is_good and servo_id in self.models:
-                replies[servo_id] = data
-        if len(replies) == len(self.ids):
-            self._awaited[-1] = None
-        states = self._decode(block, replies, alerts)
-        self._cycles_without_temperature += 1
-        if not np.isnan(states.temperature).any():
-            self._cycles_without_temperature = 0
-        return states
-
-    def _next_block(self) -> range:
-        """The shortest block that no reply is awaited for, with the temperature if that is due."""
-        model = next(iter(self.models.values()))
-        free = [block for block in model.blocks if block not in self._awaited]
-        if self._cycles_without_temperature + 1 < TEMPERATURE_CYCLES:
-            return free[0]
-        return next(filter(model.has_temperature, free), free[0])
-
-    def _decode(self, block: range, replies: dict[int, bytes], alerts: Any) -> States:
-        values = np.full((len(self.ids), 4), np.nan)
-        for row, (servo_id, model) in enumerate(self.models.items()):
-            if servo_id in replies:
-                values[row] = model.decode_block(block, replies[servo_id])
-        angle, velocity, current, temperature = values.T.copy()
-        now = time.monotonic()
-        is_fresh = np.array([servo_id in replies for servo_id in self.ids])
-        has_alert = np.array([servo_id in alerts for servo_id in self.ids])
-        return States(angle, velocity, current, is_fresh, has_alert, now, temperature)
-
-    def _request(self, servo_id: int, kind: int, data: bytes, length: int) -> bytes:
-        """The data of a reply.
-
-        A few tries, with silence in between so that no late reply answers the next one.
-        """
-        problem = "does not answer"
-        for _ in range(_TRIES):
-            self._send(servo_id, kind, data)
-            wire_ms = self.port.tx_time_per_byte * (_STATUS_BYTES + length)
-            self.port.setPacketTimeoutMillis(wire_ms + 1e3 * self.reply_timeout_s)
-            while (reply := self._receive()) is not None:
-                sender, status, found = reply
-                error = status & ~packets.ALERT
-                if sender != servo_id:
-                    continue
-                if error == packets.CRC_ERROR:  # it has done nothing: worth another try
-                    problem = f"says that {packets.STATUS_ERRORS[error]}"
-                    break
-                if error:
-                    unknown = f"error {error}, which the protocol does not have"
-                    reason = packets.STATUS_ERRORS.get(error, unknown)
-                    raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
-                if len(found) == length:
-                    return found
-            self._wait_for_silence()
-            self.num_retries += 1
-        raise ReplyError(
-            f"{servo_name(self, servo_id)} {problem} in {_TRIES} tries ({self.port.baudrate} "
-            "bit/s); check power, wiring, id and baud rate, and whether this is the port of the "
-            f"servos and not the IMU's, see: elastic hardware scan {self.name}"
-        )
-
-    def _send(self, servo_id: int, instruction: int, data: bytes) -> None:
+    @override
+    def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
         length = word(len(data) + 3)
         frame = [0, 0, 0, 0, servo_id, *length, instruction, *data, 0, 0]
         self.port.release()
@@ -334,110 +61,27 @@ class DynamixelBus:
             problem = self._handler.getTxRxResult(result)
             raise ReplyError(f"cannot send at {self.name}: {problem}")
 
-    def _receive(self) -> tuple[int, int, bytes] | None:
-        """Id, error and data of the next status; None if it is damaged, or none comes in time."""
+    @override
+    def _receive(self) -> Status | None:
         with bus_gone(self.name):
             received, result = self._handler.rxPacket(self.port, False)
-        return None if result else (received[4], received[8], bytes(received[9:-2]))
-
-    def _wait_for_silence(self) -> None:
-        with bus_gone(self.name):
-            self.port.release()
-            deadline = time.monotonic() + 10 * _QUIET_S
-            end = time.monotonic() + _QUIET_S
-            while time.monotonic() < min(end, deadline):
-                if self.port.readPort(256):
-                    end = time.monotonic() + _QUIET_S
-
-
-class BusGroup:
-    """Several buses as one. Each has a reader of its own, so that they work at the same time.
-
-    Args:
-        buses: With their servos attached; an array of all servos has theirs in this order.
-    """
-
-    def __init__(self, buses: Sequence[DynamixelBus]) -> None:
-        self.buses = tuple(buses)
-        self._readers = [ThreadPoolExecutor(1, bus.name) for bus in buses[1:]]
-
-    @property
-    def servos(self) -> list[tuple[DynamixelBus, int]]:
-        """Bus and id of each servo."""
-        return [(bus, servo_id) for bus in self.buses for servo_id in bus.ids]
-
-    @property
-    def names(self) -> list[str]:
-        """The servos' names in messages."""
-        return [servo_name(bus, servo_id) for bus, servo_id in self.servos]
-
-    def write_goals(self, angles: Array) -> None:
-        """Command all servos, (n,) [rad]."""
-        ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]
-        parts = zip(self.buses, np.split(angles, ends), strict=True)
-        self._call_all([partial(bus.write_goals, part) for bus, part in parts])
-
-    def read_states(self, timeout_s: float) -> States:
-        """States of all servos; waits for at most a time [s]."""
-        if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
-            return self.buses[0].read_states(timeout_s)
-        calls = [partial(bus.read_states, timeout_s) for bus in self.buses]
-        return States.join(self._call_all(calls))
-
-    def torque_off(self, when_sent: Any = None) -> HardwareError | None:
-        """Switch all torque off, at every bus before any servo is asked whether it is.
-
-        A lost bus keeps no other on.
-
-        Args:
-            when_sent: Called in between; servos that do not answer make the rest last.
-
-        Returns:
-            What is not certain: a `BusGoneError` where a bus is gone, else a `ReplyError`; None if
-            all is off.
-        """
-        self._call_all([partial(_call, bus.torque_off) for bus in self.buses])
-        if when_sent is not None:
-            when_sent()
-        calls = [partial(_call, bus.confirm_torque_off) for bus in self.buses]
-        answers = self._call_all(calls)
-        errors = [answer for answer in answers if isinstance(answer, HardwareError)]
-        lists = [answer for answer in answers if isinstance(answer, list)]
-        silent = [name for names in lists for name in names]
-        problems = [str(error) for error in errors]
-        if silent:
-            who = f"{', '.join(silent)}: switch the power off"
-            problems.append(f"torque off was sent, but not confirmed by {who}")
-        if not problems:
+        if result == sdk.COMM_RX_CORRUPT:
+            return DAMAGED
+        if result:
             return None
-        pairs = zip(self.buses, answers, strict=True)
-        if off := [bus.name for bus, answer in pairs if answer == []]:
-            problems.append(f"torque is off at {', '.join(off)}")
-        is_gone = any(isinstance(error, BusGoneError) for error in errors)
-        return (BusGoneError if is_gone else ReplyError)("; ".join(problems))
+        error = received[8]
+        return Status(
+            servo_id=received[4],
+            error=error & ~packets.ALERT,
+            has_alert=bool(error & packets.ALERT),
+            data=bytes(received[9:-2]),
+        )
 
-    def _call_all(self, calls: Sequence[Callable[[], T]]) -> list[T]:
-        """Call one function for each bus, the first in this thread.
+    @override
+    def _is_unheard(self, error: int) -> bool:
+        return error == packets.CRC_ERROR
 
-        All of them are done when an error is raised.
-        """
-        pairs = zip(self._readers, calls[1:], strict=True)
-        others = [reader.submit(call) for reader, call in pairs]
-        try:
-            first = calls[0]()
-        finally:
-            wait(others)
-        return [first, *(future.result() for future in others)]
-
-
-def servo_name(bus: DynamixelBus, servo_id: int) -> str:
-    """A servo's name in messages."""
-    return f"servo {servo_id} at {bus.name}"
-
-
-def _call(function: Callable[[], T]) -> T | HardwareError:
-    """The result of a call, or its error."""
-    try:
-        return function()
-    except HardwareError as error:
-        return error
+    @override
+    def _explain(self, error: int) -> str:
+        unknown = f"error {error}, which the protocol does not have"
+        return packets.STATUS_ERRORS.get(error, unknown)

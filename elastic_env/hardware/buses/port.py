@@ -4,7 +4,7 @@
 |---|---|
 | outgoing packets are not byte-stuffed | `PacketHandler.txPacket` stuffs them |
 | unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` |
-| every reply may take 34 ms before it counts as missing | `DynamixelBus.reply_timeout_s` |
+| every reply may take 34 ms before it counts as missing | `ServoBus.reply_timeout_s` |
 | waiting for a reply is a busy loop | `Port` blocks in the read |
 | each reply is read in two pieces | `Port.readPort` reads all that is there |
 | an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |

@@ -1,8 +1,9 @@
 """Servo types as data: control tables, units, and the torque that a current stands for.
 
-`models.csv` lists the servos by the model number that they report, with the units of position,
-velocity and current. The other files beside this module are the maker's tables of registers. A new
-servo of the same protocol needs a row there and, if its registers differ, a table.
+`models.csv` lists the servos by the model number that they report, with their protocol and units.
+The other files beside this module are the makers' tables of registers. A new servo of a known
+protocol needs a row there and, if its registers differ, a table. Names of registers that the
+driver uses are the same in all tables.
 """
 
 import csv
@@ -10,15 +11,15 @@ import functools
 import math
 from dataclasses import dataclass
 from importlib import resources
-from typing import Literal, NoReturn
+from typing import Literal, NoReturn, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.errors import unknown_name
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, Parameter
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.joint.dynamixel import LOSS_NM, SERVO, TORQUE_PER_CURRENT
+from elastic_env.joint.dynamixel import SERVO
 
 NUM_BLOCKS = 24
 """Ways to read a servo's state.
@@ -33,22 +34,39 @@ More hurts the gear.
 """
 
 _RPM = 2.0 * math.pi / 60.0
-_MOTION = ("present_position", "present_velocity", "present_current")
+Protocol = Literal["dynamixel", "feetech"]
+"""Packets on the wire: Dynamixel Protocol 2.0, or that of Feetech's STS and SMS."""
+
+_PROTOCOLS: dict[str, Protocol] = {name: name for name in get_args(Protocol)}
 _TEMPERATURE = "present_temperature"
-_HARDWARE_ERRORS = {
-    0: "input voltage out of its limits",
-    1: "motor hall sensor",
-    2: "overheating",
-    3: "motor encoder",
-    4: "electrical shock or too little power",
-    5: "overload",
+_ERRORS: dict[Protocol, dict[int, str]] = {
+    "dynamixel": {
+        0: "input voltage out of its limits",
+        1: "motor hall sensor",
+        2: "overheating",
+        3: "motor encoder",
+        4: "electrical shock or too little power",
+        5: "overload",
+    },
+    "feetech": {
+        0: "input voltage out of its limits",
+        1: "magnetic encoder",
+        2: "overheating",
+        3: "overcurrent",
+        5: "overload",
+    },
 }
-"""Bits of `hardware_error_status` (ROBOTIS e-manual)."""
+"""Bits of `hardware_error_status` (ROBOTIS e-manual; Feetech's memory table)."""
+OVERLOAD = 1 << 5
+"""Bit of an overload in both."""
 
 
 @dataclass(frozen=True)
 class Register:
-    """An entry of a control table. Numbers are little endian, negative ones in two's complement."""
+    """An entry of a control table. Numbers are little endian.
+
+    Negative ones are in two's complement, or a magnitude with a bit for the sign.
+    """
 
     address: int
     size: int
@@ -57,6 +75,8 @@ class Register:
     memory: Literal["EEPROM", "RAM"]
     initial: int
     is_signed: bool
+    sign_bit: int | None = None
+    """Number of the bit that is set for a negative value; None for two's complement."""
 
     @property
     def end(self) -> int:
@@ -69,8 +89,11 @@ class Register:
         Raises:
             HardwareError: It does not fit.
         """
+        stored = value
+        if self.sign_bit is not None and abs(value) < 1 << self.sign_bit:
+            stored = abs(value) | (value < 0) << self.sign_bit
         try:
-            return value.to_bytes(self.size, "little", signed=self.is_signed)
+            return stored.to_bytes(self.size, "little", signed=self.is_signed)
         except OverflowError:
             raise HardwareError(
                 f"register {self.name!r} has {self.size} bytes, which {value} does not fit"
@@ -78,7 +101,11 @@ class Register:
 
     def decode(self, stored: bytes | bytearray) -> int:
         """The value of stored bytes."""
-        return int.from_bytes(stored, "little", signed=self.is_signed)
+        value = int.from_bytes(stored, "little", signed=self.is_signed)
+        if self.sign_bit is None:
+            return value
+        size = value & ((1 << self.sign_bit) - 1)
+        return -size if value >> self.sign_bit & 1 else size
 
 
 class ControlTable(dict[str, Register]):
@@ -107,19 +134,59 @@ class ServoModel:
 
     number: int
     name: str
+    protocol: Protocol
     table: ControlTable
     counts_per_turn: int
+    zero_count: int
+    """Count that is the angle zero: the middle of a servo that counts one turn from 0."""
     velocity_unit: float
     """One count of velocity [rad/s]."""
+    load_register: str
+    """Register of the current, or of the load where there is no current."""
     current_unit: float
-    """One count of current [A]."""
+    """One count of it as a current [A]."""
+    torque_per_ampere: float
+    loss: float
+    """Line from current to torque at the output: slope [N·m/A], and what is lost [N·m]."""
+    largest_torque: float
+    """Torque that the servo may give for long [N·m]."""
     current_limit: str
-    """Name of the register that limits the current."""
+    """Name of the register that limits the current, "" where nothing hurts the gear."""
+    effort_register: str
+    """Register that limits the torque at once, in RAM; "" where there is none."""
+    effort_maximum: str
+    """Register that bounds it, in EEPROM."""
 
     @property
     def position_unit(self) -> float:
         """One count of position [rad]."""
         return 2.0 * math.pi / self.counts_per_turn
+
+    def angle(self, count: int) -> float:
+        """Angle of a count of position [rad]."""
+        return (count - self.zero_count) * self.position_unit
+
+    def count(self, angle: float) -> int:
+        """Count of position of an angle [rad]."""
+        return round(angle / self.position_unit) + self.zero_count
+
+    def torque(self, current: npt.ArrayLike) -> Array:
+        """Torque at the output for signed currents, (...) [A] to (...) [N·m].
+
+        Zero where the current only meets the losses.
+        """
+        amperes = np.asarray(current, dtype=np.float64)
+        return torque_of_current(amperes, self.torque_per_ampere, self.loss)
+
+    def current(self, torque: float) -> float:
+        """Signed current [A] for a torque at the output [N·m]."""
+        return float(np.sign(torque) * (abs(torque) + self.loss) / self.torque_per_ampere)
+
+    def explain_errors(self, status: int) -> str:
+        """Words for a hardware error status, "" where there is none."""
+        errors = _ERRORS[self.protocol].items()
+        known = ", ".join(text for bit, text in errors if status >> bit & 1)
+        return known or (f"error {status}" if status else "")
 
     @property
     def has_watchdog(self) -> bool:
@@ -134,8 +201,8 @@ class ServoModel:
         protocol has no other mark of that.
         """
         registers = self.table.values()
-        first = min(self.table[name].address for name in _MOTION)
-        last = max(self.table[name].end for name in _MOTION)
+        first = min(self.table[name].address for name in self._motion)
+        last = max(self.table[name].end for name in self._motion)
         starts = [own.address for own in registers if own.address <= first]
         ends = [own.end for own in registers if own.end >= last]
         by_length = {end - start: range(start, end) for start in starts for end in ends}
@@ -151,18 +218,37 @@ class ServoModel:
 
         Nan where it has none.
         """
-        units = (self.position_unit, self.velocity_unit, self.current_unit)
-        counts = [self._decode(name, block, data) for name in _MOTION]
+        position, velocity, load = (self._decode(name, block, data) for name in self._motion)
         degrees = math.nan
         if self.has_temperature(block):
             degrees = self._decode(_TEMPERATURE, block, data)
-        motion = [unit * count for unit, count in zip(units, counts, strict=True)]
-        return [*motion, degrees]
+        motion = [velocity * self.velocity_unit, load * self.current_unit]
+        return [self.angle(position), *motion, degrees]
+
+    @property
+    def _motion(self) -> tuple[str, str, str]:
+        return "present_position", "present_velocity", self.load_register
 
     def _decode(self, name: str, block: range, data: bytes) -> int:
         register = self.table[name]
         start = register.address - block.start
         return register.decode(data[start : start + register.size])
+
+
+def torque_of_current(current: Array, per_ampere: Parameter, loss: Parameter) -> Array:
+    r"""Torque at the output by a servo's line.
+
+    .. math:: \tau = \mathrm{sign}(I) \max(k |I| - \tau_0, 0)
+
+    Args:
+        current: I, (..., n) [A].
+        per_ampere: k, broadcast against it [N·m/A].
+        loss: τ₀, what does not reach the output, likewise [N·m].
+
+    Returns:
+        τ, (..., n) [N·m].
+    """
+    return np.sign(current) * np.maximum(per_ampere * np.abs(current) - loss, 0.0)
 
 
 def servo_model(number: int) -> ServoModel:
@@ -188,11 +274,19 @@ def servo_models() -> dict[int, ServoModel]:
         ServoModel(
             number=int(row["model_number"]),
             name=row["name"],
+            protocol=_PROTOCOLS[row["protocol"]],
             table=_read_table(row["table"]),
             counts_per_turn=int(row["counts_per_turn"]),
+            zero_count=int(row["zero_count"]),
             velocity_unit=float(row["velocity_unit_rpm"]) * _RPM,
+            load_register=row["load_register"],
             current_unit=1e-3 * float(row["current_unit_ma"]),
+            torque_per_ampere=float(row["torque_per_ampere"]),
+            loss=float(row["loss_nm"]),
+            largest_torque=float(row["torque_nm"]),
             current_limit=row["current_limit"],
+            effort_register=row["effort_register"],
+            effort_maximum=row["effort_maximum"],
         )
         for row in _read_rows("models.csv")
     )
@@ -210,6 +304,7 @@ def _read_table(file: str) -> ControlTable:
             memory="EEPROM" if row["memory"] == "EEPROM" else "RAM",
             initial=int(row["initial"] or 0),
             is_signed=row["signed"] == "Y",
+            sign_bit=int(row["signed"]) if row["signed"].isdigit() else None,
         )
         for row in _read_rows(file)
     )
@@ -221,33 +316,3 @@ def _read_rows(file: str) -> list[dict[str, str]]:
     path = resources.files("elastic_env.hardware.buses") / file
     lines = path.read_text(encoding="utf-8").splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
-
-
-def explain_errors(status: int) -> str:
-    """Words for a hardware error status, "" where there is none."""
-    errors = _HARDWARE_ERRORS.items()
-    known = ", ".join(text for bit, text in errors if status >> bit & 1)
-    return known or (f"error {status}" if status else "")
-
-
-def torque_of_current(current: npt.ArrayLike) -> Array:
-    """Torque at the output for signed currents, by the line that was measured at an H54-200-S500-R.
-
-    |τ| = 4.338 N·m/A |I| − 2.694 N·m, and zero where the current only meets the losses. The line is
-    rough: gear and temperature change it. Source: a public ROS configuration, see
-    `elastic_env/joint/dynamixel.py`.
-
-    Args:
-        current: (...) [A].
-
-    Returns:
-        (...) [N·m].
-    """
-    amperes = np.asarray(current, dtype=np.float64)
-    torque = TORQUE_PER_CURRENT * np.abs(amperes) - LOSS_NM
-    return np.sign(amperes) * np.maximum(torque, 0.0)
-
-
-def current_of_torque(torque: float) -> float:
-    """Signed current [A] for a torque at the output [N·m]."""
-    return float(np.sign(torque) * (abs(torque) + LOSS_NM) / TORQUE_PER_CURRENT)

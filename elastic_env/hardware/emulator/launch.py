@@ -11,7 +11,9 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.joints import EmulatedArm
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.safety.processes import end_child, start_child
 from elastic_env.robots.testbed.config import TestbedConfig
@@ -45,6 +47,8 @@ class Faults(Model):
     """The servos are at 95 °C, and report no error."""
     silent: bool = False
     """The servos hear but do not answer."""
+    same_id: bool = False
+    """A second servo answers with the first id, at the same time."""
     unplugged: bool = False
     """The port is gone."""
     imu_silent: bool = False
@@ -99,25 +103,39 @@ class EmulatorConfig(Model):
     """Model number that they report, if it is to be a wrong one."""
     ids: tuple[int, ...] = (1,)
     """Their ids."""
+    registers: dict[str, int] = {}
+    """Registers of all servos that differ from the factory's [count]."""
     testbed: TestbedConfig = TestbedConfig()
     """The joints behind them, and through its scenario the quality of the IMU."""
+    arm: EmulatedArm | None = None
+    """An arm behind them, in the place of the testbed's joints."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000)
     """Packets of the IMU per second [Hz]."""
-    baudrate: int = quantity("bit/s", 3_000_000, **packets.RANGE_OF_RATES)
-    """Rate of the bus; no other is heard [bit/s]."""
+    baudrate: int | None = quantity("bit/s", None, **packets.RANGE_OF_RATES)
+    """Rate of the bus, no other is heard; default the usual one of the protocol [bit/s]."""
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0)
     """Seed of faults and noise [1]."""
 
     @model_validator(mode="after")
     def _servos_exist(self) -> Self:
-        servo_model(self.model_number)
-        if not hasattr(termios, f"B{self.baudrate}"):
+        model = servo_model(self.model_number)
+        for name in self.registers:
+            _ = model.table[name]
+        if self.arm is not None and len(self.arm.order) != len(self.ids):
+            count = f"{len(self.ids)} ids for {len(self.arm.order)} joints"
+            raise ValueError(f"an emulated arm needs one id for each of its joints, got {count}")
+        if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(
-                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {packets.RATES}"
+                f"a pseudo-terminal has no rate of {self.rate} bit/s; it has {packets.RATES}"
             )
         packets.require_ids(self.ids)
         return self
+
+    @property
+    def rate(self) -> int:
+        """Rate of the bus [bit/s]."""
+        return self.baudrate or BUSES[servo_model(self.model_number).protocol].rates[0]
 
 
 class RunningEmulator(AbstractContextManager["RunningEmulator"]):

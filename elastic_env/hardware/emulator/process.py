@@ -20,7 +20,7 @@ import numpy as np
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.imu import EmulatedImu
-from elastic_env.hardware.emulator.joints import Joints
+from elastic_env.hardware.emulator.joints import ArmJoints, Joints, ServoJoints
 from elastic_env.hardware.emulator.launch import EmulatorConfig, damage
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
@@ -33,6 +33,7 @@ _SETTLE_S = 3e-4  # after a write, for the kernel to pass it on at its lower pri
 _WAIT_S = 0.1
 _KEPT_EVENTS = 100_000
 _UNREAD_BYTES = 2000
+_OTHER = 0x11  # bits that the end of another servo's reply leaves
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
@@ -102,16 +103,21 @@ class Emulator:
         # time
         self._reply_faults = np.random.default_rng([config.seed, 0])
         self._instruction_faults = np.random.default_rng([config.seed, 2])
-        self._joints = Joints(config.testbed, len(config.ids), now)
+        self._joints: ServoJoints
+        if config.arm is None:
+            self._joints = Joints(config.testbed, len(config.ids), now)
+        else:
+            self._joints = ArmJoints(config.arm, now)
         claimed = config.claimed_model_number
         self._servos: list[EmulatedServo] = []
         for index, servo_id in enumerate(config.ids):
             motion = partial(self._joints.motion, index)
             note = partial(self._note, index)
-            self._servos.append(EmulatedServo(servo_id, model, note, claimed, motion))
+            servo = EmulatedServo(servo_id, model, note, claimed, motion, config.registers)
+            self._servos.append(servo)
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
-        self._parser = packets.Parser()
+        self._parser = self._bus.wire.parser()
         self._replies: deque[tuple[float, bytes]] = deque()
         self._settled_s = now
 
@@ -154,7 +160,7 @@ class Emulator:
             self.bus_terminal = None
         elif not self.faults.unplugged and self.bus_terminal is None:
             self.bus_terminal = Terminal()
-            self._parser = packets.Parser()
+            self._parser = self._bus.wire.parser()
             self._replies.clear()
 
     @property
@@ -198,8 +204,9 @@ class Emulator:
         """Pass a change of a servo on to its joint."""
         self.events.append((time.monotonic(), servo_id, name, value))
         servo = self._servos[index]
+        if name in ("torque_enable", servo.model.effort_register):
+            self._joints.set_torque(index, servo.effort if servo.is_on else 0.0)
         if name == "torque_enable":
-            self._joints.set_torque(index, bool(value))
             self._joints.command(index, servo.goal)
         if name == "goal_position" and servo.is_on:
             self._joints.command(index, servo.goal)
@@ -208,22 +215,30 @@ class Emulator:
         """Answer the instructions that have come; returns when they were read."""
         data = terminal.read_bytes()
         now = time.monotonic()
-        if not terminal.has_rate(self.config.baudrate):
+        if not terminal.has_rate(self.config.rate):
             return now  # noise
         for packet in self._parser.parse(data):
             if self._instruction_faults.random() < self.faults.unheard:
                 continue
             for reply in self._bus.answer(packet, now):
-                self._queue(reply, now)
+                self._queue(self._doubled(reply), now)
             if packet.instruction == packets.SYNC_READ:
                 name = "present_position"
                 for servo in self._servos:
                     self.events.append((now, servo.servo_id, name, servo[name]))
         return now
 
+    def _doubled(self, reply: bytes) -> bytes:
+        """A reply as the line has it, where low bits win, if two servos have the first id."""
+        first = self._servos[0].servo_id
+        at = {"dynamixel": 4, "feetech": 2}[self._servos[0].model.protocol]
+        if not self.faults.same_id or reply[at] != first:
+            return reply
+        return reply[:-4] + bytes(byte & _OTHER for byte in reply[-4:])
+
     def _queue(self, reply: bytes, now: float) -> None:
         data, delay_s = damage(self.faults, reply, self._reply_faults)
-        wire_s = 10.0 * len(reply) / self.config.baudrate
+        wire_s = 10.0 * len(reply) / self.config.rate
         begin_s = max(now + delay_s, self._replies[-1][0] if self._replies else now)
         if data:
             self._replies.append((begin_s + wire_s, data))

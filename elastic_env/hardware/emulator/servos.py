@@ -1,14 +1,12 @@
-"""Emulated servos and their bus: registers with their rules, and the answers of Protocol 2.0."""
+"""Emulated servos and their bus: registers with their rules, and what they answer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from elastic_env.hardware.buses import packets, servo_models
-from elastic_env.hardware.buses.packets import Packet, word, words
-from elastic_env.hardware.buses.servo_models import Register, ServoModel
-
-OVERLOAD = 1 << 5
-"""Bit of an overload in the hardware error status."""
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.packets import Packet
+from elastic_env.hardware.buses.servo_models import OVERLOAD, Register, ServoModel
+from elastic_env.hardware.emulator.wires import WIRES, is_ping_to_all
 
 Notify = Callable[[int, str, int], None]
 
@@ -31,6 +29,7 @@ class EmulatedServo:
         notify: Called with id, register and value when torque, goal or watchdog change.
         model_number: Number that it claims, if another one than its type's.
         motion: Gives what it measures: angle, its rate and torque [rad], [rad/s], [N·m].
+        registers: Values that differ from the factory's, by name [count].
     """
 
     servo_id: int
@@ -38,22 +37,26 @@ class EmulatedServo:
     notify: Notify
     model_number: int | None = None
     motion: Callable[[], tuple[float, float, float]] = lambda: (0.0, 0.0, 0.0)
+    registers: Mapping[str, int] = field(default_factory=dict)
     _memory: bytearray = field(init=False)
     _heard_s: float = 0.0
 
     def __post_init__(self) -> None:
         self._memory = bytearray(self.model.table.size)
-        limit = self.model.current_limit
-        strongest = servo_models.current_of_torque(servo_models.LARGEST_TORQUE_NM)
-        allowed = int(strongest / self.model.current_unit)
         for register in self.model.table.values():
             self[register.name] = register.initial
         self["model_number"] = self.model_number or self.model.number
         self["firmware_version"] = _FIRMWARE
         self["id"] = self.servo_id
         self["return_delay_time"] = 0
-        self[limit] = min(self[limit], allowed)
-        self["present_input_voltage"] = _SUPPLY_DV
+        if limit := self.model.current_limit:
+            strongest = self.model.current(self.model.largest_torque)
+            self[limit] = min(self[limit], int(strongest / self.model.current_unit))
+        ends = (self["min_voltage_limit"], self["max_voltage_limit"])
+        is_usual = ends[0] < _SUPPLY_DV < ends[1]
+        self["present_input_voltage"] = _SUPPLY_DV if is_usual else sum(ends) // 2
+        for name, value in self.registers.items():
+            self[name] = value
         self.heat(False)
 
     def __getitem__(self, name: str) -> int:
@@ -74,15 +77,21 @@ class EmulatedServo:
     @property
     def goal(self) -> float:
         """Goal position [rad]."""
-        return self["goal_position"] * self.model.position_unit
+        return self.model.angle(self["goal_position"])
+
+    @property
+    def effort(self) -> float:
+        """Share of its torque that it may give."""
+        name = self.model.effort_register
+        return self[name] / self[self.model.effort_maximum] if name else 1.0
 
     def measure(self) -> None:
         """Put what it measures into its registers."""
         position, velocity, torque = self.motion()
-        self["present_position"] = round(position / self.model.position_unit)
+        self["present_position"] = self.model.count(position)
         self["present_velocity"] = round(velocity / self.model.velocity_unit)
-        current = servo_models.current_of_torque(torque)
-        self["present_current"] = round(current / self.model.current_unit)
+        load = self.model.current(torque) / self.model.current_unit
+        self[self.model.load_register] = round(load)
 
     def heat(self, is_hot: bool) -> None:
         """Make it hot, which it shows as its temperature alone, or let it cool."""
@@ -111,18 +120,18 @@ class EmulatedServo:
         """Note that an instruction for anybody came over the bus."""
         self._heard_s = now_s
 
-    def answer(self, instruction: int, parameters: bytes) -> tuple[int, bytes]:
-        """Error number and data of the reply to an instruction."""
+    def answer(self, instruction: int, parameters: bytes) -> bytes:
+        """The reply to an instruction, as it goes over the wire."""
+        wire = WIRES[self.model.protocol]
         match instruction:
             case packets.PING:
-                number = word(self["model_number"])
-                return self._alert, number + bytes([self["firmware_version"]])
-            case packets.READ if len(parameters) == 4:
-                return self.read_memory(*words(parameters))
-            case packets.WRITE if len(parameters) > 2:
-                return self.write_memory(words(parameters)[0], parameters[2:]), b""
+                return wire.status(self, self._alert, wire.greeting(self))
+            case packets.READ if len(parameters) == wire.place_bytes:
+                return wire.status(self, *self.read_memory(*wire.place(parameters)))
+            case packets.WRITE if len(parameters) > wire.place_bytes // 2:
+                return wire.status(self, self.write_memory(*wire.written(parameters)))
             case _:
-                return packets.INSTRUCTION_ERROR | self._alert, b""
+                return wire.status(self, packets.INSTRUCTION_ERROR | self._alert)
 
     def read_memory(self, address: int, length: int) -> tuple[int, bytes]:
         """Error number and bytes; beyond the table there is nothing to read."""
@@ -167,6 +176,8 @@ class EmulatedServo:
         ):
             return packets.RANGE_ERROR
         match register.name:
+            case "goal_position" if self.model.protocol == "feetech":
+                return 0  # one beyond the limits is cut, see `_change`
             case "goal_position":
                 lowest = self["min_position_limit"]
                 is_within = lowest <= value <= self["max_position_limit"]
@@ -185,8 +196,10 @@ class EmulatedServo:
         A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that
         they do not.
         """
+        if name == "goal_position" and self.model.protocol == "feetech":
+            value = min(max(value, self["min_position_limit"]), self["max_position_limit"])
         self[name] = value
-        if name in _SWITCHES:
+        if name in (*_SWITCHES, self.model.effort_register):
             self.notify(self.servo_id, name, value)
 
     @property
@@ -198,39 +211,33 @@ class EmulatedBus:
     """Hands instructions to its servos, and orders what they answer as the protocol says.
 
     Args:
-        servos: In any order.
+        servos: In any order, of one protocol.
     """
 
     def __init__(self, servos: Sequence[EmulatedServo]) -> None:
         self.servos = {servo.servo_id: servo for servo in servos}
+        self.wire = WIRES[servos[0].model.protocol]
 
     def answer(self, packet: Packet, now_s: float) -> list[bytes]:
         """Replies to an instruction, each as it goes over the wire, in their order."""
         for servo in self.servos.values():
             servo.hear(now_s)
+        one = self.servos.get(packet.servo_id)
         if not packet.is_intact:
-            reply = packets.status(packet.servo_id, packets.CRC_ERROR)
-            return [reply] if packet.servo_id in self.servos else []
+            return [] if one is None else self.wire.complaint(one)
         parameters = packet.parameters
+        begin = self.wire.place_bytes
         match packet.instruction:
             case packets.SYNC_READ:
-                address, length = words(parameters)
-                asked = [i for i in parameters[4:] if i in self.servos]
-                replies = [(i, *self.servos[i].read_memory(address, length)) for i in asked]
-                return [packets.status(*reply) for reply in replies]
+                place = self.wire.place(parameters)
+                asked = [self.servos[i] for i in parameters[begin:] if i in self.servos]
+                return [self.wire.status(each, *each.read_memory(*place)) for each in asked]
             case packets.SYNC_WRITE:
-                address, length = words(parameters)
-                for at in range(4, len(parameters) - length, length + 1):
+                address, length = self.wire.place(parameters)
+                for at in range(begin, len(parameters) - length, length + 1):
                     if servo := self.servos.get(parameters[at]):
                         servo.write_memory(address, parameters[at + 1 : at + 1 + length])
                 return []
-            case packets.PING if packet.servo_id == packets.BROADCAST:
-                return [self._instruct(i, packet) for i in sorted(self.servos)]
-            case _ if packet.servo_id in self.servos:
-                return [self._instruct(packet.servo_id, packet)]
-            case _:
-                return []
-
-    def _instruct(self, servo_id: int, packet: Packet) -> bytes:
-        answer = self.servos[servo_id].answer(packet.instruction, packet.parameters)
-        return packets.status(servo_id, *answer)
+        found = sorted(self.servos) if is_ping_to_all(packet) else [packet.servo_id]
+        reached = [self.servos[i] for i in found if i in self.servos]
+        return [each.answer(packet.instruction, parameters) for each in reached]

@@ -1,4 +1,4 @@
-"""Live loops: the testbed on hardware as an environment, one control cycle for one step."""
+"""Live loops: an arm that follows targets, and the testbed as an environment."""
 
 NAME = "hardware"
 ID = "elastic_env/HardwareTestbed-v0"

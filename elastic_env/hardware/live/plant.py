@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety import realtime
@@ -246,7 +245,7 @@ class ServoPlant:
                 break
             missed += 1
         self._read(cycle)
-        torque = float(torque_of_current(cycle.states.current[0]))
+        torque = float(cycle.states.torque[0])
         period_s = cycle.states.time_s - self._read_s
         timing = (late_s, period_s, overruns, missed, self.record.limited + is_limited)
         self.record = CycleRecord(self.settings.direction * torque, *timing)

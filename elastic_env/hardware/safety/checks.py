@@ -10,21 +10,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from elastic_env.hardware.buses import servo_models
-from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM
+from elastic_env.hardware.buses.servo_bus import ServoBus
 
-_POSITION_MODE = 3
-_FULL_REPLIES = 2
 _LONGEST_DELAY_US = 20
 _DELAY_UNIT_US = 2
 _WARM_SHARE = 0.8
 _PINGS = 50
 _LOST = 2
 """Replies lost or damaged from which a line counts as bad; a busy computer may cost one."""
-_SLOW_S = 2.5e-3
+_FINE_SPEED = 1 << 2
+"""Bit of Feetech's `phase` with which a count of velocity is 1 pulse/s, not 50."""
 _FASTER = (
-    "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to 0, "
+    "too slow: set the adapter's latency timer to 1 ms, the servos' return delay to 0, "
     "and the bus to 1 Mbit/s or more"
 )
 _BETTER_LINE = (
@@ -47,7 +44,7 @@ class Check:
     """True if nothing may move before that is done."""
 
 
-def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
+def check_bus(bus: ServoBus, ids: Sequence[int]) -> list[Check]:
     """Look at the port and at every servo.
 
     Args:
@@ -66,7 +63,7 @@ def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
     return checks
 
 
-def _check_line(bus: DynamixelBus, servo_id: int) -> list[Check]:
+def _check_line(bus: ServoBus, servo_id: int) -> list[Check]:
     """Latency of the adapter, and round trips of pings to a servo."""
     latency = bus.port.latency_timer_ms
     unknown = "not an FTDI adapter, or not told; see the round trip"
@@ -76,7 +73,7 @@ def _check_line(bus: DynamixelBus, servo_id: int) -> list[Check]:
     retries = bus.num_retries
     for _ in range(_PINGS):
         begin = time.monotonic()
-        bus.ping(servo_id)
+        bus.knock(servo_id)
         times.append(time.monotonic() - begin)
     lost = bus.num_retries - retries
     typical = statistics.median(times)
@@ -84,12 +81,12 @@ def _check_line(bus: DynamixelBus, servo_id: int) -> list[Check]:
     losses = f"{lost} of {_PINGS} pings"
     return [
         Check("latency timer", told, (latency or 0) <= 1, cure, is_vital=False),
-        Check("round trip of a ping", trip, typical < _SLOW_S, _FASTER),
+        Check("round trip of a ping", trip, typical < bus.slowest_trip_s, _FASTER),
         Check("lost replies", losses, lost < _LOST, _BETTER_LINE, is_vital=False),
     ]
 
 
-def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
+def _check_servo(bus: ServoBus, servo_id: int) -> list[Check]:
     checks: list[Check] = []
     model = bus.models[servo_id]
     read = partial(bus.read_register, servo_id)
@@ -99,7 +96,7 @@ def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
 
     firmware = read("firmware_version")
     check("model, firmware", f"{model.number} {model.name}, version {firmware}")
-    error = servo_models.explain_errors(read("hardware_error_status"))
+    error = model.explain_errors(read("hardware_error_status"))
     restart = "remove the cause, then switch the power off and on"
     check("hardware error", error or "none", not error, restart)
     volts = read("present_input_voltage") / 10.0
@@ -112,24 +109,30 @@ def _check_servo(bus: DynamixelBus, servo_id: int) -> list[Check]:
     cool = f"let it cool; limit {hottest} °C"
     check("temperature", f"{degrees} °C", degrees < _WARM_SHARE * hottest, cool)
     mode = read("operating_mode")
-    mend = f"with torque off, write {_POSITION_MODE}, position, to operating_mode"
-    check("operating mode", str(mode), mode == _POSITION_MODE, mend)
+    mend = f"with torque off, write {bus.position_mode}, position, to operating_mode"
+    check("operating mode", str(mode), mode == bus.position_mode, mend)
     delay_us = _DELAY_UNIT_US * read("return_delay_time")
     mend = "with torque off, write 0 to return_delay_time"
     check("return delay", f"{delay_us} µs", delay_us <= _LONGEST_DELAY_US, mend)
     level = read("status_return_level")
-    mend = f"write {_FULL_REPLIES} to status_return_level"
-    check("status return level", str(level), level == _FULL_REPLIES, mend)
-    amperes = read(model.current_limit) * model.current_unit
-    strongest = servo_models.current_of_torque(LARGEST_TORQUE_NM)
-    mend = (
-        f"with torque off, write {round(strongest / model.current_unit)} to {model.current_limit}:"
-        f" more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"
-    )
-    is_weak = amperes <= strongest + 0.1
-    check("current limit", f"{amperes:.1f} A", is_weak, mend, is_vital=False)
-    lowest = read("min_position_limit") * model.position_unit
-    highest = read("max_position_limit") * model.position_unit
+    mend = f"write {bus.full_replies} to status_return_level"
+    check("status return level", str(level), level == bus.full_replies, mend)
+    if model.current_limit:
+        amperes = read(model.current_limit) * model.current_unit
+        strongest = model.current(model.largest_torque)
+        mend = (
+            f"with torque off, write {round(strongest / model.current_unit)} to"
+            f" {model.current_limit}: more than {model.largest_torque:g} N·m hurts the gear"
+        )
+        is_weak = amperes <= strongest + 0.1
+        check("current limit", f"{amperes:.1f} A", is_weak, mend, is_vital=False)
+    if "phase" in model.table:
+        phase = read("phase")
+        mend = f"with torque off, write {phase | _FINE_SPEED} to phase: its speeds are 50 times off"
+        check("phase", str(phase), bool(phase & _FINE_SPEED), mend)
+    lowest = model.angle(read("min_position_limit"))
+    highest = model.angle(read("max_position_limit"))
+    check("homing offset", f"{read('homing_offset') * model.position_unit:+.4f} rad")
     check("position", f"{bus.read_position(servo_id):+.4f} rad")
     check("position limits", f"{lowest:.2f} to {highest:.2f} rad")
     is_on = bool(read("torque_enable"))

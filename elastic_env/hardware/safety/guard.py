@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States
-from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.settings import SafetyLimits
 
@@ -52,12 +51,14 @@ class Guard:
     """Keeps commands within limits, and notices when the measured state leaves them.
 
     Args:
-        limits: The limits, the same for all servos.
+        limits: The limits, the same for all servos but for `ranges`.
         measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead
             away from there as fast as the limits allow.
         names: The servos' names in messages, (n,).
         hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each
             and the limit holds.
+        strongest: Torques that the servos may give for long, (n,) [N·m]; likewise.
+        ranges: Lowest and highest goal of each servo, (n, 2) [rad]; None for those of the limits.
 
     Raises:
         FaultError: A position lies outside the goals' range, or is not known.
@@ -69,24 +70,29 @@ class Guard:
         measured: Array,
         names: Sequence[str],
         hottest: npt.ArrayLike = np.inf,
+        strongest: npt.ArrayLike = np.inf,
+        ranges: Array | None = None,
     ) -> None:
         n = len(measured)
         self.limits = limits
         self.goals = np.array(measured, dtype=np.float64)
         self._names = tuple(names)
+        ends = np.tile([limits.lowest_rad, limits.highest_rad], (n, 1))
+        self._lowest, self._highest = (ends if ranges is None else ranges).T
         self._hottest: Array = np.minimum(np.full(n, limits.temperature_c), hottest)
+        self._strongest: Array = np.minimum(np.full(n, limits.torque_nm), strongest)
         # cycles in a row, (n,) each
         self._without_reply: IntArray = np.zeros(n, dtype=np.int64)
         self._without_temperature: IntArray = np.zeros(n, dtype=np.int64)
         self._strained: IntArray = np.zeros(n, dtype=np.int64)
         # the margin is for what is measured on the way; where a motion begins is its first goal
-        outside = is_outside(self.goals, limits.lowest_rad, limits.highest_rad)
+        outside = is_outside(self.goals, self._lowest, self._highest)
         if outside.any():
             raise FaultError(
-                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} "
-                "rad in the servos' own angles, not where these stand: "
-                f"{self._list(outside, self.goals)} rad; move them by hand while torque is off, "
-                "correct zero_rad and direction of the mounting, or widen the limits"
+                f"motion must begin between {self._ends(outside, ' and ')} rad in the servos' own"
+                f" angles, not where these stand: {self._list(outside, self.goals)} rad; move them"
+                " by hand while torque is off, correct zero_rad and direction of the mounting, or"
+                " widen the limits"
             )
 
     @property
@@ -117,7 +123,7 @@ class Guard:
             raise FaultError(f"the time since the last command must be {needed}")
         if not self.is_holding:
             reach = self.limits.slew_rad_s * elapsed_s
-            within = np.clip(asked, self.limits.lowest_rad, self.limits.highest_rad)
+            within = np.clip(asked, self._lowest, self._highest)
             self.goals = np.clip(within, self.goals - reach, self.goals + reach)
         return self.goals.copy(), self.goals != asked
 
@@ -129,11 +135,11 @@ class Guard:
         """
         limits = self.limits
         is_fresh = states.is_fresh
-        motion = np.stack([states.position, states.velocity, states.current])
+        motion = np.stack([states.position, states.velocity, states.torque])
         unreal = is_fresh & ~np.isfinite(motion).all(axis=0)
         if unreal.any():
             servos = self._list(unreal)
-            return f"position, velocity or current of {servos} is not a finite number"
+            return f"position, velocity or torque of {servos} is not a finite number"
         if states.has_alert.any():
             return "a servo reports a hardware error"
         self._without_reply = np.where(is_fresh, 0, self._without_reply + 1)
@@ -144,11 +150,11 @@ class Guard:
                 "row; look at cables and power, the adapter's latency timer, and what else keeps "
                 "the computer busy: elastic hardware check"
             )
-        lowest = limits.lowest_rad - limits.margin_rad
-        highest = limits.highest_rad + limits.margin_rad
+        lowest = self._lowest - limits.margin_rad
+        highest = self._highest + limits.margin_rad
         outside = is_fresh & is_outside(states.position, lowest, highest)
         if outside.any():
-            ends = f"{limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad"
+            ends = f"{self._ends(outside, ' to ')} rad"
             servos = self._list(outside, states.position)
             return f"a position is outside {ends}: {servos} rad"
         fast = is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
@@ -166,15 +172,16 @@ class Guard:
         return self._check_load(states) or self._check_heat(states.temperature)
 
     def _check_load(self, states: States) -> str:
-        torque = np.abs(torque_of_current(states.current))
-        is_strained = exceeds(torque, self.limits.torque_nm)
+        torque = np.abs(states.torque)
+        is_strained = exceeds(torque, self._strongest)
         strained = np.where(is_strained, self._strained + 1, 0)
         # a missing reply tells neither way
         self._strained = np.where(states.is_fresh, strained, self._strained)
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
         if too_long.any():
             torques = self._list(too_long, torque)
-            return f"the torque exceeds {self.limits.torque_nm:g} N·m: {torques} N·m"
+            allowed = ", ".join(f"{one:g}" for one in self._strongest[too_long])
+            return f"the torque exceeds {allowed} N·m: {torques} N·m"
         return ""
 
     def _check_heat(self, temperature: Array) -> str:
@@ -190,6 +197,11 @@ class Guard:
             servos = self._list(unknown)
             return f"no temperature from {servos} in {longest} cycles: elastic hardware check"
         return ""
+
+    def _ends(self, are: BoolArray, between: str) -> str:
+        """Ranges of the goals of some servos [rad], each once."""
+        ends = zip(self._lowest[are], self._highest[are], strict=True)
+        return ", ".join(dict.fromkeys(f"{low:.3f}{between}{high:.3f}" for low, high in ends))
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:
         """Names of some servos, with their values."""

@@ -13,9 +13,10 @@ import numpy as np
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware import errors
 from elastic_env.hardware.buses.bus import States
-from elastic_env.hardware.buses.dynamixel_bus import BusGroup, DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
-from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
+from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_bus import BusGroup
+from elastic_env.hardware.buses.servo_models import Protocol
 from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
@@ -59,7 +60,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
 
     Args:
         ports: Ids of the servos by port; arrays of all servos have them in this order.
-        baudrate: Bits per second.
+        baudrate: Bits per second; None for the usual rate of the protocol.
+        protocol: Of all servos.
 
     Attributes:
         models: Model numbers of the servos, a list for each port.
@@ -74,14 +76,18 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     """
 
     def __init__(
-        self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE
+        self,
+        ports: Mapping[str, Sequence[int]],
+        baudrate: int | None = None,
+        protocol: Protocol = "dynamixel",
     ) -> None:
         for ids in ports.values():
             require_ids(ids)
         self.models: list[list[int]] = []
         self.is_confirmed_off = False
         self._ports = {port: list(ids) for port, ids in ports.items()}
-        self._baudrate = baudrate
+        self._baudrate = baudrate or BUSES[protocol].rates[0]
+        self._protocol: Protocol = protocol
         self._is_enabled = False
         self._number = 0
         self._answer_s = _ANSWER_S
@@ -94,7 +100,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         self._channel = Channel(own)
         with other:
             file = other.fileno()
-            arguments = (str(file), str(baudrate), *ports)
+            arguments = (str(file), str(self._baudrate), protocol, *ports)
             options = {"pass_fds": [file], "stdin": subprocess.DEVNULL}
             self._process = start_child(_SUPERVISOR, *arguments, **options)
         try:
@@ -110,8 +116,12 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """Process id of the supervisor."""
         return self._process.pid
 
-    def enable(self, limits: SafetyLimits | None = None) -> Array:
+    def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
         """Torque on where the servos stand.
+
+        Args:
+            limits: Limits of all servos.
+            ranges: Lowest and highest goal of each, (n, 2) [rad]; None for those of the limits.
 
         Returns:
             Their positions, (n,) [rad].
@@ -124,7 +134,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         limits = limits or SafetyLimits()
         self._is_enabled = True
         self.is_confirmed_off = False
-        answer = self._request("enable", self._slow_s, limits=limits.model_dump())
+        ends = None if ranges is None else ranges.tolist()
+        arguments = {"limits": limits.model_dump(), "ranges": ends}
+        answer = self._request("enable", self._slow_s, **arguments)
         self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
         return np.array(answer["position"])
 
@@ -261,22 +273,24 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             how = f"ended (exit code {self._process.poll()})"
         else:
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
-        outcome = emergency_stop(self._ports, self._baudrate, self.models)
+        outcome = emergency_stop(self._ports, self._baudrate, self.models, self._protocol)
         return FaultError(f"the supervisor process {how}; {outcome}")
 
 
 def emergency_stop(
     ports: Mapping[str, Sequence[int]],
-    baudrate: int = DEFAULT_BAUDRATE,
+    baudrate: int | None = None,
     models: Sequence[Sequence[int]] = (),
+    protocol: Protocol = "dynamixel",
 ) -> str:
     """Switch torque off without a supervisor.
 
     Args:
         ports: Ids of the servos by port.
-        baudrate: Bits per second.
+        baudrate: Bits per second; None for the usual rate of the protocol.
         models: Their model numbers, in that order; where they are not given each servo is asked for
             its own first.
+        protocol: Of all servos.
 
     Returns:
         What came of it, in words.
@@ -290,7 +304,7 @@ def emergency_stop(
         except kind as error:
             problems.append(f"torque could not be switched off: {error}")
 
-    buses = [DynamixelBus(port, baudrate) for port in ports]
+    buses = [BUSES[protocol](port, baudrate) for port in ports]
     try:
         for number, (bus, ids) in enumerate(zip(buses, ports.values(), strict=True)):
             with noting(HardwareError):

@@ -16,12 +16,14 @@ import signal
 import socket
 import sys
 import time
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from elastic_env.hardware.buses.bus import Condition, States
-from elastic_env.hardware.buses.dynamixel_bus import BusGroup, DynamixelBus, servo_name
+from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_bus import BusGroup, ServoBus, servo_name
+from elastic_env.hardware.buses.servo_models import Protocol
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
@@ -30,7 +32,6 @@ from elastic_env.hardware.safety.processes import Channel, is_ending
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S
 from elastic_env.hardware.settings import SafetyLimits
 
-_REPLY_TIMEOUT_S = 0.003
 _GLANCE_S = 0.005
 """Silence after which to look whether the program lives; a command comes every 4 ms [s]."""
 _REST_RAD_S = 0.2
@@ -52,7 +53,7 @@ class Supervisor:
         program: Process id of the program.
     """
 
-    def __init__(self, channel: Channel, buses: list[Any], program: int) -> None:
+    def __init__(self, channel: Channel, buses: list[ServoBus], program: int) -> None:
         self._channel = channel
         self._program = program
         self._buses = buses
@@ -74,6 +75,7 @@ class Supervisor:
             pass  # the program is gone
         finally:
             try:
+                self._lower()
                 self._torque_off()
             except BaseException:
                 # a signal in this very moment; after it no other comes through
@@ -131,7 +133,9 @@ class Supervisor:
         models = [bus.models.values() for bus in self._buses]
         return {"models": [[model.number for model in of_bus] for of_bus in models]}
 
-    def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
+    def _enable(
+        self, limits: dict[str, Any], ranges: list[list[float]] | None = None
+    ) -> dict[str, Any]:
         """Torque on, with every servo's goal where it stands."""
         if isinstance(self._fault, BusGoneError):
             # for good: what is plugged in again is another port
@@ -145,7 +149,9 @@ class Supervisor:
             require_ready(name, condition, safety_limits.temperature_c)
         hottest = [condition.temperature_limit for condition in conditions]
         positions = np.array([bus.read_position(servo_id) for bus, servo_id in servos])
-        guard = Guard(safety_limits, positions, names, hottest)
+        strongest = [bus.models[servo_id].largest_torque for bus, servo_id in servos]
+        ends = None if ranges is None else np.array(ranges)
+        guard = Guard(safety_limits, positions, names, hottest, strongest, ends)
         self._fault = None
         try:
             for bus, servo_id in servos:
@@ -153,6 +159,7 @@ class Supervisor:
             for (bus, servo_id), angle in zip(servos, positions.tolist(), strict=True):
                 # confirmed: with torque, a servo may run to the goal it has
                 bus.write_goal(servo_id, angle)
+            self._servos.restore_effort()
             for bus, servo_id in servos:
                 bus.write_torque(servo_id, True)
             self._servos.write_goals(positions)
@@ -165,7 +172,7 @@ class Supervisor:
         self._commanded_s = time.monotonic()
         self._served_s = self._commanded_s
         for bus in self._buses:
-            bus.reply_timeout_s = _REPLY_TIMEOUT_S
+            bus.reply_timeout_s = bus.patience_s
         return {"position": positions.tolist()}
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
@@ -186,7 +193,7 @@ class Supervisor:
         self._commanded_s = now
         realtime.sleep_until(at)
         begin = time.monotonic()
-        states = self._servos.read_states(_REPLY_TIMEOUT_S)
+        states = self._servos.read_states(self._buses[0].patience_s)
         reason = guard.check(states)
         if reason:
             fault = self._stop(reason)
@@ -202,6 +209,7 @@ class Supervisor:
 
     def _disable(self) -> dict[str, Any]:
         """Torque off, confirmed."""
+        self._lower()
         problem = self._torque_off()
         if problem is not None:
             raise problem
@@ -228,6 +236,8 @@ class Supervisor:
 
     def _stop(self, reason: str, is_gone: bool = False) -> HardwareError:
         """End the motion for a reason; returns the error that answers from now on."""
+        if not is_gone:
+            self._lower()
         problem = self._torque_off()
         outcome = "torque is off" if problem is None else str(problem)
         kind = BusGoneError if isinstance(problem, BusGoneError) else FaultError
@@ -235,6 +245,12 @@ class Supervisor:
         is_said = reason in outcome or (is_gone and kind is BusGoneError)
         self._fault = kind(outcome if is_said else f"{reason}; {outcome}")
         return self._fault
+
+    def _lower(self) -> None:
+        """Let the torque fall within `release_s`, where the limits say so and the servos can."""
+        if self._guard is not None and self._guard.limits.release_s > 0.0:
+            self._say_busy()
+            self._servos.lower(self._guard.limits.release_s)
 
     def _torque_off(self) -> HardwareError | None:
         """Torque off at once, then confirmed; returns what is not certain about it."""
@@ -286,14 +302,14 @@ def _ignore(signal_number: int, _: Any) -> None:
     """In the place of SIG_IGN, with which Python complains of a signal that came just before."""
 
 
-def main(ports: list[str], baudrate: int, channel: Channel) -> None:
+def main(ports: list[str], baudrate: int, protocol: Protocol, channel: Channel) -> None:
     """Open the ports, say how that went, and serve."""
     program = os.getppid()
     for number in _SIGNALS:
         signal.signal(number, _end)
     # a thread for each of several buses
     realtime.prefer_realtime(realtime.Priority.SUPERVISOR, with_threads=True)
-    buses = [DynamixelBus(port, baudrate) for port in ports]
+    buses = [BUSES[protocol](port, baudrate) for port in ports]
     try:
         for bus in buses:
             bus.open()
@@ -308,4 +324,4 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
 
 if __name__ == "__main__":
     end = socket.socket(fileno=int(sys.argv[1]))
-    main(sys.argv[3:], int(sys.argv[2]), Channel(end))
+    main(sys.argv[4:], int(sys.argv[2]), cast("Protocol", sys.argv[3]), Channel(end))

@@ -1,0 +1,152 @@
+"""The walker's input_output as a header in C99: equal to Python, in random states and on a walk."""
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import baselines
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from tests.test_c_export import RELEASED, compiled, require_no_library
+from train.commands.cli import main
+from train.export.c_walker import PlayedSteps, c_walker, play_steps
+
+TOLERANCE = 1e-12
+WALKER = "elastic_env/WalkInPlace-v0"
+CASES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "weighing": {
+        "gains": {"weight_filter_s": 0.5, "dcm": 2.0, "force_difference": 0.05},
+        "stiffness": [600.0] * 6 + [1400.0] * 6,
+    },
+    "open": {"com_feedback": False, "gravity": "ankle", "ramp_s": 0.3},
+}
+DRIVER = r"""
+#include "arm.h"
+#include <stdio.h>
+
+int main(int count, char **paths) {
+    FILE *from = fopen(paths[1], "rb"), *to = fopen(paths[2], "wb");
+    double support, out[25];
+    arm_shown shown;
+    arm_plan plan;
+    arm_state state;
+    arm_begin(&state);
+    while (count == 3 && fread(&shown, 8, 43, from) == 43) {
+        int k;
+        if (fread(&support, 8, 1, from) != 1 || fread(&plan, sizeof plan, 1, from) != 1) return 1;
+        shown.support = (int)support;
+        out[0] = arm_step(&state, &shown, &plan, out + 1);
+        for (k = 0; k < 12; k++) out[13 + k] = state.links[k];
+        fwrite(out, sizeof out, 1, to);
+    }
+    fclose(from);
+    return fclose(to);
+}
+"""
+
+
+def walker(**options: Any) -> Any:
+    """The policy, in a walk that turns and goes forward, so that no frame is another one."""
+    env = gymnasium.make(
+        WALKER,
+        step_period=[0.3, 0.4, 0.3],
+        num_steps=4,
+        gait={"step_length_m": 0.1, "turn_rad": 0.1},
+    )
+    return baselines.make("input_output", env, **options)
+
+
+def played_in_c(policy: Any, steps: PlayedSteps, folder: Path) -> tuple[Array, Array, Array]:
+    """Statuses, offsets and link angles."""
+    program = compiled(folder, c_walker(policy, "arm"), "gcc", DRIVER)
+    count = len(steps.offset)
+    fields = [values.reshape(count, -1) for values in (*steps.shown, *steps.plan)]
+    np.hstack(fields).astype(np.float64).tofile(folder / "in")
+    subprocess.run([program, "in", "out"], cwd=folder, check=True, timeout=300)
+    found = np.fromfile(folder / "out").reshape(count, 25)
+    return found[:, 0], found[:, 1:13], found[:, 13:]
+
+
+def compare(policy: Any, count: int, folder: Path) -> None:
+    steps = play_steps(policy, count, seed=1)
+    status, offset, links = played_in_c(policy, steps, folder)
+    assert not status.any()
+    np.testing.assert_allclose(links, steps.links, rtol=0.0, atol=TOLERANCE)
+    # Python hands on offsets in single precision
+    np.testing.assert_array_almost_equal_nulp(offset.astype(np.float32), steps.offset, nulp=1)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
+    """Catches a wrong frame, foot, gain, filter or row of the plan, and a load on the wrong leg."""
+    compare(walker(**CASES[case]), 200, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_the_header_computes_what_python_does_in_ten_thousand_states(
+    case: str, tmp_path: Path
+) -> None:
+    compare(walker(**CASES[case]), 10_000, tmp_path)
+
+
+def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
+    """Catches a step that counts, a force that is not looked at, and a leg that has tipped over."""
+    policy = walker()
+    program = """#define ARM_TEST
+        #include "arm.h"
+        int main(void) {
+            arm_shown shown = arm_test_shown_[0];
+            arm_plan plan = arm_test_plan_[0];
+            double offset[12] = {7.0};
+            arm_state state;
+            arm_begin(&state);
+            shown.force[1] = NAN;
+            if (arm_step(&state, &shown, &plan, offset) != ARM_NOT_FINITE) return 1;
+            shown = arm_test_shown_[0];
+            shown.support = 2;
+            if (arm_step(&state, &shown, &plan, offset) != ARM_NOT_FINITE) return 2;
+            plan.soles_in_world[1][0] = INFINITY;
+            if (arm_step(&state, &arm_test_shown_[0], &plan, offset) != ARM_NOT_FINITE) return 3;
+            plan = arm_test_plan_[0];
+            shown = arm_test_shown_[0];
+            shown.zmp[0] = 1e5;
+            if (arm_step(&state, &shown, &plan, offset) != ARM_NO_EQUILIBRIUM) return 4;
+            return !(state.steps == 0 && offset[0] == 7.0 && arm_test() < 1e-12);
+        }"""
+    subprocess.run([compiled(tmp_path, c_walker(policy, "arm"), "gcc", program)], check=True)
+
+
+def test_it_needs_no_heap(tmp_path: Path) -> None:
+    function = """int all(arm_state *state, arm_shown *shown, arm_plan *plan, double *offset) {
+        arm_begin(state);
+        return arm_step(state, shown, plan, offset);
+    }"""
+    require_no_library(tmp_path, c_walker(walker(), "arm"), function)
+
+
+def test_the_command_writes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches an example of another header, and what is not there in C."""
+    monkeypatch.chdir(tmp_path)
+    main(["export", "c", "input_output", "--prefix", "arm", "-o", "arm.h", "--example"])
+    example = Path("arm_example/arm_main.c").read_text()
+    folder = tmp_path / "arm_example"
+    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
+    said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    assert "us per control step" in said
+    capsys.readouterr()
+    for wrong, named in ((["--env", "testbed"], "input_output"), (["--ramp-s", "2"], "--ramp-s")):
+        with pytest.raises(SystemExit):
+            main(["export", "c", "input_output", *wrong])
+        assert named in capsys.readouterr().err
+    env = gymnasium.make(WALKER)
+    for policy in ("input", "dynamic", "uncompensated"):
+        with pytest.raises(ConfigurationError, match="only input_output of a walker"):
+            c_walker(baselines.make(policy, env), "arm")

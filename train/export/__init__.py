@@ -1,0 +1,1 @@
+"""Compensators and residuals for programs without Python: C99 and ONNX."""

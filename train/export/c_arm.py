@@ -1,0 +1,243 @@
+"""A compensator of live robots as a header in C99, its test vector, and an example.
+
+The header loops over tables of constants. It computes what `PositionCompensator` does, by the
+same formulas in the same order, so that both agree to rounding.
+"""
+
+import contextlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import elastic_env
+from baselines import PositionCompensator
+from baselines.compensation.dry_friction import PRESLIDING_RAD, FrictionCompensation
+from baselines.compensation.position_compensator import CompensatorConstants
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.signals import Array
+from train.export.c_text import (
+    braced,
+    comment,
+    enumerated,
+    fill,
+    identifier,
+    nested,
+    number,
+    numbers,
+    plain,
+    unique,
+)
+
+_TEST_STEPS = 12
+_LOADED_STEP = 6
+"""Step of the test vector from which on the tip carries a payload."""
+_PAYLOAD_KG = 0.3
+_PAYLOAD_AT = (0.01, -0.02, 0.05)
+_TEST_RATE = 0.5
+"""Largest rate [rad/s] and acceleration [rad/s²] of the test vector."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A body or site that can carry a payload.
+
+    Attributes:
+        name: In C, behind the prefix.
+        body: Number of the body in MuJoCo's model.
+        link: Link that it moves with.
+        place, R: In the frame of that link, (3,) [m], (3, 3).
+    """
+
+    name: str
+    body: int
+    link: int
+    place: Array
+    R: Array
+
+
+def c_header(
+    compensator: PositionCompensator, prefix: str, sources: Mapping[str, bytes] | None = None
+) -> str:
+    """The header of a compensator, with a test vector behind the macro <PREFIX>_TEST.
+
+    The compensator is played for the test vector: it begins anew, and ends so.
+
+    Args:
+        compensator: What the header computes.
+        prefix: Of all names in the header.
+        sources: Contents of the files that the compensator was made of, by name, for their digests.
+
+    Raises:
+        ConfigurationError: The prefix is none.
+    """
+    names = compensator.joints
+    constants = compensator.constants
+    frames = payload_frames(constants)
+    tables = _tables(constants, frames)
+    digest = sha256("\n".join(tables.values()).encode()).hexdigest()
+    capitals = prefix.upper()
+    return fill(
+        "arm.h.in",
+        prefix,
+        **tables,
+        vectors=fill("common_vectors.h.in", prefix),
+        version=elastic_env.__version__,
+        digest=digest,
+        origin=comment(_origin_lines(sources or {})),
+        joints=comment(_joint_lines(names, constants)),
+        joint_names=enumerated(unique(f"{capitals}_JOINT_", names)),
+        frame_names=enumerated(f"{capitals}_{frame.name}" for frame in frames),
+        test=_test_vector(compensator, prefix),
+    )
+
+
+def c_example(prefix: str, header: str) -> dict[str, str]:
+    """Contents of a program that checks the header and times it, and of its CMakeLists, by name.
+
+    Args:
+        prefix: Of the header's names.
+        header: Its file, as the program includes it.
+    """
+    return {
+        f"{prefix}_main.c": fill("arm_main.c.in", prefix, header=header),
+        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
+    }
+
+
+def payload_frames(constants: CompensatorConstants) -> list[Frame]:
+    """Bodies and sites with names that joints move; the body of the last joint first."""
+    model = constants.model
+    tree = constants.body.tree
+    bodies = [b for b in range(model.nbody) if tree.carrier[b] > 0]
+    named = [(b, model.body(b).name) for b in bodies if model.body(b).name]
+    found = [("TIP", constants.tip, np.zeros(3), np.eye(3))]
+    found += [(f"BODY_{identifier(name)}", b, np.zeros(3), np.eye(3)) for b, name in named]
+    taken = {name for _, name in named}
+    for i in range(model.nsite):
+        site = model.site(i)
+        body = int(site.bodyid[0])
+        if body in bodies and site.name and site.name not in taken:
+            R = np.zeros(9)
+            mujoco.mju_quat2Mat(R, site.quat)
+            found.append((f"SITE_{identifier(site.name)}", body, site.pos, R.reshape(3, 3)))
+    names = unique("", [name for name, *_ in found])
+    frames: list[Frame] = []
+    for name, (_, body, place, R) in zip(names, found, strict=True):
+        R_lb = tree.R[body]
+        in_link = tree.place[body] + R_lb @ place
+        frames.append(Frame(name, body, tree.carrier[body], in_link, R_lb @ R))
+    return frames
+
+
+def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[str, str]:
+    """All that is computed with, as text in C."""
+    body = constants.body
+    n = len(constants.compliance)
+    none = np.zeros(n)
+    friction = constants.friction or FrictionCompensation(none, none, none, none)
+    rows = {
+        "gravity": constants.model.opt.gravity,
+        "compliance": constants.compliance,
+        "of_command": constants.of_command,
+        "lowest": constants.lowest,
+        "highest": constants.highest,
+        "spring": body.spring,
+        "spring_rest": body.spring_rest,
+        "viscous": constants.viscous,
+        "lag_s": constants.lag_s,
+        "coulomb": friction.coulomb,
+        "load_ratio": friction.load_ratio,
+        "static": friction.static,
+        "stribeck_speed": friction.stribeck_speed,
+        "dead_zone": friction.dead_zone,
+    }
+    return {
+        "n": str(n),
+        "num_frames": str(len(frames)),
+        "ramp_steps": str(constants.ramp_steps),
+        "has_friction": str(int(constants.friction is not None)),
+        "limit_rad": number(constants.limit_rad),
+        "period_s": number(constants.period_s),
+        "presliding_rad": number(PRESLIDING_RAD),
+        "links": ",\n".join(_link(row) for row in body.tree.links[1:]),
+        "frames": ",\n".join(
+            f"    {{{one.body}, {one.link}, {braced(one.place)}, {braced(one.R)}}}"
+            for one in frames
+        ),
+        **{name: numbers(values) for name, values in rows.items()},
+    }
+
+
+def _link(row: Any) -> str:
+    masses = ", ".join(
+        [
+            number(row["mass"]),
+            braced(row["mass_moment"]),
+            braced(row["inertia"]),
+            number(row["weight"]),
+            braced(row["weight_moment"]),
+        ]
+    )
+    place = f"{row['parent']}, {row['column']}, {number(row['zero'])}"
+    return f"    {{{place}, {braced(row['R'])}, {braced(row['anchor'])},\n     {{{masses}}}}}"
+
+
+def _origin_lines(sources: Mapping[str, bytes]) -> Iterator[str]:
+    yield f"Generated by elastic-env {elastic_env.__version__}: generate it anew, do not edit it."
+    for name, content in sources.items():
+        yield f"  {plain(name)}, SHA-256 {sha256(content).hexdigest()}"
+
+
+def _joint_lines(names: Sequence[str], constants: CompensatorConstants) -> Iterator[str]:
+    with np.errstate(divide="ignore"):
+        K = 1.0 / constants.compliance
+        gain = 1.0 / (constants.of_command - constants.compliance)
+    for j, name in enumerate(names):
+        ends = f"{constants.lowest[j]:.4g} to {constants.highest[j]:.4g} rad"
+        servo = "" if np.isinf(gain[j]) else f", k_p {gain[j]:.6g} N*m/rad"
+        yield f"  {j}  {plain(name)}: K {K[j]:.6g} N*m/rad{servo}, {ends}"
+
+
+def _test_vector(compensator: PositionCompensator, prefix: str) -> str:
+    """A run of the compensator from its begin, and link angles for its commands."""
+    constants = compensator.constants
+    lowest = np.maximum(constants.lowest, -np.pi)
+    highest = np.minimum(constants.highest, np.pi)
+    generator = np.random.default_rng(0)
+    shape = (_TEST_STEPS, len(lowest))
+    q = generator.uniform(lowest, highest, shape)
+    rates = generator.uniform(-_TEST_RATE, _TEST_RATE, (2, *shape))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # nobody commands these poses
+        command, link_angle = _play(compensator, q, rates)
+    motion = np.stack([q, *rates], axis=1)
+    return fill(
+        "arm_test.h.in",
+        prefix,
+        steps=_TEST_STEPS,
+        loaded=_LOADED_STEP,
+        payload=numbers((_PAYLOAD_KG, *_PAYLOAD_AT)),
+        motion=nested(motion),
+        command=nested(command),
+        link_angle=nested(link_angle),
+    )
+
+
+def _play(compensator: PositionCompensator, q: Array, rates: Array) -> tuple[Array, Array]:
+    """Commands along a motion, (T, n) and (2, T, n), and link angles where encoders show them."""
+    command = np.empty(q.shape)
+    link_angle = np.full(q.shape, np.nan)
+    compensator.reset()
+    for step in range(len(q)):
+        if step == _LOADED_STEP:
+            compensator.set_payload(_PAYLOAD_KG, _PAYLOAD_AT)
+        command[step] = compensator.command(q[step], *rates[:, step])
+        with contextlib.suppress(ElasticError):  # NaN stands for a call that has to fail
+            link_angle[step] = compensator.link_angle(command[step])
+    compensator.reset()
+    return command, link_angle

@@ -1,0 +1,184 @@
+"""What a residual computes between its features and the inputs of its base, as plain arrays."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+import baselines
+import elastic_env
+from baselines.residual.mirror import Mirror
+from baselines.residual.network import Network, Tensors
+from baselines.residual.residual_policy import WEIGHTS, find_folder, load_residual
+from baselines.residual.settings import RESIDUAL, ResidualDescription
+from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signal
+from elastic_env.core.tensors import read_tensors
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.environments import ENVIRONMENTS
+from train.evaluate.rollout import make_vector_env
+
+_HEAVY_TAIL = 3.0
+"""Degrees of freedom of random features: two in a thousand are beyond ten standard deviations."""
+
+
+@dataclass(frozen=True)
+class ResidualLayout:
+    """A residual's features, network, mirror and bounds.
+
+    Attributes:
+        name: Of its policy, such as residual:testbed/seed_0.
+        description: Content of its `residual.json`.
+        network: From features to numbers within [−1, 1].
+        tensors: Weights of the network.
+        weights_sha256: Digest of their file.
+        features: Columns that it sees; `NAME@-k` is a measurement of k decisions ago.
+        residual: Numbers that it decides.
+        columns: Columns of its base's inputs, on which it acts.
+        bounds: Of these, (columns,), zero where it does not act.
+        source: Number of the residual that each follows, (columns,).
+        mirrors: Of features and residual in steps on the right foot; None without.
+        control_period_s: Time between two commands [s].
+    """
+
+    name: str
+    description: ResidualDescription
+    network: Network
+    tensors: Tensors
+    weights_sha256: str
+    features: tuple[Signal, ...]
+    residual: tuple[Signal, ...]
+    columns: tuple[Signal, ...]
+    bounds: Array
+    source: IntArray
+    mirrors: tuple[Mirror, Mirror] | None
+    control_period_s: float
+
+    @classmethod
+    def of(cls, name: str, env: str | None = None) -> Self:
+        """Of a residual in the environment that it was trained in.
+
+        Args:
+            name: residual:PATH, a folder or the name of one that comes with the package.
+            env: Environment, see `train.evaluate.environments.environment`; None for the one of the
+                package that the residual names.
+
+        Raises:
+            ConfigurationError: There is no such residual, it sees the truth, or its environment is
+                unknown.
+        """
+        if not name.startswith(RESIDUAL):
+            raise ConfigurationError(
+                f"a residual must be named residual:PATH, got {quote(name)}; such as"
+                " residual:testbed/seed_0, or residual:FOLDER"
+            )
+        folder = find_folder(Path(name.removeprefix(RESIDUAL)))
+        description, network = load_residual(folder)
+        if description.settings.privileged:
+            seen = ", ".join(description.settings.privileged)
+            raise ConfigurationError(
+                f"{name} is a teacher, which sees the true {seen}, and no residual for a robot"
+            )
+        with closing(_environment(description, env)) as worlds:
+            policy: Any = baselines.make(name, worlds)
+        tensors, content = read_tensors(folder / WEIGHTS)
+        channels = policy.corrected.channels
+        mirror = policy.features.mirror
+        return cls(
+            name=name,
+            description=description,
+            network=network,
+            tensors=tensors,
+            weights_sha256=sha256(content).hexdigest(),
+            features=policy.features.columns,
+            residual=channels.signals,
+            columns=channels.columns,
+            bounds=channels.bounds,
+            source=channels.source,
+            mirrors=None if mirror is None else (mirror.of_features, mirror.of_residual),
+            control_period_s=policy.corrected.model.control_period_s,
+        )
+
+    @property
+    def num_layers(self) -> int:
+        """Layers of the network."""
+        return sum(name.startswith("weight") for name in self.tensors)
+
+    def decide(self, features: Array, on_right: BoolArray) -> tuple[Array, Array]:
+        """Residual and correction of a decision, (N, k) and (N, columns).
+
+        Args:
+            features: Before the mirror, (N, width).
+            on_right: Whether the step is on the right foot, (N, 1); without effect where there is
+                no mirror.
+        """
+        if self.mirrors is None:
+            residual = self.network(features)
+        else:
+            of_features, of_residual = self.mirrors
+            residual = self.network(np.where(on_right, of_features(features), features))
+            residual = np.where(on_right, of_residual(residual), residual)
+        return residual, self.bounds * residual[:, self.source]
+
+    def draw(self, count: int, seed: int = 0) -> dict[str, Any]:
+        """Random arguments of `decide`; some features are beyond the bound of normalised ones."""
+        generator = np.random.default_rng(seed)
+        shape = (count, len(self.features))
+        normalised = generator.standard_t(_HEAVY_TAIL, shape)
+        features = self.tensors["mean"] + self.tensors["std"] * normalised
+        on_right = generator.random((count, 1)) < 0.5
+        if self.mirrors is not None:  # the network sees them as drawn
+            features = np.where(on_right, self.mirrors[0](features), features)
+        return {"features": features, "on_right": on_right}
+
+    def facts(self) -> dict[str, Any]:
+        """What one must know to use it, in types of JSON."""
+        settings = self.description.settings
+        turns = settings.cutoff_hz * self.control_period_s
+        columns = _listed(self.columns)
+        for column, bound in zip(columns, self.bounds.tolist(), strict=True):
+            column["bound"] = bound
+        return {
+            "elastic_env": elastic_env.__version__,
+            "name": self.name,
+            "weights_sha256": self.weights_sha256,
+            "robot": self.description.robot,
+            "joints": self.description.joints,
+            "base": self.description.base,
+            "base_options": self.description.base_options,
+            "control_period_s": self.control_period_s,
+            "decision_period": settings.decision_period,
+            "cutoff_hz": settings.cutoff_hz,
+            "share_per_control_step": 1.0 - float(np.exp(-2.0 * np.pi * turns)),
+            "features": _listed(self.features),
+            "residual": _listed(self.residual),
+            "correction": columns,
+        }
+
+
+def _listed(signals: Sequence[Signal]) -> list[dict[str, Any]]:
+    keys = ("name", "unit", "meaning")
+    return [{key: asdict(signal)[key] for key in keys} for signal in signals]
+
+
+def _environment(description: ResidualDescription, env: str | None) -> Any:
+    """One world of the environment of a residual."""
+    name = description.robot if env is None else env
+    if env is None and name not in ENVIRONMENTS:
+        raise ConfigurationError(
+            f"the residual is for {quote(name)}, which is no environment of the package"
+            f" ({', '.join(ENVIRONMENTS)}); name its environment by --env ROBOT.yaml or"
+            " FILE.py:ROBOT"
+        )
+    trained: Any = description.training.get("config", {})
+    condition = Condition(
+        env=name,
+        policy=PolicySpec(name=description.base),
+        reference=trained.get("reference"),
+        env_options=trained.get("env_options", {}),
+    )
+    return make_vector_env(condition, num_envs=1, num_threads=1)
