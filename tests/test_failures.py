@@ -384,7 +384,10 @@ BLOCKED = """
 import sys
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "stable_baselines3", "imageio", "matplotlib", "onnx"):
+        if name.split(".")[0] in (
+            "torch", "stable_baselines3", "imageio", "matplotlib", "onnx", "dynamixel_sdk", "serial",
+            "distributed",
+        ):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Blocked())
 """
@@ -396,6 +399,7 @@ EXTRAS = [
     (["export", "sb3", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
     (["export", "onnx", "residual:x"], "onnx"),
     (["play", "--video", "x.mp4"], "report"),
+    (["hardware", "scan", "/dev/ttyX"], "hardware"),
 ]
 
 

@@ -1,13 +1,12 @@
 """Dynamixel servos of Protocol 2.0, by dynamixel-sdk: PRO, P, X, and MX that are set to it."""
 
-import dynamixel_sdk as sdk
 from typing_extensions import override
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses import port as ports
 from elastic_env.hardware.buses.bus import ServoInfo
 from elastic_env.hardware.buses.packets import word
-from elastic_env.hardware.buses.port import bus_gone
+from elastic_env.hardware.buses.port import bus_gone, sdk
 from elastic_env.hardware.buses.servo_bus import DAMAGED, ServoBus, Status
 from elastic_env.hardware.errors import ReplyError
 

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from elastic_env.core.errors import missing_extra
@@ -28,10 +29,17 @@ from elastic_env.hardware.errors import BusGoneError, PortError
 try:
     import dynamixel_sdk as sdk
     import serial
+    from dynamixel_sdk.port_handler import PortHandler
     from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 except ModuleNotFoundError as error:
-    purpose = "the testbed on real hardware"
-    raise missing_extra(str(error.name), "hardware", purpose) from None
+    # said where a port is opened: settings and help come without the extra
+    _MISSING = missing_extra(str(error.name), "hardware", "a bus of servos")
+    _absent: Any = SimpleNamespace(SerialException=OSError)
+    sdk = serial = _absent
+    PortHandler: Any = object
+    Protocol2PacketHandler: Any = object
+else:
+    _MISSING = None
 
 DEFAULT_BAUDRATE = 3_000_000
 """Bits per second: the fastest that servos, adapter and SDK share without an odd rate."""
@@ -56,15 +64,20 @@ def bus_gone(port: str) -> Iterator[None]:
         ) from None
 
 
-class Port(sdk.PortHandler):
+class Port(PortHandler):
     """A serial port for one program alone.
 
     Args:
         name: Device, such as /dev/ttyUSB0.
         baudrate: Bits per second.
+
+    Raises:
+        MissingExtraError: The SDK is not installed.
     """
 
     def __init__(self, name: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
+        if _MISSING is not None:
+            raise _MISSING
         super().__init__(name)
         self.baudrate = baudrate
         self._read_ahead = b""
