@@ -338,5 +338,5 @@ def test_compiled_policies_do_what_their_python_code_says() -> None:
     compiled_ones, plain = (
         np.array([line.split() for line in text.splitlines()], dtype=np.float64) for text in said
     )
-    assert compiled_ones.shape == (6, 38)
+    assert compiled_ones.shape == (6, 42)
     np.testing.assert_allclose(compiled_ones, plain, rtol=1e-7, atol=1e-12)

@@ -756,7 +756,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
         (
             ["compare", "--help"],
-            ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"],
+            ["--list", "episodes.csv", "report.html", "residual:PATH", "--jobs"],
         ),
         (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
     ],

@@ -143,7 +143,7 @@ def test_standing_walker_is_not_left_swinging() -> None:
         scenario="ideal",
     )
     shaped, unshaped = (baselines.make("input_open", env) for _ in range(2))
-    unshaped._ramp = plain(np.arange(len(shaped._ramp)), 1.0)  # type: ignore[attr-defined]
+    unshaped.ramp = plain(np.arange(len(shaped.ramp)), 1.0)  # type: ignore[attr-defined]
     pitch_rate = env.unwrapped.task.observation_table.names.index("imu_rate.y")
     observation, _ = env.reset(seed=0)
     states: list[Any] = [None, None]
