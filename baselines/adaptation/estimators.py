@@ -65,18 +65,15 @@ class LegEstimator(Estimator):
     Args:
         model: Assumed walker.
         sensors: Joint torque sensors, if it has them.
-        prior_loads: Number of measurements that the assumed load counts for.
     """
 
     def __init__(
         self,
         model: WalkerModel,
         sensors: DeflectionSensors | None = None,
-        prior_loads: float = _LOADS,
     ) -> None:
         self._observer = BendingObserver(model)
         self._sensors = sensors
-        self._prior_loads = prior_loads
         self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
 
     @override
@@ -88,7 +85,7 @@ class LegEstimator(Estimator):
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
         bending = None if self._sensors is None else self._sensors.deflection(rows)
         seen, observer = self._observer.observe(rows, memory.observer, bending)
-        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], self._prior_loads)
+        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], _LOADS)
         return seen, load, EstimatorMemory(loads, observer)
 
     @override

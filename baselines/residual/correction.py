@@ -49,8 +49,7 @@ class Corrected:
         truth: What a teacher sees by, see `baselines.residual.true_robot.truth_of`.
 
     Raises:
-        ConfigurationError: An input that the base does not have, a joint that the robot has not, or
-            caution without a walker.
+        ConfigurationError: An input that the base does not have, or a joint that the robot has not.
     """
 
     def __init__(

@@ -11,6 +11,9 @@ Eight bits of checksum let one damaged packet of 256 pass whose faults are not o
 with the id and the length of a reply inside another one says that the first has lost its end.
 """
 
+from typing_extensions import override
+
+from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.packets import LARGEST_ID, Packet
 
 HEADER = b"\xff\xff"
@@ -30,17 +33,10 @@ def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     return HEADER + body + bytes([checksum(body)])
 
 
-class Parser:
-    """Finds packets in a stream of bytes that may begin anywhere."""
+class Parser(packets.Parser):
+    """Finds packets of this protocol in a stream of bytes that may begin anywhere."""
 
-    def __init__(self) -> None:
-        self._bytes = bytearray()
-
-    def parse(self, data: bytes) -> list[Packet]:
-        """The packets that are complete with these bytes, in order."""
-        self._bytes += data
-        return list(iter(self._next, None))
-
+    @override
     def _next(self) -> Packet | None:
         while True:
             start = self._bytes.find(HEADER)
