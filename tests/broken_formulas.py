@@ -53,7 +53,7 @@ _COMPENSATORS = "baselines/compensation/compensators.py"
 _CONTACT = "baselines/compensation/contact_torque.py"
 _GRAVITY = "baselines/compensation/gravity_torque.py"
 _CONTROLLER = "baselines/walking/controller.py"
-_SHARE = "shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing"
+_SHARE = "shifted = share - 4.0 * share * (1.0 - share) * shift / spacing"
 _PREVIEW = "elastic_env/motion/preview_control.py"
 _PLAN = "elastic_env/motion/walk_plan.py"
 _STATISTICS = "train/evaluate/statistics.py"
@@ -161,8 +161,8 @@ BROKEN = (
     ),
     BrokenFormula(
         _CONTROLLER,
-        "roll = -carried * own.shift[1]",
-        "roll = carried * own.shift[1]",
+        "roll = -carried * aside",
+        "roll = carried * aside",
         WALKING,
     ),
     BrokenFormula(
