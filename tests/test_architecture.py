@@ -7,6 +7,8 @@ from pathlib import Path
 
 from setuptools import find_packages
 
+from tests.broken_formulas import BROKEN
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("elastic_env", "baselines", "train")
 HEAVY = {"torch", "stable_baselines3", "tensorboard"}
@@ -50,3 +52,9 @@ def test_the_three_packages_and_all_their_parts_are_installed() -> None:
         if file.is_file() and file.suffix != ".py"
     }
     assert {file for file in data - packed if "__pycache__" not in file.parts} == set()
+
+
+def test_formulas_that_are_broken_on_purpose_stand_once() -> None:
+    """Catches a formula that was rewritten, so that nobody breaks it any more."""
+    counts = {one.right: (ROOT / one.file).read_text().count(one.right) for one in BROKEN}
+    assert {text: count for text, count in counts.items() if count != 1} == {}
