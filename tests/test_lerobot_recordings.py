@@ -165,7 +165,7 @@ def test_the_command_writes_logs_that_identify_reads(
     arguments = ["lerobot", str(folder), "--model", "docs/hardware/so101.xml"]
     arguments += ["--calibration", str(tmp_path / "arm.json"), "--output", str(tmp_path / "logs")]
     main(arguments)
-    assert "2 episodes, 480 rows" in capsys.readouterr().out
+    assert "480 rows in 2 recordings" in capsys.readouterr().out
     found = {file.stem for file in (tmp_path / "logs").glob("*.csv")}
     assert found == {f"{name}_{episode}" for name in BODY for episode in (0, 1)}
     log = read_servo_log(tmp_path / "logs" / "elbow_flex_1.csv")

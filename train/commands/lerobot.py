@@ -61,6 +61,6 @@ class Lerobot(Model):
                     write_whole(folder / f"{log.joint}_{log.episode}.csv", log_text(log))
             rows = sum(len(recording.time) for recording in recordings)
             console.print(
-                f"{len(recordings)} episodes, {rows} rows, of {', '.join(arm.compensator.joints)}"
+                f"{rows} rows in {len(recordings)} recordings of {', '.join(arm.compensator.joints)}"
             )
-            console.print(f"elastic identify --log {folder}/{arm.compensator.joints[0]}_*.csv")
+            console.print(f"elastic identify --log {folder}/{arm.compensator.joints[-1]}_*.csv")
