@@ -43,7 +43,7 @@ test-all: $(STAMP) ## Run all tests, also the slow ones: real processes, kills, 
 #     python -m venv full && full/bin/pip install -e '.[lerobot]' pytest hypothesis
 #     full/bin/python -m pytest -o addopts= tests/lerobot
 test-lerobot: $(LEROBOT)/.installed ## Run the tests of the processor steps within LeRobot, in .venv-lerobot
-	$(LEROBOT)/bin/python -m pytest -o addopts= -q tests/lerobot $(ARGS)
+	$(LEROBOT)/bin/python -m pytest -o addopts= -q tests/lerobot tests/test_lerobot.py tests/test_lerobot_recordings.py $(ARGS)
 
 $(LEROBOT)/.installed: pyproject.toml constraints.txt tests/lerobot/requirements.txt
 	$(PYTHON) -m venv --clear $(LEROBOT)

@@ -29,8 +29,6 @@ from elastic_env.core.errors import (
 from train.commands.cli import main
 from train.export.hub import pull_residual, push_residual
 
-pytest.importorskip("huggingface_hub")
-
 SHIPPED = find_folder(Path("testbed/seed_0"))
 FILES = {name: (SHIPPED / name).read_bytes() for name in (DESCRIPTION, WEIGHTS)}
 DIGEST = sha256(FILES[WEIGHTS]).hexdigest()

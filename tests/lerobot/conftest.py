@@ -1,6 +1,4 @@
-"""Lets torchvision load beside another torch than its own.
-
-`make test-lerobot` says why.
+"""Let torchvision load beside another torch than its own, as `make test-lerobot` has it.
 
 lerobot 0.4.4 imports torchvision for pictures, which our steps hand on. Its compiled part does not
 load there, and one registration of its Python part asks for an operator of it.

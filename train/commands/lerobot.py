@@ -60,7 +60,6 @@ class Lerobot(Model):
                 for log in joint_logs(recording, arm):
                     write_whole(folder / f"{log.joint}_{log.episode}.csv", log_text(log))
             rows = sum(len(recording.time) for recording in recordings)
-            console.print(
-                f"{rows} rows in {len(recordings)} recordings of {', '.join(arm.compensator.joints)}"
-            )
-            console.print(f"elastic identify --log {folder}/{arm.compensator.joints[-1]}_*.csv")
+            joints = arm.compensator.joints
+            console.print(f"{rows} rows in {len(recordings)} recordings of {', '.join(joints)}")
+            console.print(f"elastic identify --log {folder}/{joints[-1]}_*.csv")
