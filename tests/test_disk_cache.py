@@ -157,6 +157,7 @@ def test_many_at_once_read_what_is_whole(folder: Path) -> None:
 
 FIRST_STATE = """
 import gymnasium, elastic_env, sys
+import numpy as np
 from elastic_env.robots.thormang import standing
 if sys.argv[1] == "kept":
     def never(*args):
@@ -165,7 +166,7 @@ if sys.argv[1] == "kept":
 env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="drawn")
 print(env.reset(seed=3)[0].tobytes().hex())
 for _ in range(3):
-    observation, *_ = env.step(0.0 * env.action_space.sample())
+    observation, *_ = env.step(np.zeros(12, dtype=np.float32))
 print(observation.tobytes().hex())
 """
 
