@@ -11,7 +11,7 @@ import pytest
 import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import RELEASED, compiled, require_no_library
+from tests.test_c_export import COMPILERS, RELEASED, compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_walker import PlayedSteps, c_walker, play_steps
 
@@ -61,9 +61,11 @@ def walker(**options: Any) -> Any:
     return baselines.make("input_output", env, **options)
 
 
-def played_in_c(policy: Any, steps: PlayedSteps, folder: Path) -> tuple[Array, Array, Array]:
+def played_in_c(
+    policy: Any, steps: PlayedSteps, compiler: str, folder: Path
+) -> tuple[Array, Array, Array]:
     """Statuses, offsets and link angles."""
-    program = compiled(folder, c_walker(policy, "arm"), "gcc", DRIVER)
+    program = compiled(folder, c_walker(policy, "arm"), compiler, DRIVER)
     count = len(steps.offset)
     fields = [values.reshape(count, -1) for values in (*steps.shown, *steps.plan)]
     np.hstack(fields).astype(np.float64).tofile(folder / "in")
@@ -72,27 +74,29 @@ def played_in_c(policy: Any, steps: PlayedSteps, folder: Path) -> tuple[Array, A
     return found[:, 0], found[:, 1:13], found[:, 13:]
 
 
-def compare(policy: Any, count: int, folder: Path) -> None:
+def compare(policy: Any, count: int, compiler: str, folder: Path) -> None:
     steps = play_steps(policy, count, seed=1)
-    status, offset, links = played_in_c(policy, steps, folder)
+    status, offset, links = played_in_c(policy, steps, compiler, folder)
     assert not status.any()
     np.testing.assert_allclose(links, steps.links, rtol=0.0, atol=TOLERANCE)
     # Python hands on offsets in single precision
     np.testing.assert_array_almost_equal_nulp(offset.astype(np.float32), steps.offset, nulp=1)
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("case", CASES)
-def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
+def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches a wrong frame, foot, gain, filter or row of the plan, and a load on the wrong leg."""
-    compare(walker(**CASES[case]), 200, tmp_path)
+    compare(walker(**CASES[case]), 200, compiler, tmp_path)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("case", CASES)
 def test_the_header_computes_what_python_does_in_ten_thousand_states(
-    case: str, tmp_path: Path
+    case: str, compiler: str, tmp_path: Path
 ) -> None:
-    compare(walker(**CASES[case]), 10_000, tmp_path)
+    compare(walker(**CASES[case]), 10_000, compiler, tmp_path)
 
 
 def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
@@ -130,15 +134,19 @@ def test_it_needs_no_heap(tmp_path: Path) -> None:
     require_no_library(tmp_path, c_walker(walker(), "arm"), function)
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_command_writes_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    compiler: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Catches an example of another header, and what is not there in C."""
     monkeypatch.chdir(tmp_path)
     main(["export", "c", "input_output", "--prefix", "arm", "-o", "arm.h", "--example"])
     example = Path("arm_example/arm_main.c").read_text()
     folder = tmp_path / "arm_example"
-    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
+    program = compiled(folder, Path("arm.h").read_text(), compiler, example, RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per control step" in said
     capsys.readouterr()
