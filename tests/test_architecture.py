@@ -19,7 +19,7 @@ def test_importing_environment_and_baselines_loads_no_torch() -> None:
     code = (
         "import sys, gymnasium, elastic_env, baselines;"
         " gymnasium.make('elastic_env/Testbed-v0');print([name for name in"
-        f" {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio'})} if name in sys.modules])"
+        f" {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio', 'warp'})} if name in sys.modules])"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
