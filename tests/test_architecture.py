@@ -22,7 +22,7 @@ def test_importing_environment_and_baselines_loads_no_torch() -> None:
         " gymnasium.make('elastic_env/Testbed-v0');"
         " early = ['pinocchio'] if 'pinocchio' in sys.modules else [];"
         " import baselines; print(early + [name for name in"
-        f" {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio'})} if name in sys.modules])"
+        f" {sorted(HEAVY | {'matplotlib', 'plotly', 'imageio', 'warp'})} if name in sys.modules])"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
