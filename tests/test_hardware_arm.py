@@ -39,7 +39,6 @@ from elastic_env.hardware.live import targets as sources
 from elastic_env.hardware.live.targets import Follower, Poses, Socket, Stream, read_targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
-from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from tests.busy import once_more
@@ -753,46 +752,6 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     table = np.genfromtxt(tmp_path / "run" / "log.csv", delimiter=",", names=True)
     assert len(table) > 300
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
-
-
-def test_the_page_has_the_settings_of_an_arm() -> None:
-    """Catches a default or a bound that is changed in one of the two places."""
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in Path("docs/hardware.md").read_text().splitlines()
-        if line.startswith("|")
-    ]
-    told = {row[0].strip("`"): row for row in rows if len(row) == 5}
-    for name in ("rate_hz", "speed_rad_s", "acceleration_rad_s2"):
-        info = ArmSettings.model_fields[name]
-        ends = [
-            getattr(one, kind)
-            for one in info.metadata
-            for kind in ("ge", "le")
-            if hasattr(one, kind)
-        ]
-        _, unit, default, bounds, _ = told[name]
-        assert isinstance(info.json_schema_extra, dict)
-        assert unit == info.json_schema_extra["unit"]
-        assert float(default) == info.default
-        assert [float(end) for end in bounds.split(", ")] == ends
-    text = Path("docs/hardware.md").read_text()
-    changed = {
-        name: value
-        for name, value in ARM_LIMITS
-        if value != SafetyLimits.model_fields[name].default
-    }
-    assert changed.keys() == {
-        "lowest_rad",
-        "highest_rad",
-        "slew_rad_s",
-        "following_error_rad",
-        "patience_cycles",
-        "hang_s",
-        "release_s",
-    }
-    for name in ("slew_rad_s", "following_error_rad", "patience_cycles", "hang_s", "release_s"):
-        assert f"`{name}` {changed[name]:g}" in " ".join(text.split())
 
 
 def test_poses_of_a_log_are_approached_from_both_sides(tmp_path: Path) -> None:

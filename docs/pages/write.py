@@ -216,7 +216,6 @@ PARTS: Mapping[str, Part] = {
     "one arm": _of(arms.one_arm, "gallery"),
     "recorded hands": _of(recorded.hands, "recorded_justin"),
     "recorded hands by poses": _of(recorded.by_poses, "recorded_justin"),
-    "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
     "replays of recorded servos": _of(recorded.replays, "recorded_servos"),
     "recorded servos in slow motion": _of(recorded.slow_motion, "recorded_servos"),
     "priors of recorded servos": _of(recorded.priors, "recorded_servos"),
