@@ -27,7 +27,6 @@ from docs.pages.write import (
 )
 from docs.pages.write import main as write_pages
 from elastic_env.core.errors import ConfigurationError
-from train.report.leaderboard import leaderboard_markdown
 from train.runs.escaping import write_records
 
 ROOT = Path(__file__).parents[1]
@@ -183,7 +182,7 @@ def test_a_page_is_written_between_its_marks_and_nowhere_else(checkout: Path) ->
         write_pages([])
         assert (
             page.read_text()
-            == f"before\n{BEGIN}\n\n{leaderboard_markdown(results.standings)}\n{END}\nafter\n"
+            == f"before\n{BEGIN}\n\n{PARTS['leaderboard'].text(results)}\n{END}\nafter\n"
         )
     assert Path("docs", "other.md").read_text() == "no marks"
     for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):

@@ -20,21 +20,22 @@ from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
-    GROUPS,
+    ARM_SCENARIOS,
     MAPS,
+    MOTIONS,
     LearnedMap,
+    both_opponents,
     changes_table,
+    fast_gaits,
     learned_maps,
     learning_in_short,
     maps_markdown,
 )
-from docs.pages.standings import claims_markdown, read_leaderboard
+from docs.pages.standings import board_markdown, claims_markdown, read_leaderboard
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
-from train.evaluate.changes import BEST_ANALYTIC
 from train.evaluate.standings import Standing
-from train.report.leaderboard import leaderboard_markdown
 from train.report.table_formats import Head, Row, Table, to_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
@@ -47,8 +48,6 @@ _SAGS = (
 )
 _WORDS = ("robot", "K [N·m/rad]", "source of K")
 """Columns of the gallery that hold words."""
-LEARNED_WALKER = ("learned_walker", "learned_walker_1600ms", "learned_walker_1100ms")
-"""Comparisons of residuals on the walker."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -58,10 +57,12 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
+            "learned_posture_1600ms",
+            "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
             "learned_testbed_friction",
-            *LEARNED_WALKER,
+            "learned_walker",
         )
     },
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
@@ -198,11 +199,13 @@ def _of_map(name: str) -> Part:
 
 
 PARTS: Mapping[str, Part] = {
-    "leaderboard": _of_standings(leaderboard_markdown),
+    "leaderboard": _of_standings(board_markdown),
     "what learning adds": _of_standings(claims_markdown),
     "learning in short": _of(
         learning_in_short,
-        *LEARNED_WALKER,
+        "learned_walker",
+        "learned_posture_1600ms",
+        "learned_posture_1100ms",
     ),
     "learning at 3 s": _of(learning_in_short, "learned_walker"),
     "published controllers": _of_standings(walks.published_controllers),
@@ -224,23 +227,24 @@ PARTS: Mapping[str, Part] = {
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
-    "learned on the testbed": _of(changes_table, "learned_testbed"),
-    "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
-    "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
-    **{
-        f"learned on the walker at {gait}": _of(
-            partial(changes_table, against=BEST_ANALYTIC, scopes=shown), name
-        )
-        for name, gait, shown in (
-            ("learned_walker", "3 s", ()),
-            ("learned_walker_1600ms", "1.6 s", GROUPS),
-            ("learned_walker_1100ms", "1.1 s", GROUPS),
-        )
-    },
-    "learned beyond a table": _of(partial(changes_table, scopes=GROUPS), "learned_walker"),
-    "last steps of residuals": _of(
-        walks.last_steps, "walks_walker", "walks_walker_1600ms", "walks_walker_1100ms"
+    "learned at fast gaits": _of(
+        fast_gaits,
+        "learned_posture_1600ms",
+        "learned_posture_1100ms",
     ),
+    "learned on the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed",
+    ),
+    "learned on friction of the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed_friction",
+    ),
+    "learned on an arm": _of(
+        partial(changes_table, metrics=ARM, scopes=ARM_SCENARIOS),
+        "learned_robot",
+    ),
+    "learned on the walker": _of(both_opponents, "learned_walker"),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),
