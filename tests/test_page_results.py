@@ -136,13 +136,14 @@ def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other
     ("name", "metric"),
     [(kept.table or name, metric) for name, kept in KEPT.items() for metric in kept.metrics],
 )
-def test_every_kept_figure_is_shown(name: str, metric: str, tmp_path: Path) -> None:
-    """Catches a metric that is kept for nobody, and a table that shows another one in its place."""
+def test_every_kept_figure_is_shown_or_a_click_away(name: str, metric: str, tmp_path: Path) -> None:
+    """Catches a metric that is kept for nobody, and a folded table without a link to the whole."""
     changed = with_changed(
         name, lambda key, text: larger(text) if key == metric else text, tmp_path
     )
     texts = [page.read_text(encoding="utf-8") for page in pages(ROOT)]
-    assert any(page_with(text, changed) != text for text in texts if name in reads(text))
+    own = [text for text in texts if name in reads(text)]
+    assert any(f"](results/{name}.csv)" in text or page_with(text, changed) != text for text in own)
 
 
 def test_one_number_changes_a_sentence(checkout: Path) -> None:
