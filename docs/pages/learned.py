@@ -163,19 +163,14 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence
     return page_table([*names, "", *figures], lines, words=len(names) + 1)
 
 
-def fast_gaits(*tables: Rows) -> str:
-    """Paired changes of residuals of the walker against their base, at several step periods.
+def both_opponents(*tables: Rows) -> str:
+    """Paired changes of residuals of the walker, against the best policy without learning and
+    against their base.
 
     Args:
         tables: Rows of a `statistics.csv` each.
     """
-    return changes_table([row for rows in tables for row in rows], scopes=_TELLING[1:])
-
-
-def both_opponents(rows: Rows) -> str:
-    """Paired changes of a residual of the walker, against the best policy without learning and
-    against its base, from the rows of a `statistics.csv`.
-    """
+    rows = [row for table in tables for row in table]
     opponents = (BEST_ANALYTIC, _BASE)
     own = {against: _residuals(rows, _JUDGED, _TELLING, against) for against in opponents}
     cells = {

@@ -12,6 +12,7 @@ from docs.pages.cells import (
     page_table,
 )
 from elastic_env.robots.thormang.tables import BLOCKS
+from train.evaluate.changes import percent
 from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
@@ -53,6 +54,37 @@ def twenty_steps(rows: Rows) -> str:
             drift = format_metrics(row, ["foot_drift_end_m"], 0)
             lines.append([f"`{scenario}`", _robot(policy), *blocks, drift])
     head = ["scenario", "policy", "steps 1 to 4", "steps 17 to 20", "drift at the end"]
+    return page_table(head, lines, words=2)
+
+
+def last_steps(*tables: Rows) -> str:
+    """Pelvis error and ZMP deviation of residuals over the first and the last four steps.
+
+    Args:
+        tables: Kept rows of a comparison each.
+    """
+    first, last = ((f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS)
+    lines = []
+    for rows in tables:
+        cells = Cells(rows)
+        (reference,) = cells.names("reference")
+        for scenario in cells.names("scenario"):
+            own, base = (cells.row(name, reference, scenario) for name in ("residual", "foothold"))
+            changes = (
+                in_table_unit(own, b) / in_table_unit(own, a) - 1.0
+                for a, b in zip(first, last, strict=True)
+            )
+            lines.append(
+                [
+                    reference.removesuffix(" num_steps=20"),
+                    f"`{scenario}`",
+                    format_metrics(own, first, 2),
+                    format_metrics(own, last, 2),
+                    " / ".join(percent(change) for change in changes),
+                    format_metrics(base, last, 2),
+                ]
+            )
+    head = ["step", "scenario", "steps 1 to 4", "17 to 20", "change", "`foothold`, 17 to 20"]
     return page_table(head, lines, words=2)
 
 

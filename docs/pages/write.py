@@ -26,7 +26,6 @@ from docs.pages.learned import (
     LearnedMap,
     both_opponents,
     changes_table,
-    fast_gaits,
     learned_maps,
     learning_in_short,
     maps_markdown,
@@ -48,6 +47,8 @@ _SAGS = (
 )
 _WORDS = ("robot", "K [N·m/rad]", "source of K")
 """Columns of the gallery that hold words."""
+FAST_WALKERS = ("learned_walker_1600ms", "learned_walker_1100ms")
+"""Comparisons of residuals of the walker at fast gaits."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -57,12 +58,11 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
-            "learned_posture_1600ms",
-            "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
             "learned_testbed_friction",
             "learned_walker",
+            *FAST_WALKERS,
         )
     },
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
@@ -204,8 +204,7 @@ PARTS: Mapping[str, Part] = {
     "learning in short": _of(
         learning_in_short,
         "learned_walker",
-        "learned_posture_1600ms",
-        "learned_posture_1100ms",
+        *FAST_WALKERS,
     ),
     "learning at 3 s": _of(learning_in_short, "learned_walker"),
     "margins": _of(walks.margins, "margins"),
@@ -226,9 +225,8 @@ PARTS: Mapping[str, Part] = {
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned at fast gaits": _of(
-        fast_gaits,
-        "learned_posture_1600ms",
-        "learned_posture_1100ms",
+        both_opponents,
+        *FAST_WALKERS,
     ),
     "learned on the testbed": _of(
         partial(changes_table, scopes=MOTIONS),
@@ -243,6 +241,9 @@ PARTS: Mapping[str, Part] = {
         "learned_robot",
     ),
     "learned on the walker": _of(both_opponents, "learned_walker"),
+    "last steps of residuals": _of(
+        walks.last_steps, "walks_walker", "walks_walker_1600ms", "walks_walker_1100ms"
+    ),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),
