@@ -10,6 +10,7 @@ from pathlib import Path
 from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import (
+    BEST_ANALYTIC,
     FEWEST_SEEDS,
     percent,
     percent_interval,
@@ -32,9 +33,12 @@ MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
-GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
-"""Groups of scenarios, and scenarios that stand for themselves."""
-BASE = "base of the residual"
+_TELLING = ("soft", "slope", "joined", "drawn")
+"""Scenarios and groups of the walker that say where a residual gains, beside those in short."""
+MOTIONS = ("nominal", "held out")
+ARM_SCENARIOS = ("nominal", "soft", "payload")
+"""Scenarios and groups of testbed and arm."""
+_BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
 
@@ -128,31 +132,24 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
 
 
-def changes_table(
-    rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = BASE
-) -> str:
-    """Paired changes of residuals in every scenario and group, from the rows of a `statistics.csv`.
+def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = ()) -> str:
+    """Paired changes of residuals against their base, from the rows of a `statistics.csv`.
 
     Args:
         rows: Its rows.
         metrics: The metrics that are shown, where the table has them.
         scopes: The scenarios and groups that are shown; empty for all.
-        against: What the residuals are compared with, as the rows say it.
     """
-    own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
-    own = [row for row in own if row["kind"] == "residual"]
-    own = [row for row in own if row["scope"] in scopes or not scopes]
+    own = _residuals(rows, metrics, scopes, _BASE)
     titles = {
         metric: _METRICS[metric]
         for metric in metrics
         if any(row["metric"] == metric for row in own)
     }
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
-    whom = "base" if against == BASE else f"`{own[0]['base']}`"
+    places = group_by(own, lambda row: (*(row[name] for name in names), row["scope"]))
     lines = []
-    for place, found in group_by(
-        own, lambda row: (*(row[name] for name in names), row["scope"])
-    ).items():
+    for place, found in places.items():
         by_metric = {row["metric"]: row for row in found}
         cells = (
             part
@@ -160,16 +157,63 @@ def changes_table(
             for part in _over_base(by_metric[metric], unit)
         )
         lines.append([*place[:-1], _scope(found[0]), *cells])
-    head = [
-        *names,
-        "",
-        *(
-            text
-            for title, unit in titles.values()
-            for text in (f"{whom}: {title} [{unit}]", "change")
-        ),
+    figures = (
+        text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change")
+    )
+    return page_table([*names, "", *figures], lines, words=len(names) + 1)
+
+
+def fast_gaits(*tables: Rows) -> str:
+    """Paired changes of residuals of the walker against their base, at several step periods.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
+    """
+    return changes_table([row for rows in tables for row in rows], scopes=_TELLING[1:])
+
+
+def both_opponents(rows: Rows) -> str:
+    """Paired changes of a residual of the walker, against the best policy without learning and
+    against its base, from the rows of a `statistics.csv`.
+    """
+    opponents = (BEST_ANALYTIC, _BASE)
+    own = {against: _residuals(rows, _JUDGED, _TELLING, against) for against in opponents}
+    cells = {
+        (against, row["reference"], row["scope"], row["metric"]): row
+        for against, found in own.items()
+        for row in found
+    }
+    columns = [(against, metric) for metric in _JUDGED[:2] for against in opponents]
+    places = group_by(own[_BASE], lambda row: (row["reference"], row["scope"]))
+    lines = [
+        [
+            reference,
+            _scope(found[0]),
+            *(
+                _over_base(cells[against, reference, scope, metric], "")[1]
+                for against, metric in columns
+            ),
+        ]
+        for (reference, scope), found in places.items()
     ]
-    return page_table(head, lines, words=len(names) + 1)
+    head = [
+        f"{_METRICS[metric][0]}, against `{own[against][0]['base']}`" for against, metric in columns
+    ]
+    return page_table(["walk", "", *head], lines, words=2)
+
+
+def _residuals(
+    rows: Rows, metrics: Sequence[str], scopes: Sequence[str], against: str
+) -> list[Mapping[str, str]]:
+    """The rows of residuals: in some metrics and scopes, compared with one opponent."""
+    return [
+        row
+        for row in rows
+        if row["kind"] == "residual"
+        and row["base_is"] == against
+        and row["metric"] in metrics
+        and (row["scope"] in scopes or not scopes)
+    ]
 
 
 def learning_in_short(*tables: Rows) -> str:
@@ -199,10 +243,8 @@ def learning_in_short(*tables: Rows) -> str:
 
 
 def _scope(row: Mapping[str, str]) -> str:
-    """A group in bold letters, or a scenario with its marks."""
-    if row["pooled"] == "True":
-        return f"**{row['scope']}**"
-    return f"`{row['scope']}`" + (f", {row['marks']}" if row["marks"] else "")
+    """A group in bold letters, or a scenario."""
+    return f"**{row['scope']}**" if row["pooled"] == "True" else f"`{row['scope']}`"
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:

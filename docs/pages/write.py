@@ -20,21 +20,22 @@ from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
-    GROUPS,
+    ARM_SCENARIOS,
     MAPS,
+    MOTIONS,
     LearnedMap,
+    both_opponents,
     changes_table,
+    fast_gaits,
     learned_maps,
     learning_in_short,
     maps_markdown,
 )
-from docs.pages.standings import claims_markdown, read_leaderboard
+from docs.pages.standings import board_markdown, claims_markdown, read_leaderboard
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
-from train.evaluate.changes import BEST_ANALYTIC
 from train.evaluate.standings import Standing
-from train.report.leaderboard import leaderboard_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = ("uncompensated_rms", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
@@ -167,7 +168,7 @@ def _of_map(name: str) -> Part:
 
 
 PARTS: Mapping[str, Part] = {
-    "leaderboard": _of_standings(leaderboard_markdown),
+    "leaderboard": _of_standings(board_markdown),
     "what learning adds": _of_standings(claims_markdown),
     "learning in short": _of(
         learning_in_short,
@@ -176,7 +177,6 @@ PARTS: Mapping[str, Part] = {
         "learned_posture_1100ms",
     ),
     "learning at 3 s": _of(learning_in_short, "learned_walker"),
-    "published controllers": _of_standings(walks.published_controllers),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
     "forty steps": _of(walks.forty_steps, "footholds"),
@@ -194,13 +194,24 @@ PARTS: Mapping[str, Part] = {
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
-    "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
-    "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
-    "learned on the testbed": _of(changes_table, "learned_testbed"),
-    "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
-    "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
-    "learned on the walker": _of(partial(changes_table, against=BEST_ANALYTIC), "learned_walker"),
-    "learned beyond a table": _of(partial(changes_table, scopes=GROUPS), "learned_walker"),
+    "learned at fast gaits": _of(
+        fast_gaits,
+        "learned_posture_1600ms",
+        "learned_posture_1100ms",
+    ),
+    "learned on the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed",
+    ),
+    "learned on friction of the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed_friction",
+    ),
+    "learned on an arm": _of(
+        partial(changes_table, metrics=ARM, scopes=ARM_SCENARIOS),
+        "learned_robot",
+    ),
+    "learned on the walker": _of(both_opponents, "learned_walker"),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),
@@ -209,11 +220,9 @@ PARTS: Mapping[str, Part] = {
     "named policies": Part((), lambda _: policy_table()),
     "policies alone": _of_standings(speeds.policies_alone),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
-    "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
     "sensitivity of the walk": _of(walks.sensitivity, "walker_sensitivity"),
     "walks of the paper": _of(walks.paper_walks, "paper", "walker"),
-    "local frame": _of(walks.local_frame, "paper"),
     "walks in all scenarios": _of(walks.all_scenarios, "walker"),
     "testbed of the paper": _of(joints.paper_testbed, "paper_testbed", "identification"),
     "identification": _of(joints.identification, "identification"),

@@ -273,6 +273,7 @@ def compare(
     resumes: bool = False,
     fresh: bool = False,
     report: bool = True,
+    figure_format: plots.FigureFormat = "png",
 ) -> Comparison:
     """Run a comparison, write its folder, and print its tables.
 
@@ -285,6 +286,7 @@ def compare(
         fresh: Whether cells that such a run keeps are played again.
         report: Whether policies are compared with one another, and bases of residuals added for it;
             else they are scored alone, and no cells are kept.
+        figure_format: Of the pictures.
 
     Raises:
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
@@ -317,9 +319,9 @@ def compare(
             files.append(write_robots(robots, folder / "robots.csv"))
         files.append(write_summary(cells, folder / "summary.md"))
         if maps:
-            files += [*draw_maps(maps, folder), write_maps(maps, folder / "map.csv")]
+            files += [*draw_maps(maps, folder, figure_format), write_maps(maps, folder / "map.csv")]
         else:
-            files += draw_figures(cells, folder, config.figure_policies, axis)
+            files += draw_figures(cells, folder, config.figure_policies, axis, figure_format)
         if board:
             files += write_leaderboard(board, folder)
         if rows:
@@ -461,6 +463,8 @@ class Compare(Model):
     """
     resume: Path | None = None
     """Folder of a run to go on with: what is missing or has changed is played."""
+    figure_format: plots.FigureFormat = "png"
+    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
     fresh: bool = False
     """With --resume: play all cells again."""
     trust_code: bool = False
@@ -500,5 +504,13 @@ class Compare(Model):
             executors = Executors(on=self.on, jobs=self.jobs)
         output = self.resume or self.output
         is_resumed = self.resume is not None
-        finished = compare(config, console, output, executors, is_resumed, self.fresh)
+        finished = compare(
+            config,
+            console,
+            output,
+            executors,
+            resumes=is_resumed,
+            fresh=self.fresh,
+            figure_format=self.figure_format,
+        )
         print_files(finished.folder, finished.files, console)
