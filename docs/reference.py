@@ -20,6 +20,7 @@ import gymnasium
 from pydantic.fields import FieldInfo
 
 from baselines.options import PolicyOptions
+from baselines.residual.settings import ResidualSettings
 from elastic_env import IDS
 from elastic_env.core.config import Model
 from elastic_env.core.signals import Signal
@@ -27,6 +28,9 @@ from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
 from elastic_env.world.scenario import scenario_names
 from train.commands.cli import COMMANDS, main
+from train.commands.compare import CompareConfig
+from train.evaluate.conditions import PolicySpec
+from train.learn.train_config import TrainConfig
 
 PARTS = {
     "hardware": ("scan", "check", "run", "compensate", "log", "emulate"),
@@ -121,18 +125,33 @@ def commands_page() -> str:
 
 
 def gains_page() -> str:
-    """Every option of a policy that is a mapping of gains: names, defaults, bounds and meaning."""
+    """Every option of a policy, and of those that are mappings of gains every gain."""
     intro = (
-        "Written from the declarations in the code. [Options](../options.md#policies) says which"
-        " policy has which."
+        "Written from the declarations in the code. [Options](../options.md#policies) says how"
+        " they are given."
     )
-    parts = ["# Gains of policies", intro]
+    parts = ["# Options and gains of policies", intro, _model(PolicyOptions, "Options")]
     for option, field in PolicyOptions.model_fields.items():
         models = [
             kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)
         ]
         parts += [_model(model, option) for model in models]
     return "\n\n".join(parts) + "\n"
+
+
+def configurations_page() -> str:
+    """Every key of the configurations of comparisons and trainings."""
+    intro = (
+        "Written from the declarations in the code. [Options](../options.md) explains the"
+        " environments, and [Training](../training.md) the settings."
+    )
+    parts = [
+        _model(CompareConfig, "Comparisons: elastic compare"),
+        _model(PolicySpec, "policies"),
+        _model(TrainConfig, "Trainings: elastic train"),
+        _model(ResidualSettings, "settings"),
+    ]
+    return "\n\n".join(["# Keys of configurations", intro, *parts]) + "\n"
 
 
 def mountings_page() -> str:
@@ -153,7 +172,7 @@ def mountings_page() -> str:
 
 def _model(model: type[Model], title: str) -> str:
     """Name, default, bounds and meaning of every field, under a title."""
-    shown = title if " " in title else f"`{title}`"
+    shown = title if title[0].isupper() else f"`{title}`"
     about = (model.__doc__ or "").partition("\n")[0]
     rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
     head = ["name", "default", "bounds", "meaning"]
@@ -187,12 +206,17 @@ def _value(value: object) -> str:
         case Model():
             names = type(value).model_fields
             return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in names)}}}"
+        case list() | tuple():
+            return f"[{', '.join(map(_value, value))}]"
+        case dict():
+            return f"{{{', '.join(f'{key}: {_value(one)}' for key, one in value.items())}}}"
         case _:
             return str(value)
 
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "environments.md": environments_page,
+    "configurations.md": configurations_page,
     "gains.md": gains_page,
     "mountings.md": mountings_page,
     "help.md": commands_page,

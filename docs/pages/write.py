@@ -35,18 +35,9 @@ from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
-from train.report.table_formats import Head, Row, Table, to_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
-_SAGS = (
-    "uncompensated_rms",
-    "uncompensated_peak",
-    "input_rms",
-    "soft_uncompensated_rms",
-    "soft_input_rms",
-)
-_WORDS = ("robot", "K [N·m/rad]", "source of K")
-"""Columns of the gallery that hold words."""
+_SAGS = ("uncompensated_rms", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
 FAST_WALKERS = ("learned_walker_1600ms", "learned_walker_1100ms")
 """Comparisons of residuals of the walker at fast gaits."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
@@ -142,38 +133,16 @@ def gallery_table(gallery: Rows) -> str:
     rows = []
     for row in gallery:
         least, most = (float(row[f"stiffness_{which}_Nm_per_rad"]) for which in ("least", "most"))
-        deviations = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
-        rows.append(
-            [
-                row["title"],
-                row["joints"],
-                f"{least:g} to {most:g}",
-                row["stiffness_source"],
-                f"{1e3 * float(row['deflection_peak_rad']):.0f}",
-                *deviations,
-            ]
-        )
-    head = [
-        "robot",
-        "joints",
-        "K [N·m/rad]",
-        "source of K",
-        "largest deflection [mrad]",
-        "sag [mm]",
-        "largest sag",
-        "`input`",
-        "sag, soft",
-        "`input`, soft",
-    ]
-    heads = tuple(Head(title, is_number=title not in _WORDS) for title in head)
-    return to_markdown(Table(heads, tuple(Row(tuple(row)) for row in rows))) + "\n"
+        sags = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
+        rows.append([row["title"], f"{least:g} to {most:g}", *sags])
+    head = ["robot", "K [N·m/rad]", "sag [mm]", "`input`", "sag, soft", "`input`, soft"]
+    return page_table(head, rows)
 
 
 def gallery_pictures(gallery: Rows) -> str:
     """Pictures of the robots of the gallery, each under its name."""
     return "\n".join(
-        f"**{row['title']}**\n\n![{row['title']} without and with"
-        f" compensation](images/gallery/{row['robot']}.png)\n"
+        f"**{row['title']}**\n\n![{row['title']}](images/gallery/{row['robot']}.png)\n"
         for row in gallery
     )
 
