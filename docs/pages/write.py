@@ -28,13 +28,13 @@ from docs.pages.learned import (
     learning_in_short,
     maps_markdown,
 )
-from docs.pages.standings import claims_markdown, read_leaderboard
+from docs.pages.standings import claims_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.changes import BEST_ANALYTIC
 from train.evaluate.standings import Standing
-from train.report.leaderboard import leaderboard_markdown
+from train.report.leaderboard import leaderboard_markdown, read_leaderboard
 from train.report.table_formats import Head, Row, Table, to_markdown
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}

@@ -46,9 +46,9 @@ PARTLY = "partly held out"
 BEST_ANALYTIC = "best policy without learning"
 """Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds, or robots and episodes of a policy without them, from which on an interval is taken for a
-verdict: of 95 % intervals over two seeds every other one misses the truth, over five every
-eleventh."""
+"""Training seeds, or robots and episodes of a policy without them, from which on an interval is
+taken for a verdict: of 95 % intervals over two seeds every other one misses the truth, over five
+every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any
 effect.
@@ -59,8 +59,8 @@ CLAIM_ROBOTS = 64
 SIGNS = {"none": "*", "unclear": "?"}
 """Signs behind a change that is not shown, by its verdict."""
 SIGNS_ARE = (
-    "A star: the interval includes zero. A question mark: too few training seeds, robots or episodes"
-    " to say."
+    "A star: the interval includes zero. A question mark: too few training seeds, robots or"
+    " episodes to say."
 )
 
 _SMALL = 0.0995

@@ -173,9 +173,9 @@ def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
 
 
 def _share(parts: Array, axis: int = -1) -> Any:
-    """Won over played pairs, of (2, ..., seeds)."""
+    """Won over played pairs, of (2, ..., seeds); nan without one."""
     won, played = parts.sum(axis=axis)
-    return won / played
+    return won / np.where(played > 0.0, played, np.nan)
 
 
 def mean_of_robots(values: Array, counts: Array) -> Array:

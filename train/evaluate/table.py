@@ -81,7 +81,8 @@ class EpisodeTable:
     Attributes:
         rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a
             policy that was not trained), `reference`, `scenario`, `cell`, `random` (whether its
-            episodes differ), `seed`, `robot` (which of the cell's), `failed`, and the metrics [SI], nan where the episode failed.
+            episodes differ), `seed`, `robot` (which of the cell's), `failed`, and the metrics [SI],
+            nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.
