@@ -215,7 +215,9 @@ def learning_in_short(*tables: Rows) -> str:
         for (reference, base), found in places.items():
             cells = {(row["scope"], row["metric"]): row for row in found}
             changes = [
-                _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
+                _over_base(cells[scope, metric], "")[1] if (scope, metric) in cells else "-"
+                for metric in metrics
+                for scope in _SHORT
             ]
             lines.append([reference, f"`{base}`", *changes])
     head = [

@@ -30,11 +30,12 @@ from docs.pages.learned import (
     learning_in_short,
     maps_markdown,
 )
-from docs.pages.standings import board_markdown, claims_markdown, read_leaderboard
+from docs.pages.standings import board_markdown, claims_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
+from train.report.leaderboard import read_leaderboard
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = ("uncompensated_rms", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
