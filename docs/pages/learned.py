@@ -152,6 +152,29 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence
     return page_table([*names, "", *figures], lines, words=len(names) + 1)
 
 
+_TWENTY = " num_steps=20"
+"""End of the name of a walk of twenty steps."""
+
+
+def twenty_steps(*tables: Rows) -> str:
+    """Paired changes against the best policy without learning, over walks of twenty steps.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
+    """
+    lines = []
+    for rows in tables:
+        walks = [row for row in rows if row["reference"].endswith(_TWENTY)]
+        own = _residuals(walks, _JUDGED[:2], ("mixture", "drawn"), BEST_ANALYTIC)
+        places = group_by(own, lambda row: (row["reference"], row["scope"]))
+        for (reference, _), found in places.items():
+            by_metric = {row["metric"]: row for row in found}
+            changes = (_over_base(by_metric[metric], "")[1] for metric in _JUDGED[:2])
+            lines.append([reference.removesuffix(_TWENTY), _scope(found[0]), *changes])
+    titles = (_METRICS[metric][0] for metric in _JUDGED[:2])
+    return page_table(["step", "", *titles], lines, words=2)
+
+
 def both_opponents(*tables: Rows) -> str:
     """Paired changes of residuals of the walker, against the best policy without learning and
     against their base.

@@ -59,6 +59,21 @@ def twenty_steps(rows: Rows) -> str:
     return page_table(head, lines, words=2)
 
 
+def walks_in_short(rows: Rows) -> str:
+    """Pelvis error and ZMP deviation of some policies over twenty steps of 3 s."""
+    cells = Cells(rows)
+    reference = "3 s num_steps=20"
+    lines = [
+        [
+            f"`{name}`",
+            *(format_metrics(cells.row(name, reference, s), (PELVIS, ZMP), 1) for s in _SHORT),
+        ]
+        for name in ("input_output", "adaptive_posture", "foothold", "phase_table")
+    ]
+    return page_table(["policy", *(f"`{scenario}`" for scenario in _SHORT)], lines)
+
+
+_SHORT = ("nominal", "payload", "drawn")
 _LAST_SHOWN = ("nominal", "soft", "drawn")
 
 

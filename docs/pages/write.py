@@ -29,6 +29,7 @@ from docs.pages.learned import (
     learned_maps,
     learning_in_short,
     maps_markdown,
+    twenty_steps,
 )
 from docs.pages.standings import board_markdown, claims_markdown
 from docs.pages.step_picture import step_svg
@@ -176,7 +177,8 @@ PARTS: Mapping[str, Part] = {
         "learned_walker",
         *FAST_WALKERS,
     ),
-    "learning at 3 s": _of(learning_in_short, "learned_walker"),
+    "learning over twenty steps": _of(twenty_steps, "learned_walker", *FAST_WALKERS),
+    "walks in short": _of(walks.walks_in_short, "walks"),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
     "forty steps": _of(walks.forty_steps, "footholds"),
