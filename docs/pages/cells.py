@@ -192,12 +192,10 @@ def in_table_unit(row: Mapping[str, str], metric: str) -> float:
     return scale * float(row[metric]) if row[metric] else math.nan
 
 
-def format_metrics(
-    row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / "
-) -> str:
+def format_metrics(row: Mapping[str, str], metrics: Iterable[str], decimals: int) -> str:
     """Metrics side by side with so many decimals, - where there is none."""
     values = (in_table_unit(row, metric) for metric in metrics)
-    return between.join(
+    return " / ".join(
         "-" if math.isnan(value) else minus(f"{round(value, decimals) + 0.0:.{decimals}f}")
         for value in values
     )
