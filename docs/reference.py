@@ -105,7 +105,7 @@ def help_of(*words: str) -> str:
         main([*words, "--help"])
     plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).rstrip()
     return "\n".join(
-        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line
+        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line.rstrip()
         for line in plain.splitlines()
     )
 
