@@ -31,8 +31,11 @@ def test_panels_name_the_scenarios_that_their_bars_are_of(
         for step, scenarios in ((s + 0.2, own) for s, own in PLAYED.items())
         for scenario in scenarios
     ]
-    column = evaluations[0].condition.environment.swept[0]
-    plots.draw_overview(evaluations, column, tmp_path / "overview.png")
+    columns = evaluations[0].condition.environment.judged
+    plots.draw_overview(evaluations, columns, tmp_path / "overview.png")
     shown = [[label.get_text() for label in axis.get_xticklabels()] for axis in kept[0].axes]
-    assert shown == list(PLAYED.values())
+    assert shown == 2 * list(PLAYED.values())
+    labels = [axis.get_ylabel() for axis in kept[0].axes]
+    figures = ["pelvis error rms [mrad]", "ZMP deviation rms [mm]"]
+    assert labels == [label for label in figures for _ in PLAYED]  # one below the other
     plt.close(kept[0])

@@ -1000,21 +1000,21 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     parts = zip(train.commands.demo._PARTS, references, strict=True)
     short = [part.replace(references=[reference]) for part, reference in parts]
     monkeypatch.setattr(train.commands.demo, "_PARTS", short)
-    main(["demo"])
+    main(["demo", "--figure-format", "svg"])
     printed = capsys.readouterr().out
     walks = {
-        f"{name}_0.3+0.5+0.3_s_num_steps={steps}_{scenario}.png"
+        f"{name}_0.3+0.5+0.3_s_num_steps_{steps}_{scenario}.svg"
         for name in ("pelvis", "zmp")
         for steps, scenario in ((1, "nominal"), (2, "soft"))
     }
     names = {
-        "fig5_identification.png",
-        "fig6_static_errors.png",
-        "sine.png",
+        "fig5_identification.svg",
+        "fig6_static_errors.svg",
+        "sine.svg",
         "identification.json",
         *walks,
     }
-    names |= {"episodes.csv", "summary.md"}
+    names |= {"episodes.csv", "summary.md", "report.html", "report.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {
         "config.yaml",
         "metadata.json",
@@ -1022,6 +1022,9 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
     summary = Path("runs/demo/summary.md").read_text()
     assert [text for text in ("| sine |", "| input_output |") if text not in summary] == []
+    report = Path("runs/demo/report.html").read_text()
+    assert report.count("data:image/svg+xml;base64,") == 2
+    assert report.count('class="chart" id=') == 3  # a motion and two walks
     of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")
     policies = (
         "uncompensated",

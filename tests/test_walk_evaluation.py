@@ -427,8 +427,8 @@ def test_intervals_are_where_a_mask_is_true() -> None:
         ("zmp", 3.0, "nominal", "fig10_zmp_3_s_nominal"),
         ("zmp", 3, "soft", "zmp_3_s_soft"),
         ("pelvis", {"step_period": 3, "num_steps": 4}, "nominal", "fig8_pelvis_3_s_nominal"),
-        ("pelvis", {"step_period": 3, "num_steps": 1}, "nominal", "pelvis_3_s_num_steps=1_nominal"),
-        ("zmp", {"step_period": 24, "num_steps": 1}, "nominal", "zmp_24_s_num_steps=1_nominal"),
+        ("pelvis", {"step_period": 3, "num_steps": 1}, "nominal", "pelvis_3_s_num_steps_1_nominal"),
+        ("zmp", {"step_period": 24, "num_steps": 1}, "nominal", "zmp_24_s_num_steps_1_nominal"),
         ("pelvis", [0.8, 0.6, 0.8], "nominal", "pelvis_0.8+0.6+0.8_s_nominal"),
     ],
 )
@@ -585,14 +585,14 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
         "figure_policies": ["input", "rigid"],
     }
     Path("walks.yaml").write_text(yaml.safe_dump(content))
-    main(["compare", "walks.yaml", "--jobs", "1"])
+    main(["compare", "walks.yaml", "--jobs", "1", "--figure-format", "pdf"])
     assert drawn == [["input", "rigid"]] * 2
-    stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
+    stem = "0.3+0.5+0.3_s_num_steps_1_ideal.pdf"
     reports = {"statistics.csv", "report.html", "report.md"}
     files = {
         "episodes.csv",
         "summary.md",
-        "overview.png",
+        "overview.pdf",
         f"pelvis_{stem}",
         f"zmp_{stem}",
     } | reports
@@ -614,7 +614,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
 def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a command that knows the testbed alone."""
     main(["evaluate", "--env", "walker", "--reference", COMMAND_SHORT, "--policy", "input_wrench"])
-    assert Path("runs/evaluate/pelvis_0.3+0.5+0.3_s_num_steps=1_nominal.png").exists()
+    assert Path("runs/evaluate/pelvis_0.3+0.5+0.3_s_num_steps_1_nominal.png").exists()
     assert "input_wrench" in capsys.readouterr().out
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.identification.identify import Identification, identify_points
@@ -16,10 +15,17 @@ from elastic_env.core.config import Model
 from train.cells.play import run_conditions
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env
 from train.figures import comparison_figures, plots, testbed_plots
-from train.report.summary import print_summary, write_episodes, write_summary
+from train.figures.chart import time_chart
+from train.figures.colours import policy_colours
+from train.report.page import TEXTS, Page
+from train.report.report_text import capital
+from train.report.specs import page_chart
+from train.report.summary import print_summary, summary_table, write_episodes, write_summary
+from train.report.table_formats import Table
+from train.report.write import require_libraries, write_page
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
 
@@ -60,26 +66,27 @@ _PARTS = [
 ]
 """Static poses and a motion of the testbed, then walks."""
 
+Rows = list[tuple[str, str, str]]
+"""Quantity, its figure here and in the paper."""
+
 
 class Demo(Model):
-    """The paper's experiments in short, on testbed and walker, in some minutes, with pictures."""
+    """The paper's experiments in short, on testbed and walker, in some minutes, with a report."""
 
     output: Path | None = None
     """Folder for the results, new or empty; default runs/demo, numbered if taken."""
+    figure_format: plots.FigureFormat = "png"
+    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
 
     def run(self, console: Console) -> None:
         """Run, print the tables beside the paper's figures, and say where the pictures are."""
         plots.require_matplotlib()
+        require_libraries()
         parts = [config.conditions() for config in _PARTS]
         conditions = list(chain(*parts))
         recorded = {"conditions": [own.model_dump(mode="json") for own in conditions]}
         with run_folder("demo", recorded, 0, self.output) as folder:
-            console.print(
-                "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic"
-                " gear and a pendulum of 60 N·m, and a humanoid that walks in place on twelve of"
-                " them; at the end with joints that are softer than assumed (scenario soft), where"
-                " the first step settles and is not scored"
-            )
+            console.print(_PLAYED)
             evaluations = iter(run_conditions(conditions, console))
             played = [list(islice(evaluations, len(part))) for part in parts]
             static, motion, *walked = played
@@ -91,31 +98,74 @@ class Demo(Model):
             result = identify_points(points, [make_gravity(model)])
             result.save(folder / "identification.json")
             known = static[0].condition.environment
-            fig5 = folder / "fig5_identification.png"
-            fig6 = folder / "fig6_static_errors.png"
+            names = ("fig5_identification", "fig6_static_errors", "sine")
+            fig5, fig6, sine = (folder / f"{name}.{self.figure_format}" for name in names)
             files = [
                 testbed_plots.draw_identification(result, points, [model], fig5),
                 testbed_plots.draw_static_errors(static, model, fig6),
-                comparison_figures.draw_picture("time", known.curves, motion, folder / "sine.png"),
+                comparison_figures.draw_picture("time", known.curves, motion, sine),
             ]
             for walk in comparison_figures.cells_together(walks):
-                files += comparison_figures.draw_signals(walk, folder)
+                files += comparison_figures.draw_signals(walk, folder, self.figure_format)
+            page = _report(_testbed_rows(result, static), files[:2], motion, walks)
             files += [
+                *write_page(page, folder),
                 folder / "identification.json",
                 write_episodes(scored, folder / "episodes.csv"),
                 write_summary(scored, folder / "summary.md"),
             ]
-        console.print(_testbed_table(result, static), "")
+        console.print(make_table(_TESTBED, _HEAD, _testbed_rows(result, static)), "")
         print_summary(motion, console)
-        console.print("", _walk_table(walks), "")
+        console.print("", make_table(_WALKS, _HEAD, _walk_rows(walks)), "")
         print_summary(walks, console)
         print_files(folder, files, console)
 
 
+_PLAYED = (
+    "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a"
+    " pendulum of 60 N·m, and a humanoid that walks in place on twelve of them; at the end with"
+    " joints that are softer than assumed (scenario soft), where the first step settles and is not"
+    " scored"
+)
 _HEAD = ("quantity", "here", "paper")
+_TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
+_WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
-def _testbed_table(result: Identification, static: Sequence[Evaluation]) -> Table:
+def _report(
+    found: Rows, pictures: Sequence[Path], motion: Sequence[Evaluation], walks: Sequence[Evaluation]
+) -> Page:
+    """The tables of the demonstration, and its curves, which can be zoomed."""
+    page = Page("Demonstration", f"{_PLAYED}.")
+    page.section("One joint, at rest")
+    page.add("table", Table.plain(_HEAD, found))
+    for picture in pictures:
+        page.add("picture", picture, picture.stem.replace("_", " "))
+    page.section("One joint, in motion", TEXTS["curves"])
+    _add_cells(page, motion)
+    page.section("Walks", f"{TEXTS['curves']}{TEXTS['curves_walk']}")
+    page.add("table", Table.plain(_HEAD, _walk_rows(walks)), capital(_WALKS))
+    _add_cells(page, walks)
+    return page
+
+
+def _add_cells(page: Page, evaluations: Sequence[Evaluation]) -> None:
+    """Scores of some cells, and the curves of each."""
+    known = evaluations[0].condition.environment
+    page.add("table", summary_table(evaluations, known.columns))
+    for own in comparison_figures.cells_together(evaluations):
+        first = own[0].condition
+        policies = group_by(own, lambda e: e.condition.policy.title)
+        chart = time_chart(policies, known.curves, policy_colours(list(policies)), _POINTS)
+        title = capital(f"{known.title(first.reference_name)}, {first.scenario}")
+        page.add("chart", page_chart(chart), title)
+
+
+_POINTS = 1500
+"""Points of a curve on the page, at most."""
+
+
+def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     line = f"{result.line_stiffness_nm_per_rad:.1f}"
@@ -132,10 +182,10 @@ def _testbed_table(result: Identification, static: Sequence[Evaluation]) -> Tabl
         error = 1e3 * testbed_plots.static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
-    return make_table("the paper's testbed experiments, Figs. 5 and 6", _HEAD, rows)
+    return rows
 
 
-def _walk_table(walks: Sequence[Evaluation]) -> Table:
+def _walk_rows(walks: Sequence[Evaluation]) -> Rows:
     rows = []
     for walk in walks:
         condition = walk.condition
@@ -152,5 +202,4 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
         name = f"{walked}, {condition.policy.title} [mrad]"
         rows.append((name, " and ".join(peaks) or "fell", paper))
-    title = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
-    return make_table(title, _HEAD, rows)
+    return rows

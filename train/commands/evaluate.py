@@ -8,6 +8,7 @@ from elastic_env.core.config import Model
 from train.commands.compare import CompareConfig, compare
 from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options
 from train.evaluate.conditions import NumEpisodes, PolicySpec, Seed
+from train.figures.plots import FigureFormat
 from train.runs.console import print_files
 
 
@@ -52,6 +53,8 @@ class Evaluate(Model):
     such as '[1001]', twelve on the walker, or the path of an identification.json."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
+    figure_format: FigureFormat = "png"
+    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
     on: OnHardware = OnHardware()
 
     def run(self, console: Console) -> None:
@@ -68,5 +71,7 @@ class Evaluate(Model):
                 **motion,
                 **self.on.environment(self.env),
             )
-        finished = compare(config, console, self.output, report=False)
+        finished = compare(
+            config, console, self.output, report=False, figure_format=self.figure_format
+        )
         print_files(finished.folder, finished.files, console)

@@ -23,6 +23,7 @@ from elastic_env.robots.testbed.model import Pendulum
 from train.commands.identify_arm import ArmOptions, run_arm_identification
 from train.commands.options import OnHardware, option_name
 from train.figures import plots
+from train.figures.plots import FigureFormat
 from train.figures.testbed_plots import draw_identification
 from train.runs.console import make_table
 from train.runs.escaping import write_records
@@ -78,6 +79,8 @@ class Identify(Model):
     """Seed of the sensor noise, and of what is held out."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
+    figure_format: FigureFormat = "png"
+    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
     testbed: OfTestbed = OfTestbed()
     on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
     arm: ArmOptions = ArmOptions()
@@ -112,7 +115,7 @@ class Identify(Model):
                 " --log"
             )
             raise ConfigurationError(problem)
-        return run_arm_identification(self.arm, console, self.seed, self.output)
+        return run_arm_identification(self.arm, console, self.seed, self.output, self.figure_format)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
         plots.require_matplotlib()
@@ -130,7 +133,7 @@ class Identify(Model):
             finally:
                 for env in envs:
                     env.close()
-            files = [folder / "identification.json", folder / "identification.png"]
+            files = [folder / f"identification.{end}" for end in ("json", self.figure_format)]
             results[0].save(files[0])
             models = [env.unwrapped.assumed_model for env in envs]
             draw_identification(results[0], points[0], models, files[1])

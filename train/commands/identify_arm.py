@@ -54,6 +54,7 @@ from train.commands.identify_servo import ServoOptions, are_servo_logs, identify
 from train.commands.options import option_name
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
+from train.figures.plots import FigureFormat
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
@@ -130,7 +131,11 @@ class _Setting:
 
 
 def run_arm_identification(
-    options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
+    options: ArmOptions,
+    console: Console,
+    seed: int = 0,
+    output: Path | None = None,
+    figure_format: FigureFormat = "png",
 ) -> ArmIdentification | GeometryIdentification | ServoIdentification | None:
     """Identify an arm or a servo, write files and print the result; or plan poses.
 
@@ -139,6 +144,7 @@ def run_arm_identification(
         console: Where progress and table go.
         seed: Seed of the poses from which the plan chooses.
         output: Folder for the results; default runs/identify, numbered if taken.
+        figure_format: Of the figure.
 
     Returns:
         The result; None for a plan without a log.
@@ -148,7 +154,7 @@ def run_arm_identification(
         ResultsExistError: The output folder holds results.
     """
     if are_servo_logs(options.log):
-        return _identify_servo(options, console, seed, output)
+        return _identify_servo(options, console, seed, output, figure_format)
     if options.servo != ServoOptions():
         if options.log and not Path(options.log[0]).is_file():
             raise ConfigurationError(f"no log at {quote(options.log[0])[1:-1]}; name a file")
@@ -179,6 +185,7 @@ def run_arm_identification(
             held_out=options.judged,
             seed=seed,
             output=output,
+            figure_format=figure_format,
         )
     recorded = {**options.model_dump(mode="json"), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
@@ -196,7 +203,7 @@ def run_arm_identification(
         held_out = judge_poses(Judged.of_poses(model), options.judged, console, seed)
         result = describe_fit(fit, options.within, options.assume, information, held_out)
         files = result.save(folder)
-        picture = folder / "identification.png"
+        picture = folder / f"identification.{figure_format}"
         files.append(draw_arm_identification(fit, result, picture))
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
@@ -210,7 +217,11 @@ def run_arm_identification(
 
 
 def _identify_servo(
-    options: ArmOptions, console: Console, seed: int, output: Path | None
+    options: ArmOptions,
+    console: Console,
+    seed: int,
+    output: Path | None,
+    figure_format: FigureFormat,
 ) -> ServoIdentification:
     """Identify a servo from logs in time.
 
@@ -244,6 +255,7 @@ def _identify_servo(
         holdout=options.judged.holdout,
         seed=seed,
         output=output,
+        figure_format=figure_format,
     )
 
 

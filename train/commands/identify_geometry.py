@@ -28,6 +28,7 @@ from elastic_env.core.errors import list_names, unknown_name
 from elastic_env.rigid.tree.links import Tree
 from train.commands.held_out import HoldoutOptions, judge_poses, show_held_out
 from train.figures.geometry_plots import draw_geometry
+from train.figures.plots import FigureFormat
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
@@ -58,6 +59,7 @@ def identify_geometry(
     held_out: HoldoutOptions,
     seed: int = 0,
     output: Path | None = None,
+    figure_format: FigureFormat = "png",
 ) -> GeometryIdentification:
     """Identify geometry and stiffness, write files and figure, print tables.
 
@@ -71,6 +73,7 @@ def identify_geometry(
         held_out: What is kept back from the fit.
         seed: Seed of the poses that are held out.
         output: Folder for the results; default runs/identify, numbered if taken.
+        figure_format: Of the figure.
 
     Raises:
         ConfigurationError: A name does not exist, or there are too few poses.
@@ -86,7 +89,7 @@ def identify_geometry(
         judged = judge_poses(Judged.of_geometry(problem), held_out, console, seed)
         result = describe_geometry(fit, judged)
         files = result.save(folder, correct_model(spec, tree, fit))
-        files.append(draw_geometry(result, folder / "identification.png"))
+        files.append(draw_geometry(result, folder / f"identification.{figure_format}"))
     show_result(result, console)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)

@@ -18,6 +18,7 @@ from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.model_file import compiled_model
 from train.figures import plots
+from train.figures.plots import FigureFormat
 from train.figures.servo_plots import draw_servo
 from train.runs.console import make_table
 from train.runs.folders import run_folder
@@ -54,6 +55,7 @@ def identify_servo(
     holdout: float = 0.3,
     seed: int = 0,
     output: Path | None = None,
+    figure_format: FigureFormat = "png",
 ) -> ServoIdentification:
     """Identify a servo, write files and picture, print tables.
 
@@ -66,6 +68,7 @@ def identify_servo(
         holdout: Share of the logs that is replayed without a fit; 0 for none.
         seed: Seed of the draw of these logs.
         output: Folder for the results; default runs/identify, numbered if taken.
+        figure_format: Of the picture.
 
     Raises:
         ConfigurationError: A log or an option cannot be used.
@@ -90,7 +93,7 @@ def identify_servo(
                 fit = fit_servo(logs, lambda done: show(0, STAGES + done), seed)
         result = describe_servo(fit, joint or "*", held_out)
         files = result.save(folder)
-        picture = folder / "identification.png"
+        picture = folder / f"identification.{figure_format}"
         files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
     show_result(result, console)
     for path in files:

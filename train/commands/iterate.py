@@ -63,6 +63,8 @@ class Iterate(Model):
     """Robots, each of which learns by itself; their seeds follow --seed."""
     output: Path | None = None
     """Folder for the run, new or empty; default runs/iterate, numbered if taken."""
+    figure_format: plots.FigureFormat = "png"
+    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
 
     @model_validator(mode="after")
     def _motion_repeats(self) -> "Iterate":
@@ -100,7 +102,7 @@ class Iterate(Model):
         """
         plots.require_matplotlib()
         condition = self.condition
-        recorded = self.model_dump(mode="json", exclude={"output"})
+        recorded = self.model_dump(mode="json", exclude={"output", "figure_format"})
         with closing(make_vector_env(condition, self.robots)) as env:
             policy: IterativeLearner = make_policy(condition.policy, env)
             with run_folder("iterate", recorded, self.seed, self.output) as folder:
@@ -110,7 +112,7 @@ class Iterate(Model):
                 chart = trials_chart(trials, columns, title)
                 files = [
                     self._write(trials, policy.names, folder / "trials.csv"),
-                    plots.draw_chart(chart, folder / "trials.png"),
+                    plots.draw_chart(chart, folder / f"trials.{self.figure_format}"),
                 ]
                 policies = self._save(env, policy, folder)
         console.print(trials_table(trials, condition))

@@ -90,6 +90,8 @@ class Robot(Model):
     """Seed of the episodes."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/robot, numbered if taken."""
+    figure_format: plots.FigureFormat = "png"
+    """Of the figures of the comparison: pdf and svg have no resolution, and png has 300 dpi."""
     video: bool = False
     """Film the motion, uncompensated and with input.
 
@@ -128,7 +130,7 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
     if trial.stiffness is None and trial.model in GALLERY:
         text = f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness"
         console.print(text)
-    recorded = trial.model_dump(mode="json", exclude={"output", "video"})
+    recorded = trial.model_dump(mode="json", exclude={"output", "figure_format", "video"})
     with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
         compared = CompareConfig(
@@ -139,7 +141,9 @@ def try_robot(trial: Robot, console: Console) -> tuple[Path, list[Path]]:
             policies=[PolicySpec(name=name) for name in POLICIES],
             seed=trial.seed,
         )
-        comparison = compare(compared, console, folder / "comparison")
+        comparison = compare(
+            compared, console, folder / "comparison", figure_format=trial.figure_format
+        )
         placed = [_placement(one) for one in comparison.evaluations]
         shares = joint_shares(plant)
         files = [

@@ -186,30 +186,33 @@ class _Observers:
         self._env = env
         self._policy = policy
         self._task = task
-        self._estimate = _Rms(task, len(episodes)) if has_estimate else None
+        self._estimate = _Rms(len(episodes)) if has_estimate else None
         self._changes = SupportChanges(model) if has_estimate and walks else None
-        self._imu = _Rms(task, len(episodes)) if walks else None
+        self._imu = _Rms(len(episodes)) if walks else None
         self._traces = {
             world: _Trace(task, environment.traced, world)
             for world, (_, number) in enumerate(episodes)
             if number == 0
         }
         self._ended = set[int]()
+        self._scored = np.zeros(len(episodes), dtype=np.bool_)
 
     def watch(self, step: int, observation: Array, info: Any, memory: Any) -> None:
         """Take a control step, between the command and its effect."""
+        scored = self._task.masks(self._task.sample())["scored"]
+        self._scored = scored
         for world, trace in self._traces.items():
             if world not in self._ended:
-                trace.take(observation, info)
+                trace.take(observation, {**info, "scored": scored})
         if self._imu is not None:
             shown = self._task.observation_table.group("imu_attitude")
             attitude = observation[:, shown]
             truth = np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
-            self._imu.take(np.square(attitude - truth).sum(axis=1))
+            self._imu.take(np.square(attitude - truth).sum(axis=1), scored)
         if self._estimate is not None:
             estimate = self._policy.link_estimate(observation, memory)
             truth = self._env.unwrapped.truth()
-            self._estimate.take(np.square(estimate - truth.q).mean(axis=1))
+            self._estimate.take(np.square(estimate - truth.q).mean(axis=1), scored)
             if self._changes is not None:
                 self._changes.take(step, estimate, observation, truth)
 
@@ -231,7 +234,8 @@ class _Observers:
         """Take the last sample of a world."""
         self._ended.add(world)
         if world in self._traces:
-            self._traces[world].take(observation, info)
+            # the step before it says whether it is scored: the world may have begun anew
+            self._traces[world].take(observation, {**info, "scored": self._scored})
 
     def keep_trace(self, world: int, result: Evaluation) -> None:
         """Put the trace of a first episode into its evaluation."""
@@ -245,13 +249,11 @@ class _Observers:
 class _Rms:
     """RMS over the scored steps of every world."""
 
-    def __init__(self, task: Any, worlds: int) -> None:
-        self._task = task
+    def __init__(self, worlds: int) -> None:
         self._sum = np.zeros(worlds)
         self._count = np.zeros(worlds)
 
-    def take(self, squared: Array) -> None:
-        scored = self._task.masks(self._task.sample())["scored"]
+    def take(self, squared: Array, scored: BoolArray) -> None:
         self._sum += np.where(scored, squared, 0.0)
         self._count += scored
 

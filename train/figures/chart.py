@@ -5,18 +5,19 @@ Pictures and the page of a report draw the same charts.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
+from dataclasses import dataclass, replace
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.motion.trajectory import STAND_S
 from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation
 from train.evaluate.progress import Curves
 from train.evaluate.statistics import Estimate
-from train.figures.colours import REFERENCE, dash_of
+from train.figures.colours import RAMP, REFERENCE, SCORED, dash_of
 
 Colours = Mapping[str, str]
 """Colour of every policy."""
@@ -65,6 +66,7 @@ class Panel:
         is_log: Whether its axis is logarithmic.
         height: Its height in a picture [in].
         rows: Names of rows in place of numbers, from the top; a curve has the row as its y.
+        own: Names of curves that other panels of a picture lack: its own legend has them.
     """
 
     label: str
@@ -73,6 +75,22 @@ class Panel:
     is_log: bool = False
     height: float = 1.9
     rows: Sequence[str] = ()
+    own: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Times that a strip above the panels marks.
+
+    Attributes:
+        name: What they are.
+        colour: Of the strip.
+        spans: Their beginnings and ends.
+    """
+
+    name: str
+    colour: str
+    spans: Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +103,7 @@ class Chart:
         panels: From the top.
         shaded: Beginnings and ends of what is shaded.
         shade_name: Name of that in the legend.
+        marks: Strips above the panels; they do not overlap.
         ticks: Values of a logarithmic axis; None for a linear one.
         width: Width of a picture [in].
     """
@@ -94,8 +113,9 @@ class Chart:
     panels: Sequence[Panel]
     shaded: Sequence[tuple[float, float]] = ()
     shade_name: str = "single support"
+    marks: Sequence[Mark] = ()
     ticks: Sequence[float] | None = None
-    width: float = 9.0
+    width: float = 7.2
 
 
 def time_chart(
@@ -103,34 +123,78 @@ def time_chart(
     signals: Sequence[TracedSignal],
     colours: Colours,
     most_points: int | None = None,
+    most_lines: int | None = None,
 ) -> Chart:
     """Signals of the first episodes over time; over training seeds the median with its band.
 
     The scale is that of the walks that go on: what happens shortly before a fall leaves the chart.
+    Strips mark the time in which policies ramp in, and what is scored.
 
     Args:
         policies: Evaluations with a trace, by title of the policy.
         signals: A panel for each.
         colours: Of the policies.
         most_points: Points of a curve, about; None for all.
+        most_lines: Lines of a panel, with the reference; None for all. Policies of like errors
+            share a panel.
     """
     every = list(chain(*policies.values()))
     longest = _longest(every)
     time_s = longest["time_s"]
     stride = 1 if most_points is None else max(1, -(-len(time_s) // most_points))
+    most = len(policies)
+    if most_lines is not None:
+        most = most_lines - any(signal.reference is not None for signal in signals)
+    parts = _split(policies, signals, most)
     panels = []
-    for signal in signals:
+    for signal, titles in product(signals, parts):
         curves = [
-            _trace_curve(title, colours[title], own, signal, stride)
-            for title, own in policies.items()
+            _trace_curve(title, colours[title], policies[title], signal, stride) for title in titles
         ]
         if signal.reference is not None:
             y = signal.scale * longest[signal.reference][::stride]
             look = (REFERENCE, time_s[::stride], y, "dash")
             curves.append(Curve("reference", *look, width=1.1))
-        panels.append(Panel(signal.label, curves, _limits(every, signal)))
+        limits = _limits([*chain(*(policies[title] for title in titles))], signal)
+        panels.append(Panel(signal.label, curves, limits, own=titles if len(parts) > 1 else ()))
     single = longest.get("single_support", np.zeros(len(time_s)))
-    return Chart("", "time [s]", panels, shaded=intervals(single, time_s))
+    chart = Chart("", "time [s]", panels, shaded=intervals(single, time_s))
+    return replace(chart, marks=_marks(longest))
+
+
+def _split(
+    policies: Mapping[str, Evaluations], signals: Sequence[TracedSignal], most: int
+) -> list[list[str]]:
+    """Policies in parts of at most so many, about equally large, the greatest errors first.
+
+    One part has the order of the policies.
+    """
+    number = -(-len(policies) // most)
+    if number == 1:
+        return [list(policies)]
+    errors = np.array([[_rms(own, s) for s in signals] for own in policies.values()])
+    sizes = np.nansum(errors / np.maximum(np.nanmax(errors, axis=0), 1e-12), axis=1)
+    titles = list(policies)
+    order = [titles[place] for place in np.argsort(-sizes, kind="stable")]
+    return [list(part) for part in np.array_split(order, number)]
+
+
+def _rms(own: Evaluations, signal: TracedSignal) -> float:
+    """How far a signal is from what it should be; shortly before a fall left out."""
+    parts = []
+    for e in own:
+        wanted = 0.0 if signal.reference is None else e.trace[signal.reference]
+        parts.append((e.trace[signal.name] - wanted)[e.is_steady])
+    values = np.concatenate(parts)
+    return float(np.sqrt(np.nanmean(values**2))) if np.isfinite(values).any() else float("nan")
+
+
+def _marks(trace: Mapping[str, Array]) -> list[Mark]:
+    """When policies ramp in, and what is scored."""
+    time_s = trace["time_s"]
+    ramp = (float(time_s[0]), min(STAND_S, float(time_s[-1])))
+    scored = intervals(trace["scored"], time_s)
+    return [Mark("ramp-in", RAMP, [ramp]), Mark("scored", SCORED, scored)]
 
 
 def _longest(evaluations: Evaluations) -> Mapping[str, Array]:
@@ -158,9 +222,13 @@ def _median_curve(name: str, colour: str, x: Array, values: Array, **look: Any) 
 
 
 def _limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
-    """Range of a signal and its reference, shortly before a fall left out, with a margin."""
+    """Range of a signal and its reference, with a margin; neither of ramp-in nor of a fall."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
-    parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
+    masks = [e.is_steady & (e.trace["time_s"] > STAND_S) for e in evaluations]
+    if not any(mask.any() for mask in masks):
+        masks = [e.is_steady for e in evaluations]
+    played = list(zip(evaluations, masks, strict=True))
+    parts = [e.trace[name][mask] for e, mask in played for name in names]
     values = np.concatenate(parts)
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:

@@ -13,6 +13,8 @@ LINE = _CHART["line"]
 SHADE = _CHART["shade"]
 REFERENCE = _CHART["reference"]
 FAILED = _CHART["failed"]
+RAMP = _CHART["ramp"]
+SCORED = _CHART["scored"]
 COLOURS: dict[str, str] = _DATA["baselines"]
 """Of the baselines."""
 STRONG: list[str] = _DATA["strong"]

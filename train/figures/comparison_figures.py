@@ -17,11 +17,13 @@ from train.evaluate.rollout import make_vector_env
 from train.figures.chart import Cells, Curve, Panel, median, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
-from train.figures.plots import Evaluations, draw_chart, draw_overview
+from train.figures.plots import Evaluations, FigureFormat, draw_chart, draw_overview
 from train.figures.testbed_plots import draw_static_errors
 
 _MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
+_MOST_LINES = 4
+"""Lines of a panel over time."""
 _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
 _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}}
@@ -35,6 +37,7 @@ def draw_figures(
     folder: Path,
     policies: Sequence[str] = (),
     swept: str | None = None,
+    figure_format: FigureFormat = "png",
 ) -> list[Path]:
     """Draw the figures of a comparison.
 
@@ -43,46 +46,53 @@ def draw_figures(
         folder: Where to.
         policies: Policies of the time series, all if empty.
         swept: Title of the axis of swept options; None without a sweep.
+        figure_format: Of the files.
     """
     known = evaluations[0].condition.environment
     files = []
     for name, chart in sweep_charts(evaluations, swept, known.swept).items():
-        files.append(draw_chart(chart, folder / f"sweep_{name}.png"))
+        files.append(draw_chart(chart, folder / f"sweep_{name}.{figure_format}"))
     if swept is not None:
         return files
-    files.insert(0, draw_overview(evaluations, known.swept[0], folder / "overview.png"))
+    overview = folder / f"overview.{figure_format}"
+    files.insert(0, draw_overview(evaluations, known.judged, overview))
     for group in cells_together(evaluations):
         by_policy = group_by(group, lambda e: e.condition.policy.title)
         shown = [own for t, own in by_policy.items() if not policies or t in policies]
-        files += draw_signals(list(chain(*shown)), folder) if shown else []
+        files += draw_signals(list(chain(*shown)), folder, figure_format) if shown else []
     return files
 
 
-def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
+def draw_maps(
+    maps: Sequence[HeatMap], folder: Path, figure_format: FigureFormat = "png"
+) -> list[Path]:
     """Draw the maps of a comparison, a picture per scenario, motion and metric."""
     files = []
     for found in maps:
         name = _safe(f"{found.title}_{found.column.metric}")
-        files.append(draw_map(found, folder / f"map_{name}.png"))
+        files.append(draw_map(found, folder / f"map_{name}.{figure_format}"))
     return files
 
 
-def draw_signals(evaluations: Evaluations, folder: Path) -> list[Path]:
+def draw_signals(
+    evaluations: Evaluations, folder: Path, figure_format: FigureFormat = "png"
+) -> list[Path]:
     """Draw the signals of one motion and scenario over time, and what it shows at rest.
 
     Args:
         evaluations: The policies, a line each.
         folder: Where to.
+        figure_format: Of the files.
     """
     first = evaluations[0]
     known = first.condition.environment
     files = []
     for name, signals in group_by(known.curves, lambda signal: signal.picture).items():
         if name:
-            path = folder / f"{figure_name(name, first)}.png"
+            path = folder / f"{figure_name(name, first)}.{figure_format}"
             files.append(draw_picture(name, signals, evaluations, path))
     if first.points is not None:
-        path = folder / f"{figure_name('static', first)}.png"
+        path = folder / f"{figure_name('static', first)}.{figure_format}"
         model = make_vector_env(first.condition, 1).unwrapped.assumed_model
         files.append(draw_static_errors(evaluations, model, path))
     return files
@@ -91,10 +101,14 @@ def draw_signals(evaluations: Evaluations, folder: Path) -> list[Path]:
 def draw_picture(
     name: str, signals: Sequence[TracedSignal], evaluations: Evaluations, path: Path
 ) -> Path:
-    """Draw signals of several policies over time, as Figs. 7 to 10 of the paper."""
+    """Draw signals of several policies over time, as Figs. 7 to 10 of the paper.
+
+    A panel has four lines at most, so several policies have several panels.
+    """
     condition = evaluations[0].condition
     policies = {e.condition.policy.title: [e] for e in evaluations}
-    chart = time_chart(policies, signals, policy_colours(list(policies)))
+    colours = policy_colours(list(policies))
+    chart = time_chart(policies, signals, colours, most_lines=_MOST_LINES)
     number = paper_figure(name, condition)
     title = f"{_SUBJECTS.get(name, '')}{_title(condition)}"
     if number is not None:
@@ -204,4 +218,4 @@ def _stem(evaluation: Evaluation) -> str:
 
 
 def _safe(text: str) -> str:
-    return re.sub(r"[^\w.=+-]+", "_", text)
+    return re.sub(r"[^\w.+-]+", "_", text)

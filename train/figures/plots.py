@@ -1,9 +1,10 @@
 """Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a comparison."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import chain, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -11,10 +12,12 @@ from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
-from train.figures.chart import Chart, Curve, Evaluations
+from train.figures.chart import Chart, Curve, Evaluations, Mark
 from train.figures.colours import FAILED, policy_colours
 from train.runs.escaping import visible
 
+FigureFormat = Literal["png", "pdf", "svg"]
+"""Ending of a picture's file, which says what it is written as."""
 MRAD = 1e3
 """Factor from rad to what figures show."""
 
@@ -57,7 +60,7 @@ def columns_of(entries: int, widest: int = 5) -> int:
 
 
 def save(figure: Any, path: Path) -> Path:
-    """Write a figure and forget it."""
+    """Write a figure as what the ending of its file says, and forget it."""
     for text in figure.findobj(lambda part: hasattr(part, "set_text")):
         text.set_text(visible(text.get_text()))
     content = io.BytesIO()
@@ -70,7 +73,8 @@ def save(figure: Any, path: Path) -> Path:
 def draw_chart(chart: Chart, path: Path) -> Path:
     """Draw the panels of a chart one below the other, with a legend below.
 
-    A filled cross on top stands where all episodes of a policy failed, an open one where some did.
+    A panel has those of its curves beside it that the others lack. A filled cross on top stands
+    where all episodes of a policy failed, an open one where some did.
     """
     heights = [panel.height for panel in chart.panels]
     size = (chart.width, sum(heights) + 1.2)
@@ -97,11 +101,15 @@ def draw_chart(chart: Chart, path: Path) -> Path:
             axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
         if chart.ticks is None:
             axis.margins(x=0.0)
+        if panel.own:
+            _add_legend(axis, panel.own)
     if chart.ticks is not None:
         axes[-1].set_xscale("log")
         axes[-1].set_xticks(chart.ticks, [f"{value:g}" for value in chart.ticks])
         axes[-1].minorticks_off()
-    axes[0].set_title(chart.title)
+    axes[0].set_title(chart.title, pad=12 if chart.marks else None)
+    for mark in chart.marks:
+        _draw_mark(axes, mark)
     axes[-1].set_xlabel(chart.label)
     if any(curve.fails for panel in chart.panels for curve in panel.curves):
         axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
@@ -109,12 +117,34 @@ def draw_chart(chart: Chart, path: Path) -> Path:
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
         once |= dict(zip(labels, handles, strict=True))
+    for title in chain(*(panel.own for panel in chart.panels)):
+        once.pop(label_text(title), None)
     if chart.shade_name in once:  # behind the curves
         once[chart.shade_name] = once.pop(chart.shade_name)
     figure.align_ylabels(axes)
     ncols = columns_of(len(once))
     figure.legend(once.values(), once.keys(), ncols=ncols, loc="outside lower center")
     return save(figure, path)
+
+
+def _add_legend(axis: Any, titles: Sequence[str]) -> None:
+    """A legend of some curves to the right of a panel."""
+    handles, labels = axis.get_legend_handles_labels()
+    known = dict(zip(labels, handles, strict=True))
+    names = [label_text(title) for title in titles]
+    place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+    axis.legend([known[name] for name in names], names, fontsize=8, **place)
+
+
+def _draw_mark(axes: Sequence[Any], mark: Mark) -> None:
+    """A strip above the first panel; lines through all where it is one piece."""
+    style = {"color": mark.colour, "lw": 0, "clip_on": False}
+    for place, (begin, end) in enumerate(mark.spans):
+        name = {} if place else {"label": mark.name}
+        axes[0].axvspan(begin, end, ymin=1.02, ymax=1.06, **style, **name)
+    if len(mark.spans) == 1:
+        for axis, x in product(axes, mark.spans[0]):
+            axis.axvline(x, color=mark.colour, lw=0.7, ls=":", zorder=1)
 
 
 def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
@@ -149,8 +179,8 @@ def show_numbers(axis: Any, numticks: int | None = None) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
-    """A metric of every policy: a panel per reference, or of one scenario one with all of them.
+def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Path) -> Path:
+    """Metrics of every policy: a panel for each and every reference, or of one scenario one.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
     failed.
@@ -170,18 +200,23 @@ def draw_overview(evaluations: Evaluations, column: Column, path: Path) -> Path:
         panels.setdefault(outer, {}).setdefault(inner, []).append(e)
     group_width = 0.35 + 0.14 * len(titles)
     width = 1.2 + max(3.0, group_width * max(map(len, panels.values())))
-    stacked = len(panels) > 1 and width * len(panels) > _WIDEST
-    rows, columns = (len(panels), 1) if stacked else (1, len(panels))
-    size = (min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows)
+    stacked = width * len(panels) > _WIDEST
+    beside = 1 if stacked else len(panels)
+    rows = len(panels) * len(columns) // beside
+    height = 3.8 if rows == 1 else 2.3
+    size = (min(width, 1.4 * _WIDEST) * beside, height * rows)
     # each with its own groups below it: a reference need not be played in all scenarios
-    figure, axes = new_figure(rows, columns, size, sharey=True)
-    for axis, (title, groups) in zip(axes, panels.items(), strict=True):
-        _draw_bars(axis, groups, column, shades)
-        axis.set_title(title)
-        if axis.get_subplotspec().is_first_col():
-            axis.set_ylabel(column.label)
+    figure, axes = new_figure(rows, beside, size)
+    for number, column in enumerate(columns):
+        own = axes[number * len(panels) :][: len(panels)]
+        for axis, (title, groups) in zip(own, panels.items(), strict=True):
+            _draw_bars(axis, groups, column, shades)
+            if axis is not own[0]:
+                axis.sharey(own[0])
+            axis.set_title(title if stacked or not number else "")
+            axis.set_ylabel(column.label if axis.get_subplotspec().is_first_col() else "")
     if is_one_scenario and known.quantity:
-        axes[-columns].set_xlabel(known.quantity)
+        axes[-beside].set_xlabel(known.quantity)
     bar = axes[0].bar
     names = {label_text(title): shade for title, shade in shades.items()}
     handles = [bar(np.nan, 0.0, color=c, label=name) for name, c in names.items()]

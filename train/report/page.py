@@ -1,5 +1,6 @@
 """A report as sections of texts, tables and charts, written as an HTML page and as Markdown."""
 
+import base64
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,7 +15,9 @@ from train.runs.escaping import markdown_text
 _FILE = Path(__file__).with_name("texts.toml")
 TEXTS = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 """Paragraphs by section or table."""
-Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart"]
+_SHOWN = {".png": "png", ".svg": "svg+xml"}
+"""Pictures that a page shows, by the ending of their files."""
+Kind = Literal["bullets", "definitions", "table", "map", "text", "caption", "chart", "picture"]
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,9 @@ class Part:
     """A part of a section.
 
     Attributes:
-        kind: What it is; captions and charts stand on the page alone.
-        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, or the panels of a map.
+        kind: What it is; captions, charts and pictures stand on the page alone.
+        content: A text, texts, pairs of texts, a `Table`, a chart's `Spec`, the panels of a map, or
+            the file of a picture beside the page.
         title: Above it; empty for none.
         is_folded: Whether it is folded away under its title. A chart is drawn when it is unfolded.
         is_open: Whether it is unfolded at first.
@@ -36,9 +40,16 @@ class Part:
     is_open: bool = False
 
     @property
+    def data(self) -> str:
+        """A picture as an address that holds it; empty where a page cannot show its kind."""
+        kind = _SHOWN.get(self.content.suffix)
+        content = base64.b64encode(self.content.read_bytes()).decode()
+        return f"data:image/{kind};base64,{content}" if kind else ""
+
+    @property
     def as_markdown(self) -> list[str]:
         """Blocks of Markdown; none of a chart."""
-        if self.kind in ("caption", "chart"):
+        if self.kind in ("caption", "chart", "picture"):
             return []
         blocks = [f"### {markdown_text(self.title)}"] if self.title else []
         if self.kind == "table":

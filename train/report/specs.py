@@ -18,6 +18,8 @@ _LEGEND_ROW = 150
 """Letters in a row of a legend."""
 _PIXELS = 110
 """Pixels for an inch of a picture."""
+_STRIP = 8
+"""Pixels of the strip that marks times."""
 _GAP = 0.05
 """Share of the height between panels."""
 
@@ -52,12 +54,17 @@ def page_chart(chart: Chart) -> Spec:
         ticks = {"type": "log", "tickvals": list(chart.ticks), "ticktext": texts}
     last = nth(len(chart.panels) - 1)
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{last}", **ticks)
-    layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0}
+    height = round(130 + _PIXELS * total)
+    strip = _STRIP / (height - 28 - 20 * legend_rows - 50) if chart.marks else 0.0
+    layout["legend"] = {"orientation": "h", "y": 1.0 + 1.5 * strip, "yanchor": "bottom", "x": 0.0}
     layout["showlegend"] = True
     is_small = len({curve.name for curve in curves if curve.name}) < 7
     layout["hovermode"] = "x unified" if is_small else "closest"
-    layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
-    return {"data": data, "layout": {**layout, "height": round(130 + _PIXELS * total)}}
+    shapes = [_band(*span, SHADE) for span in chart.shaded]
+    ends = (1.0 + 0.5 * strip, 1.0 + 1.5 * strip)
+    shapes += [_band(*span, mark.colour, ends) for mark in chart.marks for span in mark.spans]
+    layout["shapes"] = shapes
+    return {"data": data, "layout": {**layout, "height": height}}
 
 
 def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
@@ -108,10 +115,11 @@ def _abscissa(x: Array) -> Spec:
     return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
 
 
-def _shade(begin: float, end: float) -> Spec:
+def _band(begin: float, end: float, colour: str, ends: tuple[float, float] = (0, 1)) -> Spec:
+    """A time in a colour, between two heights of the chart as shares of it."""
     x = {"xref": "x", "x0": digits(begin), "x1": digits(end)}
-    y = {"yref": "paper", "y0": 0, "y1": 1}
-    look = {"fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+    y = {"yref": "paper", "y0": round(ends[0], 6), "y1": round(ends[1], 6)}
+    look = {"fillcolor": colour, "line": {"width": 0}, "layer": "below"}
     return {"type": "rect", **x, **y, **look}
 
 

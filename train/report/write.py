@@ -57,12 +57,15 @@ def require_plotly() -> str:
 
 def write_report(results: Results) -> list[Path]:
     """Write `report.html` and `report.md` beside the other files of a comparison."""
-    page = results.folder / "report.html"
-    text = results.folder / "report.md"
-    content = _page(results)
-    write_whole(page, content.html(require_plotly()))
-    write_whole(text, content.as_markdown())
-    return [page, text]
+    return write_page(_page(results), results.folder)
+
+
+def write_page(page: Page, folder: Path) -> list[Path]:
+    """Write a page as `report.html` and `report.md`."""
+    files = [folder / "report.html", folder / "report.md"]
+    write_whole(files[0], page.html(require_plotly()))
+    write_whole(files[1], page.as_markdown())
+    return files
 
 
 def _page(results: Results) -> Page:
