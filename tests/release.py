@@ -178,6 +178,16 @@ def try_installed(programs: Path, folder: Path, wheel: Path) -> None:
     _run([elastic, "compare", "paper_testbed", "--episodes", "1", "--output", "run"], folder)
     if not (folder / "run" / "report.html").is_file():
         raise ConfigurationError("elastic compare paper_testbed wrote no report.html")
+    found = _run([*python, _PUBLISHED], folder)
+    if int(found) < 100:
+        raise ConfigurationError(f"the published leaderboard has {found} rows")
+
+
+_PUBLISHED = """\
+from pathlib import Path
+from train.report.leaderboard import find_published, read_leaderboard
+print(len(read_leaderboard(find_published(Path("leaderboard")))))
+"""
 
 
 def _require_shadow_is_named(command: list[str], own: Path) -> None:

@@ -7,10 +7,13 @@ from typing import Any
 import pytest
 import yaml
 
+import elastic_env
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.commands.bench import BenchConfig, annotation, configuration
 from train.commands.cli import main
+from train.evaluate.conditions import Condition
+from train.evaluate.episodes import evaluate
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
@@ -69,7 +72,8 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     written(figures={"link_error_rms_rad": accepted / 1.1})
     capsys.readouterr()
     assert failed([str(path)])
-    assert f"link_error_rms_rad is {accepted:.4g}, at most" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"link_error_rms_rad is {accepted:.4g} (+10.0 %), at most" in " ".join(said.split())
     assert Path("summary.md").read_text().count("## elastic bench") == 2
     assert "falls short" in Path("summary.md").read_text()
 
@@ -125,6 +129,44 @@ def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[s
     assert "is no metric of this episode; those are" in capsys.readouterr().out
     assert failed([str(path), "--update"])
     assert "link_eror_rms_rad is no metric" in capsys.readouterr().out
+
+
+def test_figures_have_margins_of_their_own_and_are_means_over_episodes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches one margin for all, an episode alone that counts, and a margin of no figure."""
+    names = ("link_error_rms_rad", "link_error_peak_rad")
+    path = written(figures=dict.fromkeys(names), episodes=3, seed=4)
+    assert not failed([str(path), "--update"])
+    accepted = yaml.safe_load(path.read_text())["cases"][0]["figures"]
+    alone = [
+        evaluate(Condition(policy={"name": "input"}, reference=QUICK, seed=seed)).episodes[0]
+        for seed in (4, 5, 6)
+    ]
+    for name in names:
+        mean = sum(own[name] for own in alone) / 3.0
+        assert accepted[name] == pytest.approx(mean, rel=1e-3)
+        assert accepted[name] != pytest.approx(alone[0][name], rel=1e-5)
+    better = {name: value / 1.2 for name, value in accepted.items()}
+    path = written(figures=better, episodes=3, seed=4, margins={names[1]: 0.25})
+    assert failed([str(path)])
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"{names[0]} is {accepted[names[0]]:.4g} (+20.0 %)" in out
+    assert f"{names[1]} is" not in out
+    path = written(margins={"link_error_peak_rad": 0.1})
+    with pytest.raises(SystemExit):
+        main(["bench", str(path)])
+    assert "figure with a margin of its own" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_workflow_of_the_docs_runs_what_there_is() -> None:
+    """Catches a workflow that no parser reads, or that installs another version than this one."""
+    page = (ROOT / "docs" / "commands.md").read_text()
+    (text,) = (block for block in page.split("```yaml") if "jobs:" in block.partition("```")[0])
+    steps = yaml.safe_load(text.partition("```")[0])["jobs"]["bench"]["steps"]
+    commands = [step["run"] for step in steps if "run" in step]
+    assert f"elastic-env=={elastic_env.__version__}" in commands[0]
+    assert commands[-1].startswith("elastic bench ")
 
 
 def test_the_shipped_configuration_is_accepted_in_full() -> None:

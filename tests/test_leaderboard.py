@@ -16,7 +16,6 @@ from rich.console import Console
 import train.commands.compare
 import train.speed.step_times
 from baselines.catalogue import Track
-from docs.pages.standings import read_leaderboard
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
@@ -30,8 +29,10 @@ from train.evaluate.statistics import Estimate, over_seeds
 from train.report.leaderboard import (
     board,
     claims_table,
+    find_published,
     leaderboard_markdown,
     print_leaderboard,
+    read_leaderboard,
     scenarios_board,
     three_digits,
     write_leaderboard,
@@ -390,12 +391,8 @@ def test_times_are_medians_of_rounds_in_turn(monkeypatch: pytest.MonkeyPatch) ->
 # elastic compare with a leaderboard.
 
 
-def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a leaderboard that the command does not write, and a user's policy that is not on
-    it."""
-    Path("mine.py").write_text(
-        "import baselines\n\n\ndef make(env):\n    return baselines.make('uncompensated', env)\n"
-    )
+def write_board(policies: Sequence[Any]) -> None:
+    """A configuration of a leaderboard of one step."""
     content = {
         "name": "board",
         "env": "walker",
@@ -403,11 +400,17 @@ def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyP
         "leaderboard": True,
         "scenarios": ["ideal"],
         "groups": {"mixture": ["ideal"]},
-        "policies": ["uncompensated", {"name": "mine.py:make", "track": "walks on this robot"}],
+        "policies": policies,
     }
     Path("board.yaml").write_text(yaml.safe_dump(content))
 
+
+def play_quickly(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Play in this process, without figures; the titles of the policies that are played."""
+    played: list[str] = []
+
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
+        played.extend(condition.policy.title for condition in conditions)
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     monkeypatch.setattr(train.commands.compare, "run_conditions", run)
@@ -415,6 +418,18 @@ def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyP
         train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1)
     )
     monkeypatch.setattr(train.commands.compare, "draw_figures", lambda *_: [])
+    return played
+
+
+def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a leaderboard that the command does not write, and a user's policy that is not on
+    it."""
+    Path("mine.py").write_text(
+        "import baselines\n\n\ndef make(env):\n    return baselines.make('uncompensated', env)\n"
+    )
+    own = {"name": "mine.py:make", "track": "walks on this robot"}
+    write_board(["uncompensated", own])
+    play_quickly(monkeypatch)
     main(["compare", "board.yaml"])
     folder = Path("runs/board")
     with (folder / "leaderboard.csv").open(newline="") as file:
@@ -428,3 +443,54 @@ def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyP
         episodes = [float(r[METRIC]) for r in csv.DictReader(file)]
     assert float(found[0]["mean"]) == pytest.approx(episodes[0], rel=1e-5)
     assert "**walks on this robot**" in (folder / "leaderboard.md").read_text()
+
+
+def test_a_policy_of_ones_own_stands_beside_published_ones_that_do_not_play(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a leaderboard that is played anew, rows that do not say that they are published,
+    and ones of another version, another protocol or the same name."""
+    Path("mine.py").write_text(
+        "import baselines\n\nmake = lambda env: baselines.make('zero', env)\n"
+    )
+    write_board(["uncompensated"])
+    played = play_quickly(monkeypatch)
+    main(["compare", "board.yaml", "--output", "theirs"])
+    published = Path("theirs/leaderboard.csv")
+    words = ["compare", "board.yaml", "--published", str(published)]
+    mine = [*words, "--policies", "mine.py:make", "--output", "ours"]
+    main(mine)
+    assert played == ["uncompensated", "mine.py:make"]
+    found = read_leaderboard(Path("ours/leaderboard.csv"))
+    assert {(row.policy, row.is_published) for row in found} == {
+        ("uncompensated", True),
+        ("mine.py:make", False),
+    }
+    before = read_leaderboard(published)
+    assert [row.score for row in found if row.is_published] == [row.score for row in before]
+    assert "uncompensated (published)" in Path("ours/leaderboard.md").read_text()
+
+    def refused(arguments: list[str]) -> str:
+        with pytest.raises(SystemExit):
+            main(arguments)
+        return " ".join(capsys.readouterr().err.split())
+
+    capsys.readouterr()
+    assert "'uncompensated' is published already; name your own by --policies" in refused(words)
+    more = refused([*mine[:-1], "more", "--episodes", "2"])
+    assert "published rows must be played as one's own" in more
+    text = published.read_text()
+    published.write_text(text.replace("mujoco 4", "mujoco 3"))
+    assert "there by elastic-env" in refused([*mine[:-1], "other"])
+    Path("board.yaml").write_text("name: board\n")
+    assert "leaderboard: true" in refused([*mine[:-1], "none"])
+    assert len(played) == 2  # all of it was found before anything played
+
+
+def test_the_package_brings_a_leaderboard_of_its_version_and_preset() -> None:
+    """Catches a file that is not in the package, and one that nobody can append to."""
+    preset = load_yaml(ROOT / "configs" / "leaderboard.yaml", CompareConfig)
+    found = read_leaderboard(find_published(Path("leaderboard")))
+    assert {row.origin for row in found} == {preset.origin}
+    with pytest.raises(ConfigurationError, match="name of the published one: leaderboard"):
+        find_published(Path("nothing"))

@@ -13,7 +13,6 @@ import pytest
 
 from docs.pages.cells import KEPT, Cells, Kept, condense, in_table_unit, keep, read_rows
 from docs.pages.learned import MAPS, learned_maps
-from docs.pages.standings import read_leaderboard
 from docs.pages.write import (
     PARTS,
     PICTURES,
@@ -27,6 +26,7 @@ from docs.pages.write import (
 )
 from docs.pages.write import main as write_pages
 from elastic_env.core.errors import ConfigurationError
+from train.report.leaderboard import read_leaderboard
 from train.runs.escaping import write_records
 
 ROOT = Path(__file__).parents[1]

@@ -225,3 +225,42 @@ def test_figures_are_asked_for_all_resamples_at_once() -> None:
 
     estimate(figures, [4])
     assert asked == [1, RESAMPLES]
+
+
+def test_without_training_episodes_of_one_robot_have_an_interval() -> None:
+    """Catches one over single episodes in the place of pairs, one of a scenario in which nothing
+    is random, and one of a residual, whose seeds it would hide."""
+    theirs = np.array([2.0, 9.0, 4.0, 3.0, 8.0, 5.0])
+    gain = np.array([0.5, 0.6, 0.4, 0.7, 0.5, 0.3])
+    played = [
+        cell("base", {"all": list(theirs)}, "payload"),
+        cell("base", {"all": [2.0]}, "ideal"),
+        cell("mine", {"all": list(gain * theirs)}, "payload"),
+        cell("mine", {"all": [1.0]}, "ideal"),
+    ]
+    rows = {row.scope: row for row in changes(played) if row.column.metric == METRIC}
+    found = rows["payload"].relative
+    assert found.value == pytest.approx((gain @ theirs) / theirs.sum() - 1.0)
+    known = stats.bootstrap(
+        (gain * theirs, theirs),
+        lambda mine, base, axis=-1: mine.mean(axis=axis) / base.mean(axis=axis) - 1.0,
+        paired=True,
+        rng=np.random.default_rng(9),
+        **BOOTSTRAP,
+    )
+    np.testing.assert_allclose(found.ends, known.confidence_interval, rtol=0.03)
+    assert (found.over, found.robots, rows["payload"].verdict) == ("6 episodes", 0, "lower")
+    assert not rows["ideal"].relative.has_interval
+    assert rows["ideal"].verdict == "unclear"
+
+
+def test_drawn_robots_and_episodes_of_one_robot_are_told_apart() -> None:
+    """Catches episodes that are called robots in a group that has both."""
+    played = [
+        cell(title, {"all": [own, own + 1.0, own + 3.0]}, scenario)
+        for title, own in (("base", 4.0), ("mine", 2.0))
+        for scenario in ("drawn", "payload")
+    ]
+    (row, *_) = [r for r in changes(played, {"both": ["drawn", "payload"]}) if r.is_group]
+    assert row.relative.over == "3 robots and 3 episodes"
+    assert row.verdict == "lower"

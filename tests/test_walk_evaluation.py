@@ -427,8 +427,8 @@ def test_intervals_are_where_a_mask_is_true() -> None:
         ("zmp", 3.0, "nominal", "fig10_zmp_3_s_nominal"),
         ("zmp", 3, "soft", "zmp_3_s_soft"),
         ("pelvis", {"step_period": 3, "num_steps": 4}, "nominal", "fig8_pelvis_3_s_nominal"),
-        ("pelvis", {"step_period": 3, "num_steps": 1}, "nominal", "pelvis_3_s_num_steps=1_nominal"),
-        ("zmp", {"step_period": 24, "num_steps": 1}, "nominal", "zmp_24_s_num_steps=1_nominal"),
+        ("pelvis", {"step_period": 3, "num_steps": 1}, "nominal", "pelvis_3_s_num_steps_1_nominal"),
+        ("zmp", {"step_period": 24, "num_steps": 1}, "nominal", "zmp_24_s_num_steps_1_nominal"),
         ("pelvis", [0.8, 0.6, 0.8], "nominal", "pelvis_0.8+0.6+0.8_s_nominal"),
     ],
 )

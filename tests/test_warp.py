@@ -21,6 +21,7 @@ from elastic_env.joint.make_elastic import transform_hinges
 from elastic_env.joint.small_servos import small_servo
 from elastic_env.world.physics import ManyWorlds, Simulation
 from elastic_env.world.warp_physics import WarpWorlds, for_warp
+from train.commands.speed import Speed, measure
 
 TESTBED = "elastic_env/Testbed-v0"
 WALKER = "elastic_env/WalkInPlace-v0"
@@ -272,3 +273,15 @@ def test_a_step_of_the_walk_agrees_with_mujoco() -> None:
     for name in ("pelvis_error_rms_rad", "pelvis_roll_rms_rad", "zmp_deviation_rms_m"):
         np.testing.assert_allclose(warped[name], plain[name], rtol=5e-3)
     assert np.ptp(plain["pelvis_error_rms_rad"]) > 1e-3
+
+
+@pytest.mark.slow
+def test_the_command_that_measures_a_gpu_steps_its_worlds_on_warp() -> None:
+    """Catches a command that measures the CPU under the name of the GPU."""
+    options = {"backend": "warp", "device": DEVICE, "others": False, "ppo": False}
+    config = Speed(env="testbed", num_envs=[2], steps=2, rounds=1, **options)
+    loop = config.vector_loop(2, "input", residual=False)
+    assert isinstance(loop.env.unwrapped.simulation, WarpWorlds)
+    found = measure(config, lambda share: None)
+    assert [one["contender"] for one in found][:2] == ["vector env on warp", "raw mj_step"]
+    assert min(one["steps_per_s"] for one in found) > 0.0

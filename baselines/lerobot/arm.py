@@ -145,7 +145,7 @@ class LeRobotArm:
         off = 0.5 * (lower + upper) - middle
         is_turn = ~(upper - lower < _TURN_RAD)
         for joint in np.flatnonzero(np.isfinite(off) & ~is_turn & (np.abs(off) > _FAR_RAD)):
-            place = places[joint]
+            place = places[int(joint)]
             _warn(
                 f"LeRobot's zero of {self.motors[joint]} is the middle of the calibrated range, and"
                 f" the model's range has its middle at {middle[joint]:.3g} rad: is zero_rad"

@@ -7,8 +7,11 @@
 from typing import Any
 
 try:
-    from lerobot.configs.types import PipelineFeatureType, PolicyFeature
-    from lerobot.processor import (
+    from lerobot.configs.types import (  # pyright: ignore[reportMissingImports]
+        PipelineFeatureType,
+        PolicyFeature,
+    )
+    from lerobot.processor import (  # pyright: ignore[reportMissingImports]
         ObservationProcessorStep,
         ProcessorStepRegistry,
         RobotAction,
@@ -19,7 +22,6 @@ except ImportError as error:
     from elastic_env.core.errors import missing_extra
 
     raise missing_extra("lerobot", "lerobot", "a processor step of LeRobot") from error
-from typing_extensions import override
 
 from baselines.lerobot.arm import LeRobotArm
 from baselines.lerobot.settings import ArmSettings
@@ -44,20 +46,20 @@ class CompensateActionStep(RobotActionProcessorStep):
     def __init__(self, **settings: Any) -> None:
         self.arm = LeRobotArm(ArmSettings(**settings))
 
-    @override
     def action(self, action: RobotAction) -> RobotAction:
+        """Action with compensated positions."""
         return self.arm.command(action)
 
-    @override
     def get_config(self) -> dict[str, Any]:
+        """Settings as JSON, with the content of files in the place of their names."""
         return self.arm.settings.model_dump(mode="json")
 
-    @override
     def reset(self) -> None:
+        """Begin anew: the ramp starts at zero."""
         self.arm.reset()
 
-    @override
     def transform_features(self, features: Features) -> Features:
+        """The same features."""
         return features
 
 
@@ -71,14 +73,14 @@ class CorrectObservationStep(ObservationProcessorStep):
     def __init__(self, **settings: Any) -> None:
         self.arm = LeRobotArm(ArmSettings(**settings))
 
-    @override
     def observation(self, observation: RobotObservation) -> RobotObservation:
+        """Observation with positions of the links."""
         return self.arm.link_angles(observation)
 
-    @override
     def get_config(self) -> dict[str, Any]:
+        """Settings as JSON, with the content of files in the place of their names."""
         return self.arm.settings.model_dump(mode="json")
 
-    @override
     def transform_features(self, features: Features) -> Features:
+        """The same features."""
         return features

@@ -51,17 +51,11 @@ class LearnedMap:
     Attributes:
         policy: Title of the residual.
         metric: Column of the episodes.
-        x_is, y_is: What the axes are.
-        x, y: Their values as they are shown.
-        cells: Row of the CSV by (x, y).
+        cells: Row of the CSV by the values of both axes, as they are shown.
     """
 
     policy: str
     metric: str
-    x_is: str
-    y_is: str
-    x: Sequence[str]
-    y: Sequence[str]
     cells: Mapping[tuple[str, str], Mapping[str, str]]
 
     @classmethod
@@ -71,34 +65,28 @@ class LearnedMap:
         return cls(
             first["policy"],
             first["metric"],
-            first["x_is"],
-            first["y_is"],
-            list(dict.fromkeys(row["x"] for row in rows)),
-            list(dict.fromkeys(row["y"] for row in rows)),
             {(row["x"], row["y"]): row for row in rows},
         )
 
     @property
-    def table(self) -> str:
-        """Changes with x to the right and y upwards."""
-        head = [f"{self.y_is} \\ {self.x_is}", *self.x]
-        rows = [
-            [f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)
-        ]
-        return page_table(head, rows, words=0)
-
-    @property
-    def sentence(self) -> str:
-        """In how many cells the residual is ahead and behind, and whom it is compared with."""
-        verdicts = [row["verdict"] for row in self.cells.values()]
-        rivals = [row["best_without_learning"] or "none" for row in self.cells.values()]
+    def row(self) -> list[str]:
+        """Metric, policy, cells ahead and behind, range of the change, and the opponent."""
+        cells = list(self.cells.values())
+        verdicts = [cell["verdict"] for cell in cells]
+        opponents = [cell["best_without_learning"] or "none" for cell in cells]
+        common = max(dict.fromkeys(opponents), key=opponents.count)
+        changes = [float(cell["change"]) for cell in cells if cell["change"]]
+        failed = sum(int(cell["failed"] or 0) for cell in cells)
         title, _ = _METRICS[self.metric]
-        common = max(dict.fromkeys(rivals), key=rivals.count)
-        return (
-            f"**{title[:1].upper()}{title[1:]}, {self.policy}.** Ahead in {verdicts.count('lower')}"
-            f" of {len(verdicts)} cells, behind in {verdicts.count('higher')}. The best policy"
-            f" without learning is {common} in {rivals.count(common)} of {len(rivals)} cells."
-        )
+        return [
+            title,
+            self.policy,
+            f"{verdicts.count('lower')} of {len(cells)}",
+            str(verdicts.count("higher")),
+            f"{percent(min(changes))} to {percent(max(changes))}",
+            str(failed),
+            f"{common} ({opponents.count(common)})",
+        ]
 
 
 def learned_maps(path: Path) -> list[LearnedMap]:
@@ -128,8 +116,9 @@ def learned_maps(path: Path) -> list[LearnedMap]:
 
 
 def maps_markdown(maps: Iterable[LearnedMap]) -> str:
-    """A sentence and a table for each map."""
-    return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
+    """A row for each map."""
+    head = ["", "residual", "ahead", "behind", "change", "failed", "most often best without"]
+    return page_table(head, [each.row for each in maps], words=2)
 
 
 def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = ()) -> str:
@@ -163,19 +152,37 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence
     return page_table([*names, "", *figures], lines, words=len(names) + 1)
 
 
-def fast_gaits(*tables: Rows) -> str:
-    """Paired changes of residuals of the walker against their base, at several step periods.
+_TWENTY = " num_steps=20"
+"""End of the name of a walk of twenty steps."""
+
+
+def twenty_steps(*tables: Rows) -> str:
+    """Paired changes against the best policy without learning, over walks of twenty steps.
 
     Args:
         tables: Rows of a `statistics.csv` each.
     """
-    return changes_table([row for rows in tables for row in rows], scopes=_TELLING[1:])
+    lines = []
+    for rows in tables:
+        walks = [row for row in rows if row["reference"].endswith(_TWENTY)]
+        own = _residuals(walks, _JUDGED[:2], ("mixture", "drawn"), BEST_ANALYTIC)
+        places = group_by(own, lambda row: (row["reference"], row["scope"]))
+        for (reference, _), found in places.items():
+            by_metric = {row["metric"]: row for row in found}
+            changes = (_over_base(by_metric[metric], "")[1] for metric in _JUDGED[:2])
+            lines.append([reference.removesuffix(_TWENTY), _scope(found[0]), *changes])
+    titles = (_METRICS[metric][0] for metric in _JUDGED[:2])
+    return page_table(["step", "", *titles], lines, words=2)
 
 
-def both_opponents(rows: Rows) -> str:
-    """Paired changes of a residual of the walker, against the best policy without learning and
-    against its base, from the rows of a `statistics.csv`.
+def both_opponents(*tables: Rows) -> str:
+    """Paired changes of residuals of the walker, against the best policy without learning and
+    against their base.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
     """
+    rows = [row for table in tables for row in table]
     opponents = (BEST_ANALYTIC, _BASE)
     own = {against: _residuals(rows, _JUDGED, _TELLING, against) for against in opponents}
     cells = {
@@ -231,7 +238,9 @@ def learning_in_short(*tables: Rows) -> str:
         for (reference, base), found in places.items():
             cells = {(row["scope"], row["metric"]): row for row in found}
             changes = [
-                _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
+                _over_base(cells[scope, metric], "")[1] if (scope, metric) in cells else "-"
+                for metric in metrics
+                for scope in _SHORT
             ]
             lines.append([reference, f"`{base}`", *changes])
     head = [
@@ -272,15 +281,3 @@ def _without_breaks(interval: str) -> str:
     """A change whose interval stays on one line in a narrow table."""
     change, _, ends = interval.partition(" [")
     return "{} [{}".format(*(part.replace(" ", "\N{NO-BREAK SPACE}") for part in (change, ends)))
-
-
-def _change(row: Mapping[str, str]) -> str:
-    """Relative change, with a sign where it is not told from chance, and ✕ where a policy
-    failed.
-    """
-    failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
-    return (
-        signed_off(percent(float(row["change"])), row["verdict"]) + failed
-        if row["change"]
-        else f"-{failed}"
-    )

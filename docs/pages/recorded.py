@@ -50,7 +50,7 @@ def _listed(texts: Sequence[str]) -> str:
 
 
 def in_short(rows: Rows) -> str:
-    """The humanoid in one sentence."""
+    """The humanoid's hand in three predictions."""
     full = {
         row["prediction"]: float(row["mean_mm"])
         for row in _of_masses(rows, GUESSED)
@@ -58,12 +58,14 @@ def in_short(rows: Rows) -> str:
     }
     best = min(value for name, value in full.items() if name.startswith("K"))
     others = [value for name, value in full.items() if not name.startswith(("K", "rigid"))]
-    held_out = rows[0]["held_out"]
-    return (
-        f"Identification lowers the error of a recorded humanoid's hand from"
-        f" {full['rigid, as given']:.1f} to {best:.1f} mm at {held_out} held-out poses. The best"
-        f" prediction without physics reaches {min(others):.1f} mm.\n"
-    )
+    head = [
+        f"recorded hand of a humanoid, {rows[0]['held_out']} held-out poses",
+        "rigid model",
+        "K identified",
+        "best without physics",
+    ]
+    figures = (full["rigid, as given"], best, min(others))
+    return page_table(head, [["mean error [mm]", *(f"{value:.1f}" for value in figures)]])
 
 
 def _of_masses(rows: Rows, masses: str) -> list[Mapping[str, str]]:

@@ -12,6 +12,7 @@ from docs.pages.cells import (
     page_table,
 )
 from elastic_env.robots.thormang.tables import BLOCKS
+from train.evaluate.changes import percent
 from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
@@ -31,6 +32,8 @@ _DRAWN = ("input_output", "adaptive_posture", "foothold", "residual of 3 s")
 """Policies that are judged in all scenarios, and on drawn robots."""
 _LONG = ("nominal", "drawn")
 """Scenarios of walks of twenty steps."""
+_LEARNED = ("nominal", "soft", "spread", "payload", "sensor", "push", "slope", "imu", "drawn")
+"""Scenarios in which a robot learns from walk to walk."""
 _FAR = ("nominal", "soft")
 """Scenarios of walks of forty steps."""
 
@@ -53,6 +56,55 @@ def twenty_steps(rows: Rows) -> str:
             drift = format_metrics(row, ["foot_drift_end_m"], 0)
             lines.append([f"`{scenario}`", _robot(policy), *blocks, drift])
     head = ["scenario", "policy", "steps 1 to 4", "steps 17 to 20", "drift at the end"]
+    return page_table(head, lines, words=2)
+
+
+def walks_in_short(rows: Rows) -> str:
+    """Pelvis error and ZMP deviation of some policies over twenty steps of 3 s."""
+    cells = Cells(rows)
+    reference = "3 s num_steps=20"
+    lines = [
+        [
+            f"`{name}`",
+            *(format_metrics(cells.row(name, reference, s), (PELVIS, ZMP), 1) for s in _SHORT),
+        ]
+        for name in ("input_output", "adaptive_posture", "foothold", "phase_table")
+    ]
+    return page_table(["policy", *(f"`{scenario}`" for scenario in _SHORT)], lines)
+
+
+_SHORT = ("nominal", "payload", "drawn")
+_LAST_SHOWN = ("nominal", "soft", "drawn")
+
+
+def last_steps(*tables: Rows) -> str:
+    """Pelvis error and ZMP deviation of residuals over the first and the last four steps.
+
+    Args:
+        tables: Kept rows of a comparison each.
+    """
+    first, last = ((f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS)
+    lines = []
+    for rows in tables:
+        cells = Cells(rows)
+        (reference,) = cells.names("reference")
+        for scenario in _LAST_SHOWN:
+            own, base = (cells.row(name, reference, scenario) for name in ("residual", "foothold"))
+            changes = (
+                in_table_unit(own, b) / in_table_unit(own, a) - 1.0
+                for a, b in zip(first, last, strict=True)
+            )
+            lines.append(
+                [
+                    reference.removesuffix(" num_steps=20"),
+                    f"`{scenario}`",
+                    format_metrics(own, first, 2),
+                    format_metrics(own, last, 2),
+                    " / ".join(percent(change) for change in changes),
+                    format_metrics(base, last, 2),
+                ]
+            )
+    head = ["step", "scenario", "steps 1 to 4", "17 to 20", "change", "`foothold`, 17 to 20"]
     return page_table(head, lines, words=2)
 
 
@@ -179,13 +231,12 @@ def _mean_and_worst(row: Mapping[str, str]) -> str:
 
 
 def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
-    """Scores of `iterative` on each robot, beside its base."""
+    """Scores of `iterative` on each robot, and of its base."""
     found = {
         (s.policy, s.scope, s.metric): s
         for s in standings
         if s.reference == "3 s" and not s.is_group
     }
-    scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
     lines = [
         [
             f"`{scope}`",
@@ -194,9 +245,9 @@ def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
                 for policy in ("adaptive_posture", "iterative")
             ),
         ]
-        for scope in scopes
+        for scope in _LEARNED
     ]
-    return page_table(["scenario", "without learning", "after ten walks"], lines)
+    return page_table(["scenario", "`adaptive_posture`", "after ten walks"], lines)
 
 
 def _mean(pair: Sequence[Standing], decimals: int = 1) -> str:

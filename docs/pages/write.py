@@ -26,19 +26,22 @@ from docs.pages.learned import (
     LearnedMap,
     both_opponents,
     changes_table,
-    fast_gaits,
     learned_maps,
     learning_in_short,
     maps_markdown,
+    twenty_steps,
 )
-from docs.pages.standings import board_markdown, claims_markdown, read_leaderboard
+from docs.pages.standings import board_markdown, claims_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
+from train.report.leaderboard import read_leaderboard
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = ("uncompensated_rms", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
+FAST_WALKERS = ("learned_walker_1600ms", "learned_walker_1100ms")
+"""Comparisons of residuals of the walker at fast gaits."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -48,12 +51,11 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
-            "learned_posture_1600ms",
-            "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
             "learned_testbed_friction",
             "learned_walker",
+            *FAST_WALKERS,
         )
     },
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
@@ -173,10 +175,10 @@ PARTS: Mapping[str, Part] = {
     "learning in short": _of(
         learning_in_short,
         "learned_walker",
-        "learned_posture_1600ms",
-        "learned_posture_1100ms",
+        *FAST_WALKERS,
     ),
-    "learning at 3 s": _of(learning_in_short, "learned_walker"),
+    "learning over twenty steps": _of(twenty_steps, "learned_walker", *FAST_WALKERS),
+    "walks in short": _of(walks.walks_in_short, "walks"),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
     "forty steps": _of(walks.forty_steps, "footholds"),
@@ -195,9 +197,8 @@ PARTS: Mapping[str, Part] = {
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned at fast gaits": _of(
-        fast_gaits,
-        "learned_posture_1600ms",
-        "learned_posture_1100ms",
+        both_opponents,
+        *FAST_WALKERS,
     ),
     "learned on the testbed": _of(
         partial(changes_table, scopes=MOTIONS),
@@ -212,6 +213,9 @@ PARTS: Mapping[str, Part] = {
         "learned_robot",
     ),
     "learned on the walker": _of(both_opponents, "learned_walker"),
+    "last steps of residuals": _of(
+        walks.last_steps, "walks_walker", "walks_walker_1600ms", "walks_walker_1100ms"
+    ),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import tyro
@@ -23,10 +23,17 @@ from elastic_env.core.config import (
     load_yaml,
     quantity,
 )
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec, Seed, cell_of
+from train.evaluate.conditions import (
+    Condition,
+    GivenReference,
+    NumEpisodes,
+    PolicySpec,
+    Seed,
+    cell_of,
+)
 from train.evaluate.episodes import Evaluation, group_by
 from train.report.table_formats import Head, Row, Table, to_markdown, to_terminal
 from train.runs.folders import run_folder
@@ -35,6 +42,10 @@ from train.runs.user_code import CodeNamingModel, is_a, load_without_code
 USUAL = Path("configs/bench.yaml")
 """The default configuration; in a checkout it is that of the package."""
 _SHIPPED = Path(__file__).with_name("bench.yaml")
+
+
+Margin = Annotated[float, Field(ge=0, le=100)]
+"""Relative amount by which a figure may exceed the accepted one."""
 
 
 class BenchCase(Model):
@@ -49,14 +60,24 @@ class BenchCase(Model):
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
     seed: Seed = 0
-    """Seed of the episode."""
+    """Seed of the first episode."""
+    episodes: NumEpisodes = 1
+    """Episodes, with seeds that follow; a figure is the mean over them."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
-    """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
+    """Metrics of the episodes with what was accepted; null where `--update` has not measured."""
+    margins: dict[str, Margin] = {}
+    """Margins of single figures, in place of that of the file."""
+
+    @model_validator(mode="after")
+    def _margins_are_of_figures(self) -> Self:
+        require_known("figure with a margin of its own", self.margins, self.figures)
+        return self
 
     @property
     def condition(self) -> Condition:
         """The cell to play."""
-        return cell_of(self, PolicySpec(name=self.policy, options=self.options))
+        policy = PolicySpec(name=self.policy, options=self.options)
+        return cell_of(self, policy).replace(episodes=self.episodes)
 
 
 class BenchConfig(CodeNamingModel):
@@ -64,7 +85,8 @@ class BenchConfig(CodeNamingModel):
 
     name: Title = "bench"
     margin: float = quantity("1", 0.05, ge=0, le=100)
-    """Relative amount by which a figure may exceed the accepted."""
+    """Relative amount by which a figure may exceed the accepted, where it has no margin of its own.
+    """
     _kind = model_validator(mode="before")(is_a("bench"))
     cases: Entries[BenchCase]
 
@@ -166,27 +188,35 @@ _Figure = dict[str, Any]
 
 
 def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
-    (episode,) = found.episodes
     motion = found.condition.reference_name
     policy = f"{case.policy} {case.options}" if case.options else case.policy
     for metric, accepted in case.figures.items():
-        measured = None if episode["termination"] else episode.get(metric)
-        if measured is not None and np.isnan(measured):
-            measured = None
-        bound = None if accepted is None else accepted + margin * abs(accepted)
+        measured = _measured(found, metric)
+        own = case.margins.get(metric, margin)
+        bound = None if accepted is None else accepted + own * abs(accepted)
         yield {
             "case": f"{case.env}, {motion}, {case.scenario}, {policy}",
             "metric": metric,
             "measured": measured,
             "accepted": accepted,
             "bound": bound,
-            "problem": _problem(metric, measured, bound, episode),
+            "problem": _problem(metric, measured, accepted, bound, found),
         }
 
 
-def _problem(metric: str, measured: Any, bound: Any, episode: dict[str, Any]) -> str:
-    if episode["termination"]:
-        return f"{metric} has no value: the episode ended as {episode['termination']!r}"
+def _measured(found: Evaluation, metric: str) -> float | None:
+    """Mean of a metric over the episodes; None where one of them failed or does not have it."""
+    values = found.values(metric)
+    is_whole = len(values) == len(found.episodes) and not np.isnan(values).any()
+    return float(values.mean()) if is_whole else None
+
+
+def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evaluation) -> str:
+    if ends := dict.fromkeys(own["termination"] for own in found.episodes if own["termination"]):
+        who = f"{found.num_failed} of {len(found.episodes)} episodes"
+        who = "the episode" if len(found.episodes) == 1 else who
+        return f"{metric} has no value: {who} ended as {' and '.join(map(repr, ends))}"
+    episode = found.episodes[0]
     if metric not in episode:
         units = ("_m", "_rad", "_s", "_nm")
         known = ", ".join(name for name in episode if name.endswith(units))
@@ -198,7 +228,8 @@ def _problem(metric: str, measured: Any, bound: Any, episode: dict[str, Any]) ->
         return f"{metric} is {measured:.4g}, and nothing was accepted yet; {accept}"
     if measured <= bound:
         return ""
-    return f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted"
+    worse = f" ({_change(measured, accepted)})" if accepted else ""
+    return f"{metric} is {measured:.4g}{worse}, at most {bound:.4g} is accepted"
 
 
 def _accept(path: Path, evaluations: list[Evaluation]) -> None:
@@ -207,11 +238,11 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> None:
     cases = _child(yaml.compose(text), "cases").value
     changes = []
     for case, evaluation in zip(cases, evaluations, strict=True):
-        (episode,) = evaluation.episodes
         for key, value in _child(case, "figures").value:
-            if key.value in episode and not episode["termination"]:
+            measured = _measured(evaluation, key.value)
+            if measured is not None:
                 place = (value.start_mark.index, value.end_mark.index)
-                changes.append((*place, f"{episode[key.value]:.4g}"))
+                changes.append((*place, f"{measured:.4g}"))
     for begin, end, value in sorted(changes, reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text)  # the user named it, maybe by a link
@@ -235,14 +266,14 @@ def _table(figures: list[_Figure]) -> Table:
             if figure["bound"] is None and figure["measured"] is not None:
                 verdict = "new"
             texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
-            rows.append(Row((metric, *texts, _change(figure), verdict)))
+            change = _change(figure["measured"], figure["accepted"])
+            rows.append(Row((metric, *texts, change, verdict)))
     title = "short rollouts against what was accepted"
     return Table(tuple(heads), tuple(rows), title=title)
 
 
-def _change(figure: _Figure) -> str:
+def _change(measured: float | None, accepted: float | None) -> str:
     """Change of a figure against what was accepted, in per cent; a dash where there is none."""
-    measured, accepted = figure["measured"], figure["accepted"]
     if measured is None or not accepted:
         return "-"
     return f"{100.0 * (measured - accepted) / abs(accepted):+.1f} %"

@@ -1,8 +1,10 @@
 """`elastic compare`: policies × scenarios × references × seeds under one protocol."""
 
+import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -12,8 +14,9 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from baselines.policies import is_saved
-from elastic_env.core.config import MOST_ENTRIES, Entries, Model, Once, Title, load_yaml
+from elastic_env.core.config import MOST_ENTRIES, Entries, Locator, Model, Once, Title, load_yaml
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, quote, require_known
+from elastic_env.world.scenario import make_scenario
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.commands.options import OnHardware, name_options
@@ -33,17 +36,22 @@ from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.residual_seeds import expand
 from train.evaluate.robots import robot_scores
 from train.evaluate.rollout import make_policy, single_world_envs
-from train.evaluate.standings import standings
+from train.evaluate.standings import Standing, append_standings, standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
 from train.report.change_tables import print_changes, write_maps, write_statistics
-from train.report.leaderboard import print_leaderboard, write_leaderboard
+from train.report.leaderboard import (
+    find_published,
+    print_leaderboard,
+    read_leaderboard,
+    write_leaderboard,
+)
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
 from train.runs.console import print_files, warn_once
-from train.runs.folders import describe, lock_run, require_run, run_folder
+from train.runs.folders import describe, installed_version, lock_run, require_run, run_folder
 from train.runs.presets import find_configuration, print_presets
 from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
@@ -142,6 +150,18 @@ class CompareConfig(CodeNamingModel):
         for problem in chain(self._problems_of_map(), self._problems()):
             raise ConfigurationError(problem)
         return self
+
+    @property
+    def origin(self) -> str:
+        """Version and protocol: rows of leaderboards can stand together if these are the same."""
+        others = {"name", "policies", "figure_policies", "leaderboard"}
+        protocol = self.model_dump(mode="json", exclude=others)
+        known = environment(self.env)
+        played = [make_scenario(name, known.walks, self.ranges) for name in self.scenarios]
+        protocol["scenarios"] = [scenario.model_dump(mode="json") for scenario in played]
+        digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
+        versions = [f"{name} {installed_version(name)}" for name in ("elastic-env", "mujoco")]
+        return "; ".join([*versions, f"protocol {digest}"])
 
     @property
     def names_of_code(self) -> list[str]:
@@ -274,6 +294,7 @@ def compare(
     fresh: bool = False,
     report: bool = True,
     figure_format: plots.FigureFormat = "png",
+    published: Sequence[Standing] = (),
 ) -> Comparison:
     """Run a comparison, write its folder, and print its tables.
 
@@ -287,6 +308,7 @@ def compare(
         report: Whether policies are compared with one another, and bases of residuals added for it;
             else they are scored alone, and no cells are kept.
         figure_format: Of the pictures.
+        published: Rows of a leaderboard that one's own are appended to.
 
     Raises:
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
@@ -297,6 +319,7 @@ def compare(
     if report:
         require_libraries()
     conditions = config.conditions(with_bases=report)
+    _require_new(config, published)
     try_out(conditions)
     with _open_run(config, output, resumes) as folder:
         store = Store(folder / CELLS) if report else None
@@ -314,7 +337,10 @@ def compare(
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")
-            board = standings(evaluations, config.groups, step_times(conditions))
+            times = step_times(conditions)
+            board = standings(evaluations, config.groups, times, config.origin)
+            if published:
+                board = append_standings(published, board)
         if robots:
             files.append(write_robots(robots, folder / "robots.csv"))
         files.append(write_summary(cells, folder / "summary.md"))
@@ -335,6 +361,26 @@ def compare(
     if board:
         print_leaderboard(board, console)
     return Comparison(folder, evaluations, files)
+
+
+def _require_new(config: CompareConfig, published: Sequence[Standing]) -> None:
+    """Refuse published rows that one's own cannot stand beside, before anything is played.
+
+    Raises:
+        ConfigurationError: No leaderboard is written, a policy of this name is published, or the
+            protocol is another one.
+    """
+    if not published:
+        return
+    if not config.leaderboard:
+        raise ConfigurationError("published rows are for a configuration with leaderboard: true")
+    known = {row.policy for row in published}
+    again = [policy.title for policy in config.policies if policy.title in known]
+    if again:
+        cure = "name your own by --policies, or give it a label in a configuration"
+        raise ConfigurationError(f"{quote(again[0])} is published already; {cure}")
+    own = [replace(published[0], origin=config.origin)]
+    append_standings(published, own)
 
 
 @contextmanager
@@ -440,6 +486,9 @@ class Compare(Model):
 
     Example, all policies in tracks by what they need: elastic compare leaderboard
 
+    Example, your policy beside them, which are not played again: elastic compare leaderboard
+        --policies mine.py:make --published leaderboard
+
     Example, heat maps over two axes: elastic compare map_payload_slope
     """
 
@@ -453,6 +502,12 @@ class Compare(Model):
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
     episodes: int | None = None
     """Episodes per cell, in place of what the configuration says: 1 for a first look."""
+    policies: tuple[Locator, ...] = ()
+    """Policies in place of those of the configuration: baselines, or FILE.py:function."""
+    published: Path | None = None
+    """leaderboard.csv whose rows yours are appended to, and which are not played; `leaderboard` is
+    the one of the package. It must be of the same version and protocol.
+    """
     jobs: int = 0
     """Conditions that run at the same time, 0 for one per core; on hardware they come one after
     the other.
@@ -495,6 +550,13 @@ class Compare(Model):
         if self.episodes is not None:
             with name_options():
                 config = config.replace(episodes=self.episodes, scenario_episodes={})
+        if self.policies:
+            own = [{"name": name} for name in self.policies]
+            with name_options():
+                config = config.replace(policies=own, figure_policies=[])
+        published = ()
+        if self.published is not None:
+            published = read_leaderboard(find_published(self.published))
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}
@@ -512,5 +574,6 @@ class Compare(Model):
             resumes=is_resumed,
             fresh=self.fresh,
             figure_format=self.figure_format,
+            published=published,
         )
         print_files(finished.folder, finished.files, console)

@@ -29,6 +29,7 @@ from train.evaluate.table import (
     EpisodeTable,
     Groups,
     Scope,
+    by_episode,
     failures,
     means_of_cells,
     pair,
@@ -45,9 +46,9 @@ PARTLY = "partly held out"
 BEST_ANALYTIC = "best policy without learning"
 """Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds, or robots of a policy without them, from which on an interval is taken for a
-verdict: of 95 % intervals over two seeds every other one misses the truth, over five every
-eleventh."""
+"""Training seeds, or robots and episodes of a policy without them, from which on an interval is
+taken for a verdict: of 95 % intervals over two seeds every other one misses the truth, over five
+every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any
 effect.
@@ -58,7 +59,8 @@ CLAIM_ROBOTS = 64
 SIGNS = {"none": "*", "unclear": "?"}
 """Signs behind a change that is not shown, by its verdict."""
 SIGNS_ARE = (
-    "A star: the interval includes zero. A question mark: too few training seeds or robots to say."
+    "A star: the interval includes zero. A question mark: too few training seeds, robots or"
+    " episodes to say."
 )
 
 _SMALL = 0.0995
@@ -122,11 +124,14 @@ class Change(Scope):
     def verdict(self) -> Verdict:
         """lower, higher, none (the interval includes zero), or unclear.
 
-        That is with too few training seeds, or too few robots of a policy that was not trained.
+        That is with too few training seeds, or too few robots and episodes of a policy that was
+        not trained.
         """
         low = self.relative.low
         high = self.relative.high
-        units = self.num_compared if self.is_family else self.relative.robots
+        units = self.relative.robots + self.relative.episodes
+        if self.is_family:
+            units = self.num_compared
         if low is None or high is None or units < FEWEST_SEEDS:
             return "unclear"
         return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
@@ -276,6 +281,9 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
     own = table.of(scope.policy, *scope.cells)
+    drawn = [own.loc[own["cell"] == cell, "robot"].iloc[0] != "" for cell in scope.cells]
+    if scope.first.member is None:
+        own = by_episode(own)
     cells = table.cells_of_base(scope, base)
     beside = zip(cells, scope.cells, strict=True)
     parts = [table.of(base, there).assign(cell=cell) for there, cell in beside]
@@ -306,8 +314,8 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         column=column,
         is_judged=column in table.environment.judged,
         per_seed=change(means, base_means),
-        relative=estimate(relative, robots),
-        improvement=improvement(won, played),
+        relative=_of_units(estimate(relative, robots), robots, drawn),
+        improvement=_of_units(improvement(won, played), robots, drawn),
         mine=_mean(means),
         theirs=_mean(base_means),
         num_pairs=int(sum(values.sum() for values in played)),
@@ -317,6 +325,14 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         base_episodes=base_episodes,
         is_rival=member is not None and base == member.rival,
     )
+
+
+def _of_units(found: Estimate, units: Sequence[int], drawn: Sequence[bool]) -> Estimate:
+    """An estimate that tells drawn robots from episodes of one robot, of units in all cells."""
+    if not found.robots:
+        return found
+    robots = sum(n for n, is_drawn in zip(units, drawn, strict=True) if is_drawn and n > 1)
+    return replace(found, robots=robots, episodes=found.robots - robots)
 
 
 def _mean(values: Array) -> float:

@@ -1,10 +1,11 @@
 """The leaderboard of a comparison: scores over groups of scenarios, in tracks by needs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 from baselines.catalogue import Track
+from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import change_of
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
@@ -53,6 +54,8 @@ class Standing:
             favours it.
         step_us: Median time of the policy alone for a control step of one world [µs].
         interval_over: What the interval of the score is over; empty without one.
+        origin: Version and protocol that it was played with, which rows of one leaderboard share.
+        is_published: Whether it was read from a file, and not played.
     """
 
     track: Track
@@ -71,10 +74,38 @@ class Standing:
     rival: Paired | None
     step_us: float
     interval_over: str = ""
+    origin: str = ""
+    is_published: bool = False
+
+
+def append_standings(published: Sequence[Standing], own: Sequence[Standing]) -> list[Standing]:
+    """A published leaderboard with one's own rows behind; bases that both have stay published.
+
+    Args:
+        published: Rows that were read.
+        own: Rows that were played.
+
+    Raises:
+        ConfigurationError: They were played with another version or protocol.
+    """
+    theirs = dict.fromkeys(row.origin for row in published)
+    ours = dict.fromkeys(row.origin for row in own)
+    if theirs.keys() != ours.keys():
+        there, here = (" and ".join(origins) or "nothing" for origins in (theirs, ours))
+        raise ConfigurationError(
+            f"published rows must be played as one's own, there by {there or 'an unknown version'},"
+            f" here by {here}; the protocol is motions, scenarios, groups, episodes and seed"
+        )
+    known = {row.policy for row in published}
+    kept = [replace(row, is_published=True) for row in published]
+    return [*kept, *(row for row in own if row.policy not in known)]
 
 
 def standings(
-    evaluations: Sequence[Evaluation], groups: Groups, step_us: Mapping[str, float]
+    evaluations: Sequence[Evaluation],
+    groups: Groups,
+    step_us: Mapping[str, float],
+    origin: str = "",
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
@@ -85,6 +116,7 @@ def standings(
         evaluations: All cells, one per training seed.
         groups: Scenarios to pool over, by name.
         step_us: Time per step of every policy, by its title.
+        origin: See `Standing`.
     """
     table = EpisodeTable(evaluations)
     scopes = [s for title in table.policies for s in table.scopes(title, groups)]
@@ -125,6 +157,7 @@ def standings(
                 rival=best,
                 step_us=step_us.get(scope.policy, float("nan")),
                 interval_over=level.over,
+                origin=origin,
             )
             found.append(standing)
     return found

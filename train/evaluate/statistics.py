@@ -1,10 +1,11 @@
 """Statistics over training seeds and robots: changes, interquartile means, bootstrap intervals.
 
 Learning draws the training seed at random, and a scenario draws robots. An interval is over both
-where there are several of both, and over the one of which there are several; never over the
-episodes of one robot [Agarwal 2021, Colas 2019]. All seeds play the same robots. So a resample
-draws seeds, and robots of every cell, and crosses the two [Owen 2007]. A policy is compared with
-its base on the same episodes.
+where there are several of both, and over the one of which there are several [Agarwal 2021, Colas
+2019]. All seeds play the same robots. So a resample draws seeds, and robots of every cell, and
+crosses the two [Owen 2007]. A policy is compared with its base on the same episodes. One that was
+not trained has nothing else that is random where one robot plays all episodes: there the interval
+is over these, which differ in noise, pushes and slopes.
 
 [Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice", NeurIPS. [Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons
@@ -40,8 +41,8 @@ class Estimate:
     Attributes:
         value: The figure; nan where there is none.
         low, high: 95 % interval over seeds and robots; None where there are fewer than two of each.
-        seeds, robots: Training seeds that the interval is over, and drawn robots of all cells; 0
-            where it is not over them.
+        seeds, robots, episodes: Training seeds that the interval is over, drawn robots of all
+            cells, and episodes of one robot; 0 where it is not over them.
     """
 
     value: float
@@ -49,6 +50,7 @@ class Estimate:
     high: float | None = None
     seeds: int = field(default=0, compare=False)
     robots: int = field(default=0, compare=False)
+    episodes: int = field(default=0, compare=False)
 
     @property
     def has_interval(self) -> bool:
@@ -58,9 +60,12 @@ class Estimate:
     @property
     def over(self) -> str:
         """What the interval is over: "10 training seeds and 64 robots"; empty without one."""
-        seeds = f"{self.seeds} training seeds"
-        robots = f"{self.robots} robots"
-        return " and ".join([seeds] * bool(self.seeds) + [robots] * bool(self.robots))
+        units = {
+            "training seeds": self.seeds,
+            "robots": self.robots,
+            "episodes": self.episodes,
+        }
+        return " and ".join(f"{number} {unit}" for unit, number in units.items() if number)
 
     @property
     def is_known(self) -> bool:
@@ -168,9 +173,9 @@ def improvement(won: Sequence[Array], played: Sequence[Array]) -> Estimate:
 
 
 def _share(parts: Array, axis: int = -1) -> Any:
-    """Won over played pairs, of (2, ..., seeds)."""
+    """Won over played pairs, of (2, ..., seeds); nan without one."""
     won, played = parts.sum(axis=axis)
-    return won / played
+    return won / np.where(played > 0.0, played, np.nan)
 
 
 def mean_of_robots(values: Array, counts: Array) -> Array:

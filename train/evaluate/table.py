@@ -80,8 +80,9 @@ class EpisodeTable:
 
     Attributes:
         rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a
-            policy that was not trained), `reference`, `scenario`, `cell`, `seed`, `robot` (which of
-            the cell's), `failed`, and the metrics [SI], nan where the episode failed.
+            policy that was not trained), `reference`, `scenario`, `cell`, `random` (whether its
+            episodes differ), `seed`, `robot` (which of the cell's), `failed`, and the metrics [SI],
+            nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.
@@ -107,6 +108,9 @@ class EpisodeTable:
                 "reference": condition.reference_name,
                 "scenario": condition.scenario,
                 "cell": cell,
+                "random": not self.environment.is_deterministic(
+                    condition.scenario, condition.reference
+                ),
             }
             draws_robots = condition.draws_robots
             for episode in e.episodes:
@@ -238,6 +242,15 @@ def per_robot(
         found[cell].unstack().reindex(members).to_numpy(dtype=np.float64)
         for cell in rows["cell"].unique()
     ]
+
+
+def by_episode(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows in which each random episode of an undrawn robot counts for itself.
+
+    Its seed stands in the place of the robot. Statistics of policies without training take these.
+    """
+    is_alone = rows["random"] & (rows["robot"] == "")
+    return rows.assign(robot=rows["robot"].where(~is_alone, rows["seed"].astype(str)))
 
 
 def score(

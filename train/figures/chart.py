@@ -222,9 +222,13 @@ def _median_curve(name: str, colour: str, x: Array, values: Array, **look: Any) 
 
 
 def _limits(evaluations: Evaluations, signal: TracedSignal) -> tuple[float, float]:
-    """Range of a signal and its reference, shortly before a fall left out, with a margin."""
+    """Range of a signal and its reference, with a margin; neither of ramp-in nor of a fall."""
     names = [name for name in (signal.name, signal.reference) if name is not None]
-    parts = [e.trace[name][e.is_steady] for e in evaluations for name in names]
+    masks = [e.is_steady & (e.trace["time_s"] > STAND_S) for e in evaluations]
+    if not any(mask.any() for mask in masks):
+        masks = [e.is_steady for e in evaluations]
+    played = list(zip(evaluations, masks, strict=True))
+    parts = [e.trace[name][mask] for e, mask in played for name in names]
     values = np.concatenate(parts)
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:

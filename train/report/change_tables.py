@@ -23,25 +23,40 @@ _SIGNS = {
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell: against bases, then against rivals."""
-    shown = [row for row in rows if row.is_family and row.is_judged]
-    for is_rival in (False, True):
-        own = [row for row in shown if row.is_rival == is_rival]
-        if own:
+    """Print the changes, a line per cell: residuals against bases, against rivals, then others."""
+    judged = [row for row in rows if row.is_judged]
+    kinds = group_by(judged, lambda row: (not row.is_family, row.is_rival, *_alone(row)))
+    for _, own in sorted(kinds.items()):
+        lines = len(own) // len({row.column for row in own})
+        if own[0].is_family or lines <= _MOST_LINES:
             print_table(cells_table(own), console, "statistics.csv")
+        else:
+            title = f"{lines} changes of policies without training against {own[0].base}"
+            console.print(f"{title}: see statistics.csv and report.md")
+
+
+_MOST_LINES = 40
+"""Changes of policies without training that a terminal shows."""
+
+
+def _alone(row: Change) -> tuple[str, ...]:
+    """The base that a table is for: residuals against each their own share one."""
+    return () if row.is_family else (row.base,)
 
 
 def cells_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against one kind of opponent, a line per cell with all metrics.
+    """Changes against one kind of opponent, a line per cell with all metrics.
 
     Args:
-        rows: Changes of families, of one environment, all against bases or all against rivals.
+        rows: Changes of one environment: of residuals, all against bases or all against rivals, or
+            of policies without training against one policy.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
     policies = tuple(dict.fromkeys(row.policy for row in rows))
     is_one = len(policies) == 1
-    names = [*([] if is_one else ["residual"]), "reference", "scenario"]
+    named = "residual" if rows[0].is_family else "policy"
+    names = [*([] if is_one else [named]), "reference", "scenario"]
     words: dict[str, Any] = {"is_number": False, "wraps": True}
     heads = [Head(name, titles=name == "reference", **words) for name in names]
     heads += [Head(name.replace("_", " ")) for name in swept]
@@ -123,6 +138,8 @@ def _means(row: Change) -> str:
 
 def _seeds(rows: Sequence[Change]) -> str:
     seeds = sorted({row.num_seeds for row in rows})
+    if not rows[0].is_family:
+        return named_intervals(row.relative for row in rows) or "no interval"
     if seeds == [1]:
         named = named_intervals(row.relative for row in rows)
         return f"one training seed, {named or 'no interval'}"
@@ -130,7 +147,9 @@ def _seeds(rows: Sequence[Change]) -> str:
 
 
 def _opponent(rows: Sequence[Change]) -> str:
-    """The policy that a table compares residuals with."""
+    """The policy that a table compares others with."""
+    if not rows[0].is_family:
+        return rows[0].base
     if not rows[0].is_rival:
         return "the base"
     return f"{', '.join(dict.fromkeys(row.base for row in rows))} ({terms.BEST_ANALYTIC})"

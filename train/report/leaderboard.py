@@ -1,13 +1,17 @@
 """The leaderboard as tables for the report, as CSV and as Markdown."""
 
+import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from baselines.catalogue import Track
+from elastic_env.core.errors import ConfigurationError, shorten
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
@@ -23,6 +27,7 @@ from train.runs.escaping import write_records
 COLUMNS = {
     "is_group": ("pooled",),
     "is_column": ("column",),
+    "is_published": ("published",),
     "score": ("mean", "low", "high"),
     "base": ("base", "change", "change_low", "change_high", "verdict"),
     "rival": (
@@ -67,7 +72,9 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
             for column in columns:
                 found = [places.get((policy, *column, metric)) for metric in metrics]
                 entries.append(_entry([s for s in found if s is not None], best))
-            rows.append(Row((policy, *entries, *_totals(policy, everything))))
+            is_published = any(s.is_published for s in own if s.policy == policy)
+            name = f"{policy} (published)" if is_published else policy
+            rows.append(Row((name, *entries, *_totals(policy, everything))))
     heads = [Head("policy", is_number=False)]
     heads += [Head(scope, second=reference, leaves=1) for scope, reference in columns]
     heads += [Head("failed"), Head("µs")] if everything else []
@@ -172,7 +179,8 @@ def legend(found: Sequence[Standing]) -> str:
     if len(over) > _MOST_NAMED:
         within = ", and column `interval_over` of leaderboard.csv says over what"
     intervals = f" Intervals are 95 %{within}." if over else ""
-    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}"
+    published = TEXTS["published"] if any(s.is_published for s in found) else ""
+    return f"{capital(meaning)}; {episodes}. {TEXTS['leaderboard']}{intervals}{published}"
 
 
 def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
@@ -231,3 +239,65 @@ def _cells(value: Any, number: int) -> list[str]:
         figures = (value.value, value.low, value.high)
         return ["" if figure is None else f"{figure:.6g}" for figure in figures]
     return [""] * number if value is None else [str(value)]
+
+
+def find_published(given: Path) -> Path:
+    """A leaderboard of the user's, or the one of the package that is called `leaderboard`.
+
+    Raises:
+        ConfigurationError: There is neither.
+    """
+    shipped = Path(str(resources.files("train") / "published" / f"{given}.csv"))
+    if given.is_file():
+        return given
+    if not given.suffix and shipped.is_file():
+        return shipped
+    cure = "give a leaderboard.csv, or the name of the published one: leaderboard"
+    raise ConfigurationError(f"no published leaderboard at {shorten(given)}; {cure}")
+
+
+def read_leaderboard(path: Path) -> list[Standing]:
+    """The rows of a `leaderboard.csv`.
+
+    Raises:
+        ConfigurationError: It is none.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        try:
+            found = [_standing(row) for row in csv.DictReader(file)]
+        except ValidationError as error:
+            said = error.errors()[0]["msg"]
+            raise ConfigurationError(f"{shorten(path)} is no leaderboard.csv: {said}") from None
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"{shorten(path)} is no leaderboard.csv: {error!r}"
+            raise ConfigurationError(problem) from None
+    if not found:
+        raise ConfigurationError(f"{shorten(path)} has no rows")
+    return found
+
+
+def _standing(row: Mapping[str, str]) -> Standing:
+    fields = {}
+    for name in Standing.__dataclass_fields__:
+        columns = COLUMNS.get(name, (name,))
+        if name in _NEW and columns[0] not in row:
+            continue  # of a leaderboard that was written before there was one
+        cells = [row[column] for column in columns]
+        fields[name] = _FIELDS[len(cells)](*cells)
+    return _STANDING.validate_python(fields)
+
+
+def _estimate(value: str, low: str, high: str) -> Estimate:
+    if not low:
+        return Estimate(float(value))
+    return Estimate(float(value), float(low), float(high))
+
+
+def _paired(to: str, value: str, low: str, high: str, verdict: str) -> Paired | None:
+    return Paired(to, _estimate(value, low, high), verdict) if to else None
+
+
+_NEW = ("interval_over", "origin", "is_published")
+_FIELDS: Mapping[int, Callable[..., Any]] = {1: str, 3: _estimate, 5: _paired}
+"""Fields from so many columns."""
+_STANDING = TypeAdapter(Standing)
