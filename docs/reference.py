@@ -35,6 +35,7 @@ from train.learn.train_config import TrainConfig
 PARTS = {
     "hardware": ("scan", "check", "run", "compensate", "log", "emulate"),
     "export": ("c", "onnx", "sb3"),
+    "hub": ("push", "pull"),
 }
 """Parts of commands, which have their help."""
 FOLDER = Path(__file__).parent / "lookup"
