@@ -35,6 +35,7 @@ from train.learn.train_config import TrainConfig
 PARTS = {
     "hardware": ("scan", "check", "run", "compensate", "log", "emulate"),
     "export": ("c", "onnx", "sb3"),
+    "hub": ("push", "pull"),
 }
 """Parts of commands, which have their help."""
 FOLDER = Path(__file__).parent / "lookup"
@@ -191,11 +192,12 @@ def _parameter(name: str, field: FieldInfo) -> list[str]:
     ]
     bounds = ", ".join(f"{sign} {value:g}" for sign, value in found if value is not None)
     default = "required" if field.is_required() else _value(field.default)
-    return [f"`{name}`", default, bounds, " ".join((field.description or "").split())]
+    meaning = re.sub(r"(?<!\S)(--[\w-]+)", r"`\1`", " ".join((field.description or "").split()))
+    return [f"`{name}`", default, bounds, meaning]
 
 
 def _value(value: object) -> str:
-    """A default as a configuration writes it."""
+    """A default as a configuration writes it; of a model, what differs from its own defaults."""
     match value:
         case None:
             return "null"
@@ -204,8 +206,9 @@ def _value(value: object) -> str:
         case float():
             return f"{value:.4g}"
         case Model():
-            names = type(value).model_fields
-            return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in names)}}}"
+            fields = type(value).model_fields.items()
+            given = ((name, getattr(value, name), field.default) for name, field in fields)
+            return _value({name: one for name, one, default in given if one != default})
         case list() | tuple():
             return f"[{', '.join(map(_value, value))}]"
         case dict():
