@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+LEROBOT := .venv-lerobot
 
 define WRONG_PYTHON
 elastic-env needs Python 3.11, 3.12 or 3.13, and "$(PYTHON)" is none of them. Name one that is, for example:
@@ -13,7 +14,7 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format typecheck bench residuals docs release-check clean
+.PHONY: help demo test test-all test-lerobot lint format typecheck bench residuals docs release-check clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
@@ -36,6 +37,21 @@ test: $(STAMP) ## Run the tests, without network or display
 
 test-all: $(STAMP) ## Run all tests, also the slow ones: real processes, kills, long trainings
 	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal -m "" $(ARGS)
+
+# lerobot 0.4.4 pins torch below 2.11 and brings several GB of CUDA packages. Its processor needs neither: tests/lerobot has
+# what it imports, beside the torch of constraints.txt. With all of lerobot's own versions:
+#     python -m venv full && full/bin/pip install -e '.[lerobot]' pytest hypothesis
+#     full/bin/python -m pytest -o addopts= tests/lerobot
+test-lerobot: $(LEROBOT)/.installed ## Run the tests of the processor steps within LeRobot, in .venv-lerobot
+	$(LEROBOT)/bin/python -m pytest -o addopts= -q tests/lerobot $(ARGS)
+
+$(LEROBOT)/.installed: pyproject.toml constraints.txt tests/lerobot/requirements.txt
+	$(PYTHON) -m venv --clear $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt setuptools wheel
+	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation \
+	    -e . pytest hypothesis requests torch
+	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/lerobot/requirements.txt
+	@touch $@
 
 lint: $(STAMP) ## Check style, format and types; changes nothing
 	$(BIN)/ruff check .
@@ -67,7 +83,7 @@ release-check: $(STAMP) ## Build sdist and wheel into dist/, and try the wheel i
 	$(if $(REPOSITORY),REPOSITORY=$(REPOSITORY)) $(BIN)/python -m tests.release $(ARGS)
 
 clean: ## Remove the virtual environment and all caches; results under runs/ stay
-	rm -rf $(VENV) build dist docs/_build docs/generated *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT
+	rm -rf $(VENV) $(LEROBOT) build dist docs/_build docs/generated *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An existing .venv is kept if it has pip and the wanted Python, and made anew otherwise. Setuptools comes first and

@@ -9,12 +9,10 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 os.environ.setdefault("MUJOCO_GL", "egl")
-os.environ["COLUMNS"] = "78"
 
 from docutils import nodes  # noqa: E402
 from docutils.utils.math.latex2mathml import tex2mathml  # noqa: E402
 from pydantic import BaseModel  # noqa: E402
-from reference import write_reference  # noqa: E402
 
 from elastic_env import __version__  # noqa: E402
 
@@ -58,8 +56,6 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "abort_on_example_error": True,
 }
-
-write_reference(HERE / "generated")
 
 
 def _tables_as_text(app, what, name, obj, options, lines):  # noqa: ARG001  Sphinx's arguments

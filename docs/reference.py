@@ -1,27 +1,45 @@
-"""The reference pages that are written from the code: environments, gains of policies, and the
-help of commands.
+"""The reference pages that are written from the code, so that they can be read without a build:
+environments, gains of policies, settings of hardware, and the help of commands.
+
+    python -m docs.reference      # docs/lookup/*.md
+
+A test compares pages and code.
 """
 
 import contextlib
 import io
+import os
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import get_args
+from unittest.mock import patch
 
 import gymnasium
 from pydantic.fields import FieldInfo
 
 from baselines.options import PolicyOptions
+from baselines.residual.settings import ResidualSettings
 from elastic_env import IDS
 from elastic_env.core.config import Model
 from elastic_env.core.signals import Signal
+from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
+from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
 from elastic_env.world.scenario import scenario_names
 from train.commands.cli import COMMANDS, main
+from train.commands.compare import CompareConfig
+from train.evaluate.conditions import PolicySpec
+from train.learn.train_config import TrainConfig
 
-PARTS = {"hardware": ("scan", "check", "run", "emulate"), "export": ("c", "onnx", "sb3")}
+PARTS = {
+    "hardware": ("scan", "check", "run", "compensate", "log", "emulate"),
+    "export": ("c", "onnx", "sb3"),
+}
 """Parts of commands, which have their help."""
+FOLDER = Path(__file__).parent / "lookup"
+_COLUMNS = "78"
+"""Width of the terminal of the help."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -79,11 +97,15 @@ def environments_page() -> str:
 def help_of(*words: str) -> str:
     """What `elastic WORDS --help` prints, without colours."""
     output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
+    with (
+        patch.dict(os.environ, {"COLUMNS": _COLUMNS}),
+        contextlib.redirect_stdout(output),
+        contextlib.suppress(SystemExit),
+    ):
         main([*words, "--help"])
     plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).rstrip()
     return "\n".join(
-        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line
+        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line.rstrip()
         for line in plain.splitlines()
     )
 
@@ -103,25 +125,58 @@ def commands_page() -> str:
 
 
 def gains_page() -> str:
-    """Every option of a policy that is a mapping of gains: names, defaults, bounds and meaning."""
+    """Every option of a policy, and of those that are mappings of gains every gain."""
     intro = (
-        "Written from the declarations in the code. [Options](../options.md#policies) says which"
-        " policy has which."
+        "Written from the declarations in the code. [Options](../options.md#policies) says how"
+        " they are given."
     )
-    parts = ["# Gains of policies", intro]
+    parts = ["# Options and gains of policies", intro, _model(PolicyOptions, "Options")]
     for option, field in PolicyOptions.model_fields.items():
         models = [
             kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)
         ]
-        for model in models:
-            about = (model.__doc__ or "").partition("\n")[0]
-            rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
-            parts += [
-                f"## `{option}`",
-                about,
-                table(["name", "default", "bounds", "meaning"], rows),
-            ]
+        parts += [_model(model, option) for model in models]
     return "\n\n".join(parts) + "\n"
+
+
+def configurations_page() -> str:
+    """Every key of the configurations of comparisons and trainings."""
+    intro = (
+        "Written from the declarations in the code. [Options](../options.md) explains the"
+        " environments, and [Training](../training.md) the settings."
+    )
+    parts = [
+        _model(CompareConfig, "Comparisons: elastic compare"),
+        _model(PolicySpec, "policies"),
+        _model(TrainConfig, "Trainings: elastic train"),
+        _model(ResidualSettings, "settings"),
+    ]
+    return "\n\n".join(["# Keys of configurations", intro, *parts]) + "\n"
+
+
+def mountings_page() -> str:
+    """Every key of the files that say how real hardware is mounted, with bounds."""
+    intro = (
+        "Written from the declarations in the code. A value beyond its bounds is refused."
+        " [Hardware](../hardware.md) has examples."
+    )
+    testbed, arm = "A file of the testbed", "A file of an arm"
+    parts = [
+        _model(HardwareSettings, testbed),
+        _model(SafetyLimits, "limits"),
+        _model(ArmSettings, arm),
+        _model(ServoPlace, "joints"),
+    ]
+    return "\n\n".join(["# Mounting files", intro, *parts]) + "\n"
+
+
+def _model(model: type[Model], title: str) -> str:
+    """Name, default, bounds and meaning of every field, under a title."""
+    shown = title if title[0].isupper() else f"`{title}`"
+    about = (model.__doc__ or "").partition("\n")[0]
+    rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
+    head = ["name", "default", "bounds", "meaning"]
+    return "\n\n".join([f"## {shown}", about, table(head, rows)])
 
 
 def _is_model(kind: object) -> bool:
@@ -135,7 +190,8 @@ def _parameter(name: str, field: FieldInfo) -> list[str]:
         (sign, getattr(bound, key, None)) for bound in field.metadata for key, sign in signs.items()
     ]
     bounds = ", ".join(f"{sign} {value:g}" for sign, value in found if value is not None)
-    return [f"`{name}`", _value(field.default), bounds, " ".join((field.description or "").split())]
+    default = "required" if field.is_required() else _value(field.default)
+    return [f"`{name}`", default, bounds, " ".join((field.description or "").split())]
 
 
 def _value(value: object) -> str:
@@ -150,19 +206,25 @@ def _value(value: object) -> str:
         case Model():
             names = type(value).model_fields
             return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in names)}}}"
+        case list() | tuple():
+            return f"[{', '.join(map(_value, value))}]"
+        case dict():
+            return f"{{{', '.join(f'{key}: {_value(one)}' for key, one in value.items())}}}"
         case _:
             return str(value)
 
 
-def write_reference(folder: Path) -> None:
-    """Write the generated pages; a page that has not changed is left alone."""
-    folder.mkdir(parents=True, exist_ok=True)
-    pages = {
-        "environments.md": environments_page(),
-        "gains.md": gains_page(),
-        "help.md": commands_page(),
-    }
-    for name, text in pages.items():
-        page = folder / name
-        if not page.is_file() or page.read_text(encoding="utf-8") != text:
-            page.write_text(text, encoding="utf-8")
+PAGES: Mapping[str, Callable[[], str]] = {
+    "environments.md": environments_page,
+    "configurations.md": configurations_page,
+    "gains.md": gains_page,
+    "mountings.md": mountings_page,
+    "help.md": commands_page,
+}
+"""The pages by the names of their files."""
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for name, page in PAGES.items():
+        (FOLDER / name).write_text(page(), encoding="utf-8")

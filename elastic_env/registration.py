@@ -17,6 +17,8 @@ from elastic_env.rendering.picture import Picture
 from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.world.task import Task
 
+BACKENDS = ("mujoco", "warp")
+"""What can step the physics of a vector environment."""
 _LEAST_WORLD_BYTES = 10_000
 """Memory of a world: measured on the testbed, the smallest robot, without a policy."""
 
@@ -50,13 +52,25 @@ class Robot:
         num_threads: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        backend: str = "mujoco",
+        device: str | None = None,
         **arguments: Any,
     ) -> ElasticVectorEnv:
         """Vector entry point; further arguments as in `configure`.
 
+        Args:
+            num_envs: Worlds.
+            num_threads: Threads of the physics and the control step, 0 for all cores.
+            autoreset_mode: Gymnasium's `AutoresetMode` or its value.
+            render_mode: "rgb_array" or None.
+            backend: What steps the physics: "mujoco", or "warp" for MuJoCo Warp on a GPU, which
+                needs the extra `gpu`.
+            device: Of the backend "warp": "cuda:0", the default, another GPU, or "cpu" for tests.
+            **arguments: As in `configure`.
+
         Raises:
-            ConfigurationError: A number of worlds or threads that cannot be, or worlds beyond the
-                memory.
+            ConfigurationError: A number of worlds or threads that cannot be, worlds beyond the
+                memory, or a backend or device that is not there.
         """
         bounds = ("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")
         for name, number, least, note in bounds:
@@ -65,10 +79,26 @@ class Robot:
                     f"{name} must be a whole number >= {least}{note}, got {quote(number)}"
                 )
         require_memory("num_envs", num_envs, _LEAST_WORLD_BYTES)
+        require_known("backend", [backend], BACKENDS)
+        if device is not None and backend != "warp":
+            raise ConfigurationError(
+                f'device = {quote(device)} needs backend="warp"; the backend "mujoco" runs on the'
+                " processor"
+            )
         task = self.task(self._configured(arguments), num_envs)
         picture = partial(self.picture, task)
+        simulation = None
+        if backend == "warp":
+            from elastic_env.world.warp_physics import WarpWorlds  # of the extra `gpu`
+
+            simulation = WarpWorlds(task.model, num_envs, device)
         return ElasticVectorEnv(
-            task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture
+            task,
+            num_threads,
+            autoreset_mode,
+            simulation=simulation,
+            render_mode=render_mode,
+            picture=picture,
         )
 
     def register(self) -> None:

@@ -42,8 +42,8 @@ finally:
 #
 #    elastic hardware check /dev/pts/3 --imu-port /dev/pts/4
 #    elastic identify --port /dev/pts/3 --imu-port /dev/pts/4 --yes --patient
-#    elastic evaluate --port /dev/pts/3 --imu-port /dev/pts/4 --policy input --reference sine --yes
-# --patient
+#    elastic evaluate --port /dev/pts/3 --imu-port /dev/pts/4 --policy input --reference sine \
+#        --yes --patient
 #
 # On a real joint the port is ``/dev/ttyUSB0``, and there is no ``--patient``. Somebody stands by
 # the power switch.

@@ -1,13 +1,16 @@
-"""Settings of the whole suite: pictures without a display; hypothesis repeats itself and leaves
-no files behind."""
+"""Settings of the whole suite: pictures without a display, nothing kept from another run;
+hypothesis repeats itself and leaves no files behind."""
 
+import os
 import signal
 
 from hypothesis import settings
 
+from elastic_env.core.disk_cache import VARIABLE
 from elastic_env.rendering.headless import prefer_egl
 
 prefer_egl()
+os.environ[VARIABLE] = "off"
 # a shell's background jobs ignore Ctrl-C, and so would the programs that tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

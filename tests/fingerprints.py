@@ -35,7 +35,7 @@ WORLDS = 7
 POLICIES = {"testbed": ON_JOINTS, "walker": ON_THE_WALKER}
 RESIDUALS = {
     "testbed": ("testbed/seed_0",),
-    "walker": ("walker_3s/seed_0", "walker_1600ms_posture/seed_0"),
+    "walker": ("walker_3s/seed_0", "walker_1600ms/seed_0"),
 }
 
 

@@ -31,8 +31,8 @@ RESIDUALS = {
     "testbed_friction": "learned_testbed_friction",
     "robot": "learned_robot",
     "walker_3s": "learned_walker",
-    "walker_1600ms_posture": "learned_posture_1600ms",
-    "walker_1100ms_posture": "learned_posture_1100ms",
+    "walker_1600ms": "learned_walker_1600ms",
+    "walker_1100ms": "learned_walker_1100ms",
 }
 """Residuals of the package: configs/train_NAME.yaml trains them, and this configuration compares
 them.

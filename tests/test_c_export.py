@@ -4,7 +4,9 @@ import math
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 STRICT = "-std=c99 -O1 -Wall -Wextra -Wpedantic -Werror -fsanitize=undefined"
 CHECKED = f"{STRICT} -fno-sanitize-recover=undefined"
 RELEASED = "-std=c99 -O3 -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
-COMPILERS = [name for name in ("gcc", "clang") if name == "gcc" or shutil.which(name)]
+COMPILERS = {"gcc": ["gcc"]}
+if shutil.which("clang"):
+    COMPILERS["clang"] = ["clang"]
+if find_spec("ziglang"):
+    COMPILERS["zig"] = [sys.executable, "-m", "ziglang", "cc"]
 TOLERANCE = 1e-12
 # of records: whether there is a payload, frame, mass, place; whether there are rates
 HEAD = 7
@@ -170,11 +176,11 @@ def compiled(
     folder: Path, header: str, compiler: str, program: str = DRIVER, options: str = CHECKED
 ) -> Path:
     """A program with the header, compiled strictly."""
-    assert shutil.which(compiler), f"no {compiler}: apt-get install gcc libc6-dev"
+    assert shutil.which("gcc"), "no gcc: apt-get install gcc libc6-dev"
     (folder / "arm.h").write_text(header)
     (folder / "driver.c").write_text(program)
     made = folder / f"driver_{compiler}"
-    arguments = [compiler, *options.split(), "driver.c", "-o", str(made), "-lm"]
+    arguments = [*COMPILERS[compiler], *options.split(), "driver.c", "-o", str(made), "-lm"]
     done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return made
@@ -242,7 +248,8 @@ def test_it_needs_no_heap_and_nothing_but_mathematics(tmp_path: Path) -> None:
     require_no_library(tmp_path, c_header(seven(), "arm"), function)
 
 
-def test_two_robots_fit_in_one_program_that_checks_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_two_robots_fit_in_one_program_that_checks_them(compiler: str, tmp_path: Path) -> None:
     """Catches a name without the prefix, and a test vector that is not of the compensator."""
     names = {"left": tree, "right_2": seven}
     headers = {name: c_header(robot(), name) for name, robot in names.items()}
@@ -252,27 +259,29 @@ def test_two_robots_fit_in_one_program_that_checks_them(tmp_path: Path) -> None:
         #include "arm.h"
         #include "right_2.h"
         int main(void) { return !(left_test() < 1e-12 && right_2_test() < 1e-12); }"""
-    subprocess.run([compiled(tmp_path, headers["left"], "gcc", program)], check=True)
+    subprocess.run([compiled(tmp_path, headers["left"], compiler, program)], check=True)
     table = re.search(r"left_compliance_\[LEFT_JOINTS\] = {([^,]*),", headers["left"])
     assert table is not None
     wrong = headers["left"].replace(table[1], f"{1.001 * float(table[1])!r}", 1)
     assert wrong != headers["left"]
-    done = subprocess.run([compiled(tmp_path, wrong, "gcc", program)])
+    done = subprocess.run([compiled(tmp_path, wrong, compiler, program)])
     assert done.returncode == 1
 
 
-def test_the_example_checks_and_times_the_header(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_the_example_checks_and_times_the_header(compiler: str, tmp_path: Path) -> None:
     """Catches an example that does not compile, and one for another header."""
     (tmp_path / "robot.h").write_text(header := c_header(springs(), "arm"))
     made = c_example("arm", "robot.h")
     assert "add_executable(arm_main arm_main.c)" in made["CMakeLists.txt"]
-    program = compiled(tmp_path, header, "gcc", made["arm_main.c"], RELEASED)
+    program = compiled(tmp_path, header, compiler, made["arm_main.c"], RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert said.startswith("largest deviation from Python: 0 rad")
     assert "us per command" in said
 
 
-def test_names_of_a_model_do_no_harm_in_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_names_of_a_model_do_no_harm_in_c(compiler: str, tmp_path: Path) -> None:
     """Catches a name that ends a comment, one in another alphabet, and two that become one."""
     names = ["*/ int x;", "a-b", "a_b", "π??/"]
     spec = mujoco.MjSpec()
@@ -287,7 +296,7 @@ def test_names_of_a_model_do_no_harm_in_c(tmp_path: Path) -> None:
     assert {"ARM_JOINT_A_B", "ARM_JOINT_A_B_2", "ARM_SITE_A_B_SITE_2"} <= set(
         re.findall(r"\w+", header)
     )
-    compiled(tmp_path, header, "gcc")
+    compiled(tmp_path, header, compiler)
 
 
 def test_the_command_writes_header_and_example(

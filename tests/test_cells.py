@@ -120,7 +120,7 @@ SEALED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "none": (on_episodes(set_first("deflection_rms_rad", None)), "is None"),
     "seed": (on_episodes(set_first("seed", 7)), "seed of episode 0 is 7, in the cell it is 0"),
     "policy": (on_episodes(of_policy("input")), "policy of episode 0 is 'input'"),
-    "metric": (on_episodes(set_first("invented", 1.0)), "episode 1 has other metrics"),
+    "metric": (on_episodes(set_first("invented", 1.0)), "episode 1 lacks 'invented'"),
     "termination": (on_episodes(set_first("termination", 3)), "does not say how it ended"),
     "no list": (on_episodes(lambda _: {"a": 1}), "it has no episodes"),
     "no mappings": (on_episodes(lambda _: [1, 2]), "it has no episodes"),
@@ -151,6 +151,19 @@ def test_what_does_not_fit_its_cell_is_not_taken(name: str, file: Path) -> None:
     rewrite(file, change, seals=True)
     with pytest.raises(UnfitCellError, match=said):
         Store(file.parent).get(CONDITION)
+
+
+def test_an_episode_that_ended_early_may_lack_metrics(file: Path) -> None:
+    """Catches cells with a fall before the first step that are played again in every resumption."""
+
+    def fell(episodes: list[Any]) -> None:
+        episodes[1]["termination"] = "fell"
+        del episodes[1]["deflection_rms_rad"]
+
+    rewrite(file, on_episodes(fell), seals=True)
+    kept = Store(file.parent).get(CONDITION)
+    assert kept is not None
+    assert kept.episodes[1]["termination"] == "fell"
 
 
 def unpacked(size: int) -> bytes:

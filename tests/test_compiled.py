@@ -31,6 +31,7 @@ from train.runs.progress import say_what_is_compiled
 ROOT = Path(__file__).parents[1]
 KERNELS = (
     "elastic_env.world.control_kernels",
+    "elastic_env.world.metrics",
     "elastic_env.rigid.tree.kernels",
     "baselines.compensation.compensators",
     "baselines.compensation.contact_torque",

@@ -386,7 +386,7 @@ class Blocked:
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in (
             "torch", "stable_baselines3", "imageio", "matplotlib", "onnx", "dynamixel_sdk", "serial",
-            "distributed",
+            "distributed", "huggingface_hub",
         ):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Blocked())
@@ -400,6 +400,7 @@ EXTRAS = [
     (["export", "onnx", "residual:x"], "onnx"),
     (["play", "--video", "x.mp4"], "report"),
     (["hardware", "scan", "/dev/ttyX"], "hardware"),
+    (["hub", "push", "residual:testbed/seed_0", "me/mine"], "hub"),
 ]
 
 

@@ -5,6 +5,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -27,6 +28,9 @@ from elastic_env.core.config import load_yaml, read_mapping
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.hardware.arm_settings import ARM_LIMITS, ArmSettings, ServoPlace
+from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES
+from elastic_env.hardware.buses.feetech_bus import FeetechBus
+from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.joints import EmulatedArm
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import FaultError, HardwareError
@@ -35,12 +39,14 @@ from elastic_env.hardware.live import targets as sources
 from elastic_env.hardware.live.targets import Follower, Poses, Socket, Stream, read_targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
-from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from tests.busy import once_more
+from tests.hardware_trials.trials import compare_replies
 from tests.lines import VirtualArm, looped
 from tests.test_hardware_arm_servos import servos
+from tests.test_hardware_faults import SERVO, Case, named
+from tests.virtual_bus import VirtualBus
 from train.commands import hardware_arm as command
 from train.commands.cli import main
 from train.commands.hardware import Emulate
@@ -654,6 +660,81 @@ def test_no_fault_of_an_arms_bus_is_silent(fault: dict[str, Any], words: str) ->
             assert not any(running.state()["torque_on"])
 
 
+LATER = Case({"late": 0.01, "late_s": 0.03}, goes_on="they come in the midst of a later cycle")
+ON_ARM = [*SERVO, LATER]
+DELAYS = ("latency_s", "late_s")
+"""An arm waits for 6 ms: what is below that is not missed."""
+PATIENCE = 10
+RELEASE_S = 0.3
+TO_FIND = {"hot": TEMPERATURE_CYCLES, "overload": 1, "unplugged": 1}
+"""Cycles in which a fault is found, where missing replies do not tell it."""
+
+
+@pytest.mark.parametrize("case", ON_ARM, ids=named)
+def test_every_fault_of_twelve_servos_ends_or_holds_the_motion(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an arm that goes on with a servo that is hot, gone, or answers for another, an old
+    reply that is taken for a new one, a goal beyond a range, and torque that falls too late: all
+    kinds of fault, in motion, driver and supervisor in virtual time."""
+    model, names = two_arms()
+    home = dict(zip(names, [*HOME, *HOME], strict=True))
+    zeros = {"direction": (1,) * 12, "zero_rad": (0.0,) * 12}
+    twins = emulated(model=model, order=names, home=home, **zeros)
+    ids = tuple(range(1, 13))
+    bus = VirtualBus(EmulatorConfig(model_number=777, ids=ids, arm=twins), monkeypatch)
+    limits = ARM_LIMITS.replace(patience_cycles=PATIENCE, release_s=RELEASE_S)
+    joints = {name: ServoPlace(id=i) for i, name in enumerate(names, 1)}
+    settings = ArmSettings(port="virtual", joints=joints, limits=limits, rate_hz=50.0)
+    servo_map = settings.servos(names)
+    ranges = servo_map.servo_ranges(np.tile(LOWEST, 2), np.tile(HIGHEST, 2), limits)
+    arm = live.Arm(bus, settings, servo_map, Plain(), ranges)  # type: ignore[arg-type]
+    arm.begin()
+    targets = Poses(np.tile(drawn(5), 2), 1.0)
+    play(arm, targets, 20)
+    began_s = bus.now_s
+    held = arm.counts.held
+    bus.emulator.set_faults(case.faults)
+    if case.goes_on:
+        play(arm, targets, 100)
+        assert bus.emulator.state["torque_on"] == [True] * 12
+        delay_s = max(case.faults.get(name, 0.0) for name in DELAYS)
+        assert (arm.counts.held > held) == (not 0.0 < delay_s <= FeetechBus.patience_s)
+        said = ""
+    else:
+        stops = case.stops.replace(" °C, at most 80", ".* °C, at most 70")  # of this model
+        with pytest.raises(HardwareError, match=stops) as caught:
+            play(arm, targets, 200)
+        said = str(caught.value)
+    events = bus.emulator.events
+    goals = [(i - 1, v) for _, i, name, v in events if name == "goal_position"]
+    counts = 2048 + ranges * 4096 / (2.0 * np.pi)
+    assert all(counts[i, 0] - 1 <= value <= counts[i, 1] + 1 for i, value in goals)
+    taken, wrong = compare_replies(events, bus.seen, ids, servo_model(777))
+    assert taken["accepted"] > 200
+    assert not wrong
+    cannot_be_told = {"unheard", "unplugged"} & case.faults.keys()
+    off = {i: t for t, i, name, v in events if t > began_s and (name, v) == ("torque_enable", 0)}
+    if case.goes_on or cannot_be_told:
+        assert not off
+        assert bus.emulator.state["torque_on"] == [True] * 12
+        assert case.goes_on or re.search("Switch their power off|not confirmed by servo", said)
+    else:
+        found = TO_FIND.get(next(iter(case.faults)), PATIENCE)
+        assert off.keys() == set(ids)
+        assert max(off.values()) < began_s + (found + 1) / settings.rate_hz + RELEASE_S + 0.03
+        assert bus.emulator.state["torque_on"] == [False] * 12
+    if "unplugged" not in case.faults:
+        bus.emulator.set_faults(Faults().model_dump())
+        bus.close()
+        assert bus.emulator.state["torque_on"] == [False] * 12
+
+
+def play(arm: live.Arm, targets: Any, cycles: int) -> None:
+    for _ in zip(range(cycles), arm.play(targets), strict=False):
+        pass
+
+
 @pytest.mark.slow
 @once_more
 def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -671,46 +752,6 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     table = np.genfromtxt(tmp_path / "run" / "log.csv", delimiter=",", names=True)
     assert len(table) > 300
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
-
-
-def test_the_page_has_the_settings_of_an_arm() -> None:
-    """Catches a default or a bound that is changed in one of the two places."""
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in Path("docs/hardware.md").read_text().splitlines()
-        if line.startswith("|")
-    ]
-    told = {row[0].strip("`"): row for row in rows if len(row) == 5}
-    for name in ("rate_hz", "speed_rad_s", "acceleration_rad_s2"):
-        info = ArmSettings.model_fields[name]
-        ends = [
-            getattr(one, kind)
-            for one in info.metadata
-            for kind in ("ge", "le")
-            if hasattr(one, kind)
-        ]
-        _, unit, default, bounds, _ = told[name]
-        assert isinstance(info.json_schema_extra, dict)
-        assert unit == info.json_schema_extra["unit"]
-        assert float(default) == info.default
-        assert [float(end) for end in bounds.split(", ")] == ends
-    text = Path("docs/hardware.md").read_text()
-    changed = {
-        name: value
-        for name, value in ARM_LIMITS
-        if value != SafetyLimits.model_fields[name].default
-    }
-    assert changed.keys() == {
-        "lowest_rad",
-        "highest_rad",
-        "slew_rad_s",
-        "following_error_rad",
-        "patience_cycles",
-        "hang_s",
-        "release_s",
-    }
-    for name in ("slew_rad_s", "following_error_rad", "patience_cycles", "hang_s", "release_s"):
-        assert f"`{name}` {changed[name]:g}" in " ".join(text.split())
 
 
 def test_poses_of_a_log_are_approached_from_both_sides(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import math
 import operator
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware import imu
+from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.buses.bus import Condition
 from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
@@ -318,43 +318,13 @@ def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
         Emulate(fault=["hot"], fault_after_s=after_s)
 
 
-BOUNDS = ("ge", "gt", "le", "lt")
-
-
-def documented() -> dict[str, tuple[str, float, float, float]]:
-    """Unit, default and bounds of each number, as docs/hardware.md has them."""
-    rows = [
-        line.strip("| ").split(" | ") for line in Path("docs/hardware.md").read_text().splitlines()
-    ]
-    numbers = [row for row in rows if len(row) == 6 and row[0].startswith("`")]
-    return {row[0].strip("`"): (row[1], *map(_number, row[2:5])) for row in numbers}
-
-
-def _number(text: str) -> float:
-    factor = math.pi if text.endswith("π") else 1.0
-    return factor * float({"": "1", "-": "-1"}.get(text.removesuffix("π"), text.removesuffix("π")))
-
-
-def in_code(model: type[Model], prefix: str = "") -> dict[str, tuple[str, float, float, float]]:
-    """The same of a model's fields."""
-    found = {}
+@pytest.mark.parametrize("model", [HardwareSettings, SafetyLimits, ArmSettings, ServoPlace])
+def test_every_number_of_a_mounting_file_has_its_unit_and_both_bounds(model: type[Model]) -> None:
+    """Catches a setting without a bound, and a meaning with another unit than the errors."""
     for name, info in model.model_fields.items():
-        if isinstance(info.json_schema_extra, dict):
-            low, high = (
-                getattr(bound, kind)
-                for bound in info.metadata
-                for kind in BOUNDS
-                if hasattr(bound, kind)
-            )
-            found[prefix + name] = (str(info.json_schema_extra["unit"]), info.default, low, high)
-    return found
-
-
-def test_the_table_of_the_docs_has_the_bounds_of_the_code() -> None:
-    """Catches a bound, a unit or a default that is changed in one of the two places, and a
-    setting without any."""
-    expected = in_code(HardwareSettings) | in_code(SafetyLimits, "limits.")
-    assert documented().keys() == expected.keys()
-    for name, (unit, *numbers) in documented().items():
-        assert unit == expected[name][0]
-        assert numbers == pytest.approx(expected[name][1:])
+        if info.annotation not in (int, float):
+            continue
+        assert isinstance(info.json_schema_extra, dict), name
+        assert f"[{info.json_schema_extra['unit']}]" in str(info.description), name
+        for kinds in (("ge", "gt"), ("le", "lt")):
+            assert any(hasattr(one, kind) for one in info.metadata for kind in kinds), name

@@ -1,6 +1,7 @@
 """Running statistics against NumPy on the recorded samples."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.world.metrics import EpisodeMetrics, Metric, RunningStatistic
+from elastic_env.world.metrics import EpisodeMetrics, Metric, Statistic
 
-STATISTICS = {
+STATISTICS: dict[Statistic, Callable[[Array], Any]] = {
     "rms": lambda x: np.sqrt(np.mean(x**2)),
     "mean": np.mean,
     "min": np.min,
@@ -20,7 +21,7 @@ STATISTICS = {
     "last": lambda x: x[-1],
     "count": len,
 }
-METRICS = [Metric(f"x_{s}_rad", "x", s) for s in STATISTICS] + [  # type: ignore[arg-type]
+METRICS = [Metric(f"x_{s}_rad", "x", s) for s in STATISTICS] + [
     Metric("y_rms_rad", "y", "rms", over="all"),
     Metric("x_all_mean_rad", "x", "mean", over="all"),
 ]
@@ -38,19 +39,37 @@ def masks(scored: Sequence[bool] | BoolArray) -> dict[str, BoolArray]:
     return {"scored": np.array(scored, dtype=bool), "all": np.ones(len(scored), dtype=bool)}
 
 
+def one_by_one(values: Array, sampled: BoolArray) -> EpisodeMetrics:
+    """Every statistic of a log, (steps, worlds), whose steps are taken one by one."""
+    metrics = EpisodeMetrics([Metric(s, "x", s) for s in STATISTICS], values.shape[1])
+    for row, mask in zip(values, sampled, strict=True):
+        metrics.update({"x": row}, {"scored": mask})
+    return metrics
+
+
 @given(log=logs)
 def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray]) -> None:
     """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing
     was sampled."""
     values, sampled = log
+    results = one_by_one(values, sampled).values()
     for name, function in STATISTICS.items():
-        running = RunningStatistic(name, 1, values.shape[1])
-        for row, mask in zip(values, sampled, strict=True):
-            running.update(row[None, None], mask[None, None])
-        for world, result in enumerate(running.values()[0]):
+        for world, result in enumerate(results[name]):
             chosen = values[sampled[:, world], world]
             expected = function(chosen) if len(chosen) or name == "count" else np.nan
             np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_nan_is_forgotten_by_the_last_value_alone() -> None:
+    """Catches a minimum that steps over a nan, and a nan outside of the mask that counts."""
+    values = np.array([[2.0, 2.0], [np.nan, np.nan], [1.0, 1.0]])
+    sampled = np.array([[True, True], [True, False], [True, True]])
+    found = one_by_one(values, sampled).values()
+    for name in ("rms", "mean", "min", "max", "peak"):
+        assert np.isnan(found[name][0]), name
+        assert np.isfinite(found[name][1]), name
+    np.testing.assert_array_equal(found["last"], [1.0, 1.0])
+    np.testing.assert_array_equal(found["count"], [3.0, 2.0])
 
 
 def test_scored_and_all_steps_are_kept_apart() -> None:
@@ -97,10 +116,9 @@ def test_how_many_steps_are_taken_at_once_does_not_matter(
     """Catches sums that depend on the grouping of steps, and so on when other worlds end: equal
     to the last bit."""
     values, sampled = log
-    for name in STATISTICS:
-        one_by_one, grouped = (RunningStatistic(name, 1, values.shape[1]) for _ in range(2))
-        for row, mask in zip(values, sampled, strict=True):
-            one_by_one.update(row[None, None], mask[None, None])
-        for part in (slice(None, split), slice(split, None)):
-            grouped.update(values[None, part], sampled[None, part])
-        np.testing.assert_array_equal(grouped.values(), one_by_one.values(), err_msg=name)
+    expected = one_by_one(values, sampled).values()
+    grouped = EpisodeMetrics([Metric(s, "x", s) for s in STATISTICS], values.shape[1])
+    for part in (slice(None, split), slice(split, None)):
+        grouped.update({"x": values[part]}, {"scored": sampled[part]})
+    for name, value in grouped.values().items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)

@@ -158,7 +158,7 @@ def cell(policy: str, scenario: str, episodes: int = 2, **changes: Any) -> Condi
         pytest.param("adaptive_posture", marks=pytest.mark.slow),
         pytest.param("link_encoder", marks=pytest.mark.slow),
         pytest.param("thormang", marks=pytest.mark.slow),
-        "residual:walker_1600ms_posture/seed_0",
+        "residual:walker_1600ms/seed_0",
     ],
 )
 def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> None:

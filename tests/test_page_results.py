@@ -26,7 +26,7 @@ from docs.pages.write import (
 )
 from docs.pages.write import main as write_pages
 from elastic_env.core.errors import ConfigurationError
-from train.report.leaderboard import leaderboard_markdown, read_leaderboard
+from train.report.leaderboard import read_leaderboard
 from train.runs.escaping import write_records
 
 ROOT = Path(__file__).parents[1]
@@ -136,13 +136,14 @@ def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other
     ("name", "metric"),
     [(kept.table or name, metric) for name, kept in KEPT.items() for metric in kept.metrics],
 )
-def test_every_kept_figure_is_shown(name: str, metric: str, tmp_path: Path) -> None:
-    """Catches a metric that is kept for nobody, and a table that shows another one in its place."""
+def test_every_kept_figure_is_shown_or_a_click_away(name: str, metric: str, tmp_path: Path) -> None:
+    """Catches a metric that is kept for nobody, and a folded table without a link to the whole."""
     changed = with_changed(
         name, lambda key, text: larger(text) if key == metric else text, tmp_path
     )
     texts = [page.read_text(encoding="utf-8") for page in pages(ROOT)]
-    assert any(page_with(text, changed) != text for text in texts if name in reads(text))
+    own = [text for text in texts if name in reads(text)]
+    assert any(f"](results/{name}.csv)" in text or page_with(text, changed) != text for text in own)
 
 
 def test_one_number_changes_a_sentence(checkout: Path) -> None:
@@ -182,7 +183,7 @@ def test_a_page_is_written_between_its_marks_and_nowhere_else(checkout: Path) ->
         write_pages([])
         assert (
             page.read_text()
-            == f"before\n{BEGIN}\n\n{leaderboard_markdown(results.standings)}\n{END}\nafter\n"
+            == f"before\n{BEGIN}\n\n{PARTS['leaderboard'].text(results)}\n{END}\nafter\n"
         )
     assert Path("docs", "other.md").read_text() == "no marks"
     for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import re
+import subprocess
 import tomllib
 from functools import reduce
 from importlib import import_module
@@ -80,24 +81,46 @@ def _resolved(name: str) -> object:
     return None
 
 
-@pytest.mark.parametrize(
-    "page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-)
-def test_links_lead_somewhere(page: Path) -> None:
-    """Catches a page or a heading that was renamed; pages that the site generates are left to
-    its own build."""
-    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", page.read_text(encoding="utf-8")):
+def published() -> list[Path]:
+    """Files of the repository, as git lists them; all files where there is no git."""
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+            cwd=ROOT,
+            capture_output=True,
+            check=True,
+        ).stdout.decode()
+    except (OSError, subprocess.CalledProcessError):
+        return [path for path in ROOT.rglob("*") if ".venv" not in path.parts]
+    return [ROOT / name for name in listed.split("\0") if name]
+
+
+PUBLISHED = published()
+MARKDOWN = [path for path in PUBLISHED if path.suffix == ".md" and path.is_file()]
+
+
+@pytest.mark.parametrize("page", MARKDOWN, ids=[str(p.relative_to(ROOT)) for p in MARKDOWN])
+def test_links_lead_somewhere_in_the_repository(page: Path) -> None:
+    """Catches a page or a heading that was renamed, and a link to a file that only a build
+    makes."""
+    text = page.read_text(encoding="utf-8")
+    shown = re.sub(r"^```.*?^```|`[^`\n]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+    links = re.findall(r"\]\((?!\w+:)([^)\s]+)\)", shown)
+    links += re.findall(r"(?:src|href)=\"(?!\w+:)([^\"]+)\"", shown)
+    for target in links:
         path, _, heading = target.partition("#")
         file = (page.parent / path).resolve() if path else page
-        if "generated" in file.parts:
-            continue
-        assert file.exists(), f"{page.name}: {target}"
+        assert file in PUBLISHED or any(file in known.parents for known in PUBLISHED), target
         if heading:
-            text = file.read_text(encoding="utf-8")
-            titles = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
-            assert heading in {
-                re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles
-            }, target
+            titles = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            anchors = {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
+            assert heading in anchors, target
+
+
+def test_files_that_only_a_build_makes_are_not_published() -> None:
+    """Catches a list of files that takes the site's own pages for those of the repository."""
+    assert ROOT / "docs" / "lookup" / "gains.md" in PUBLISHED
+    assert not any("generated" in path.parts or "_build" in path.parts for path in PUBLISHED)
 
 
 def test_the_citation_agrees_with_the_package() -> None:

@@ -19,7 +19,7 @@ from baselines.residual.residual_policy import save_residual
 from baselines.residual.settings import ResidualDescription, ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import RELEASED, compiled, require_no_library
+from tests.test_c_export import COMPILERS, RELEASED, compiled, require_no_library
 from train.commands.cli import main
 from train.export.c_residual import c_residual
 from train.export.onnx_residual import onnx_model
@@ -179,10 +179,10 @@ int main(int count, char **paths) {
 
 
 def played_in_c(
-    layout: ResidualLayout, folder: Path, features: Array, on_right: Any
+    layout: ResidualLayout, compiler: str, folder: Path, features: Array, on_right: Any
 ) -> tuple[Array, Array]:
     """Decisions of every row, and values of the base's inputs where the rows are a motion."""
-    program = compiled(folder, c_residual(layout, "arm"), "gcc", DRIVER)
+    program = compiled(folder, c_residual(layout, "arm"), compiler, DRIVER)
     np.hstack([features, on_right]).tofile(folder / "in")
     subprocess.run([program, "in", "out"], cwd=folder, check=True, timeout=300)
     found = np.fromfile(folder / "out").reshape(len(features), -1)
@@ -190,19 +190,23 @@ def played_in_c(
     return decided, values
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("case", CASES)
-def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
+def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches what is wrong with a table, a layer, an activation or the mirror."""
     layout = ResidualLayout.of(residual(case, tmp_path / "r"))
     drawn = layout.draw(10_000, seed=2)
-    found, _ = played_in_c(layout, tmp_path, **drawn)
+    found, _ = played_in_c(layout, compiler, tmp_path, **drawn)
     expected, _ = layout.decide(**drawn)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
 
 
-def test_the_header_corrects_on_a_walk_as_the_policy_does(walk: Walk, tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_the_header_corrects_on_a_walk_as_the_policy_does(
+    walk: Walk, compiler: str, tmp_path: Path
+) -> None:
     """Catches another period, a low-pass of another share, and a column at another's bound."""
-    _, values = played_in_c(walk.layout, tmp_path, walk.features, walk.on_right)
+    _, values = played_in_c(walk.layout, compiler, tmp_path, walk.features, walk.on_right)
     np.testing.assert_allclose(values, walk.values, rtol=0.0, atol=TOLERANCE)
     assert (np.abs(values).max(axis=0) > 0.0).sum() == np.count_nonzero(walk.layout.bounds)
 
@@ -231,8 +235,12 @@ def test_the_header_needs_no_heap(tmp_path: Path) -> None:
     require_no_library(tmp_path, c_residual(layout, "arm"), function)
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_example_in_c_checks_the_header(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    compiler: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Catches a test vector of another residual, and options of arms that have no effect."""
     monkeypatch.chdir(tmp_path)
@@ -240,7 +248,7 @@ def test_the_example_in_c_checks_the_header(
     main(["export", "c", "residual:mine/r", "--prefix", "arm", "-o", "arm.h", "--example"])
     example = Path("arm_example/arm_main.c").read_text()
     folder = tmp_path / "arm_example"
-    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
+    program = compiled(folder, Path("arm.h").read_text(), compiler, example, RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per decision" in said
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""The walker's input_output as a header in C99: equal to Python, in random states and on a walk."""
+"""Policies of the walker as headers in C99: equal to Python, in random states and on a walk."""
 
 import subprocess
 from pathlib import Path
@@ -11,14 +11,22 @@ import pytest
 import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from tests.test_c_export import RELEASED, compiled, require_no_library
+from tests.test_c_export import COMPILERS, RELEASED, compiled, require_no_library
 from train.commands.cli import main
-from train.export.c_walker import PlayedSteps, c_walker, play_steps
+from train.export.c_walker import PlayedSteps, c_walker, play_observations, play_steps
 
 TOLERANCE = 1e-12
 WALKER = "elastic_env/WalkInPlace-v0"
 CASES: dict[str, dict[str, Any]] = {
     "default": {},
+    "adaptive": {"policy": "adaptive_posture"},
+    "adaptive_quick": {
+        "policy": "adaptive_posture",
+        "adaptation": {"period_s": 0.02, "filter_s": 0.01, "limit": 0.2},
+        "posture": {"integral": 0.0, "trim": 4.0, "swing_s": 0.0, "limit_rad": 0.01},
+        "ramp_s": 0.2,
+        "gains": {"weight_filter_s": None},
+    },
     "weighing": {
         "gains": {"weight_filter_s": 0.5, "dcm": 2.0, "force_difference": 0.05},
         "stiffness": [600.0] * 6 + [1400.0] * 6,
@@ -27,6 +35,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 DRIVER = r"""
 #include "arm.h"
+#include <stddef.h>
 #include <stdio.h>
 
 int main(int count, char **paths) {
@@ -36,7 +45,7 @@ int main(int count, char **paths) {
     arm_plan plan;
     arm_state state;
     arm_begin(&state);
-    while (count == 3 && fread(&shown, 8, 43, from) == 43) {
+    while (count == 3 && fread(&shown, offsetof(arm_shown, support), 1, from) == 1) {
         int k;
         if (fread(&support, 8, 1, from) != 1 || fread(&plan, sizeof plan, 1, from) != 1) return 1;
         shown.support = (int)support;
@@ -44,60 +53,111 @@ int main(int count, char **paths) {
         for (k = 0; k < 12; k++) out[13 + k] = state.links[k];
         fwrite(out, sizeof out, 1, to);
     }
+#if ARM_IS_ADAPTIVE
+    fwrite(state.correction, sizeof state.correction, 1, to);
+    fwrite(state.unknowns, sizeof state.unknowns + sizeof state.covariance, 1, to);
+    fwrite(state.tilt, 8 * sizeof state.tilt[0], 1, to);
+#endif
     fclose(from);
     return fclose(to);
 }
 """
 
 
-def walker(**options: Any) -> Any:
-    """The policy, in a walk that turns and goes forward, so that no frame is another one."""
-    env = gymnasium.make(
+def walk(scenario: str = "nominal") -> Any:
+    """A walk that turns and goes forward, so that no frame is another one."""
+    return gymnasium.make(
         WALKER,
         step_period=[0.3, 0.4, 0.3],
         num_steps=4,
         gait={"step_length_m": 0.1, "turn_rad": 0.1},
+        scenario=scenario,
     )
-    return baselines.make("input_output", env, **options)
 
 
-def played_in_c(policy: Any, steps: PlayedSteps, folder: Path) -> tuple[Array, Array, Array]:
-    """Statuses, offsets and link angles."""
-    program = compiled(folder, c_walker(policy, "arm"), "gcc", DRIVER)
+def walker(policy: str = "input_output", **options: Any) -> Any:
+    return baselines.make(policy, walk(), **options)
+
+
+def played_in_c(
+    policy: Any, steps: PlayedSteps, compiler: str, folder: Path
+) -> tuple[Array, Array, Array, Array]:
+    """Statuses, offsets and link angles; then what it remembers of the last step."""
+    program = compiled(folder, c_walker(policy, "arm"), compiler, DRIVER)
     count = len(steps.offset)
     fields = [values.reshape(count, -1) for values in (*steps.shown, *steps.plan)]
     np.hstack(fields).astype(np.float64).tofile(folder / "in")
     subprocess.run([program, "in", "out"], cwd=folder, check=True, timeout=300)
-    found = np.fromfile(folder / "out").reshape(count, 25)
-    return found[:, 0], found[:, 1:13], found[:, 13:]
+    found, last = np.split(np.fromfile(folder / "out"), [25 * count])
+    found = found.reshape(count, 25)
+    return found[:, 0], found[:, 1:13], found[:, 13:], last
 
 
-def compare(policy: Any, count: int, folder: Path) -> None:
-    steps = play_steps(policy, count, seed=1)
-    status, offset, links = played_in_c(policy, steps, folder)
+def remembered(memory: Any) -> Array:
+    """What the header of adaptive_posture remembers, from the policy's memory; else nothing."""
+    if not hasattr(memory, "feedback"):
+        return np.empty(0)
+    feedback = memory.feedback[0]
+    estimate = memory.inner.estimator.observer[0]
+    rolls = [estimate["unknowns"][:, 0], estimate["covariance"][:, 0]]
+    posture = [feedback[name] for name in ("tilt", "integral", "trim", "kept")]
+    return np.concatenate([memory.inner.correction[0, [1, 7]], *map(np.ravel, rolls), *posture])
+
+
+def compare(policy: Any, steps: PlayedSteps, compiler: str, folder: Path) -> None:
+    status, offset, links, last = played_in_c(policy, steps, compiler, folder)
     assert not status.any()
     np.testing.assert_allclose(links, steps.links, rtol=0.0, atol=TOLERANCE)
+    np.testing.assert_allclose(last, remembered(steps.memory), rtol=0.0, atol=TOLERANCE)
     # Python hands on offsets in single precision
     np.testing.assert_array_almost_equal_nulp(offset.astype(np.float32), steps.offset, nulp=1)
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("case", CASES)
-def test_the_header_computes_what_python_does(case: str, tmp_path: Path) -> None:
+def test_the_header_computes_what_python_does(case: str, compiler: str, tmp_path: Path) -> None:
     """Catches a wrong frame, foot, gain, filter or row of the plan, and a load on the wrong leg."""
-    compare(walker(**CASES[case]), 200, tmp_path)
+    policy = walker(**CASES[case])
+    compare(policy, play_steps(policy, 200, seed=1), compiler, tmp_path)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_adaptive_posture_in_c_walks_as_python_does(compiler: str, tmp_path: Path) -> None:
+    """Catches an estimate at another time, a trim before the walk, and a leg that does not keep
+    its pitch: on legs that are softer than assumed, measured as the robot measures."""
+    env = walk("soft")
+    policy = baselines.make("adaptive_posture", env, posture={"trim": 4.0})
+    observation, _ = env.reset(seed=3)
+    rows = []
+    state = None
+    is_over = False
+    while not is_over:
+        rows.append(observation)
+        action, state = policy.predict(observation, state)
+        observation, _, terminated, truncated, info = env.step(action)
+        is_over = terminated or truncated
+    assert not info["episode_metrics"]["fell"]
+    steps = play_observations(policy, np.array(rows, dtype=np.float64))
+    np.testing.assert_array_equal(steps.memory.inner.correction, state.inner.correction)
+    assert (steps.memory.inner.correction[0, [1, 7]] > 0.1).all()
+    assert np.all(steps.memory.feedback["trim"] != 0.0)
+    compare(policy, steps, compiler, tmp_path)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("case", CASES)
 def test_the_header_computes_what_python_does_in_ten_thousand_states(
-    case: str, tmp_path: Path
+    case: str, compiler: str, tmp_path: Path
 ) -> None:
-    compare(walker(**CASES[case]), 10_000, tmp_path)
+    policy = walker(**CASES[case])
+    compare(policy, play_steps(policy, 10_000, seed=1), compiler, tmp_path)
 
 
-def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["input_output", "adaptive_posture"])
+def test_bad_numbers_and_soft_springs_change_nothing(name: str, tmp_path: Path) -> None:
     """Catches a step that counts, a force that is not looked at, and a leg that has tipped over."""
-    policy = walker()
+    policy = walker(name)
     program = """#define ARM_TEST
         #include "arm.h"
         int main(void) {
@@ -106,7 +166,11 @@ def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
             double offset[12] = {7.0};
             arm_state state;
             arm_begin(&state);
+            #if ARM_IS_ADAPTIVE
+            shown.wrench[1][5] = NAN;
+            #else
             shown.force[1] = NAN;
+            #endif
             if (arm_step(&state, &shown, &plan, offset) != ARM_NOT_FINITE) return 1;
             shown = arm_test_shown_[0];
             shown.support = 2;
@@ -122,31 +186,40 @@ def test_bad_numbers_and_soft_springs_change_nothing(tmp_path: Path) -> None:
     subprocess.run([compiled(tmp_path, c_walker(policy, "arm"), "gcc", program)], check=True)
 
 
-def test_it_needs_no_heap(tmp_path: Path) -> None:
+@pytest.mark.parametrize("policy", ["input_output", "adaptive_posture"])
+def test_it_needs_no_heap(policy: str, tmp_path: Path) -> None:
     function = """int all(arm_state *state, arm_shown *shown, arm_plan *plan, double *offset) {
         arm_begin(state);
         return arm_step(state, shown, plan, offset);
     }"""
-    require_no_library(tmp_path, c_walker(walker(), "arm"), function)
+    require_no_library(tmp_path, c_walker(walker(policy), "arm"), function)
 
 
+@pytest.mark.parametrize("policy", ["input_output", "adaptive_posture"])
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_the_command_writes_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    policy: str,
+    compiler: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Catches an example of another header, and what is not there in C."""
     monkeypatch.chdir(tmp_path)
-    main(["export", "c", "input_output", "--prefix", "arm", "-o", "arm.h", "--example"])
+    main(["export", "c", policy, "--prefix", "arm", "-o", "arm.h", "--example"])
     example = Path("arm_example/arm_main.c").read_text()
     folder = tmp_path / "arm_example"
-    program = compiled(folder, Path("arm.h").read_text(), "gcc", example, RELEASED)
+    program = compiled(folder, Path("arm.h").read_text(), compiler, example, RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout
     assert "us per control step" in said
     capsys.readouterr()
-    for wrong, named in ((["--env", "testbed"], "input_output"), (["--ramp-s", "2"], "--ramp-s")):
+    for wrong, named in ((["--env", "testbed"], policy), (["--ramp-s", "2"], "--ramp-s")):
         with pytest.raises(SystemExit):
-            main(["export", "c", "input_output", *wrong])
+            main(["export", "c", policy, *wrong])
         assert named in capsys.readouterr().err
     env = gymnasium.make(WALKER)
-    for policy in ("input", "dynamic", "uncompensated"):
-        with pytest.raises(ConfigurationError, match="only input_output of a walker"):
-            c_walker(baselines.make(policy, env), "arm")
+    for other in ("input", "dynamic", "uncompensated", "adaptive", "posture", "foothold"):
+        with pytest.raises(ConfigurationError, match="only input_output and adaptive_posture"):
+            c_walker(baselines.make(other, env), "arm")
+    with pytest.raises(ConfigurationError, match="only input_output and adaptive_posture"):
+        c_walker(baselines.make("adaptive_posture", env, base="dynamic"), "arm")

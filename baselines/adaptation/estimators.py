@@ -36,7 +36,7 @@ _ERROR = _SEEN.group("model_error")
 _LOAD = _SEEN.names.index("excess_load")
 _AXIS = np.array([0, 0, 1, 1, 1, 0])  # roll or pitch, of the joints of a leg
 _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
-_LOADS = 5.0
+ASSUMED_LOADS = 5.0
 """Number of measurements that the assumed load counts for."""
 
 
@@ -62,6 +62,8 @@ class EstimatorMemory(NamedTuple):
 class LegEstimator(Estimator):
     """r of each leg by motors, foot sensors and IMU, and by joint torques where there are any.
 
+    Attributes `observer` and `sensors` are what it estimates with.
+
     Args:
         model: Assumed walker.
         sensors: Joint torque sensors, if it has them.
@@ -72,20 +74,20 @@ class LegEstimator(Estimator):
         model: WalkerModel,
         sensors: DeflectionSensors | None = None,
     ) -> None:
-        self._observer = BendingObserver(model)
-        self._sensors = sensors
+        self.observer = BendingObserver(model)
+        self.sensors = sensors
         self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
         loads = np.zeros((num_worlds, 2))
-        return EstimatorMemory(loads, self._observer.begin(num_worlds))
+        return EstimatorMemory(loads, self.observer.begin(num_worlds))
 
     def observe(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, Array, Any]:
         """Values of the observer, the mean excess load, (num_worlds, 1) [1], and new memory."""
-        bending = None if self._sensors is None else self._sensors.deflection(rows)
-        seen, observer = self._observer.observe(rows, memory.observer, bending)
-        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], _LOADS)
+        bending = None if self.sensors is None else self.sensors.deflection(rows)
+        seen, observer = self.observer.observe(rows, memory.observer, bending)
+        load, loads = mean_load(memory.loads, seen[:, [_LOAD]], ASSUMED_LOADS)
         return seen, load, EstimatorMemory(loads, observer)
 
     @override
@@ -201,7 +203,7 @@ def make_estimator(model: RobotModel, sensors: DeflectionSensors) -> Estimator:
     return LegEncoderEstimator(model, sensors)
 
 
-def mean_load(memory: Array, excess: Array, prior: float = _LOADS) -> tuple[Array, Array]:
+def mean_load(memory: Array, excess: Array, prior: float = ASSUMED_LOADS) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum.
 
     Args:

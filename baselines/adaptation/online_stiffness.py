@@ -53,6 +53,12 @@ class StiffnessMemory(NamedTuple):
 class OnlineStiffness(policies.PolicyAround):
     """A compensated policy whose model of the joints is corrected by what is measured.
 
+    Attributes:
+        estimator: Says r.
+        every: Control steps from an estimate to the next one.
+        share: Of its way to the estimate that the correction goes in a control step [1].
+        limit: Largest correction [1].
+
     Args:
         policy: The policy that is corrected; it has the input `deflection`.
         model: Assumed robot.
@@ -65,16 +71,16 @@ class OnlineStiffness(policies.PolicyAround):
     ) -> None:
         super().__init__(policy, model)
         dt = model.control_period_s
-        self._estimator = estimator
-        self._every = max(round(gains.period_s / dt), 1)
-        self._gain = 1.0 - float(np.exp(-dt / gains.filter_s))
-        self._limit = gains.limit
+        self.estimator = estimator
+        self.every = max(round(gains.period_s / dt), 1)
+        self.share = 1.0 - float(np.exp(-dt / gains.filter_s))
+        self.limit = gains.limit
 
     @override
     def begin(self, rows: Array) -> StiffnessMemory:
         wait = np.zeros(len(rows), dtype=np.int64)
         zero = np.zeros((len(rows), self.view.num_joints))
-        estimator = self._estimator.begin(len(rows))
+        estimator = self.estimator.begin(len(rows))
         return StiffnessMemory(wait, zero, zero, estimator, self.policy.begin(rows))
 
     @override
@@ -85,13 +91,13 @@ class OnlineStiffness(policies.PolicyAround):
         own = memory.estimator
         if np.count_nonzero(memory.wait) < len(rows):
             due = memory.wait == 0
-            wait[due] = self._every - 1
+            wait[due] = self.every - 1
             before = policies.select_rows(own, due)
-            estimate, after = self._estimator.estimate(rows[due], before)
-            estimate = np.clip(estimate, -self._limit, self._limit)
+            estimate, after = self.estimator.estimate(rows[due], before)
+            estimate = np.clip(estimate, -self.limit, self.limit)
             target = policies.put_rows(target, due, estimate)
             own = policies.put_rows(own, due, after)
-        correction = memory.correction + self._gain * (target - memory.correction)
+        correction = memory.correction + self.share * (target - memory.correction)
         together = correction
         if inputs.deflection is not None:
             together = (1.0 + correction) * (1.0 + inputs.deflection) - 1.0

@@ -51,6 +51,8 @@ class BendingObserver:
 
     Args:
         model: Assumed walker.
+
+    Attribute `carried` is the force that the feet carry [N].
     """
 
     signals = tuple(
@@ -71,7 +73,7 @@ class BendingObserver:
         self._theta = table.group("encoder_angle")
         self._attitude = table.group("imu_attitude")
         self._view = WalkView(table)
-        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
+        self.carried = model.biped.chains_above_feet.mass * model.biped.gravity
 
     def begin(self, num_worlds: int) -> Records:
         """Memory before the first measurement, (num_worlds,)."""
@@ -96,7 +98,7 @@ class BendingObserver:
         memory = memory.copy()
         found = np.empty((len(rows), len(self.signals)))
         observed = self._view.fields(rows)
-        regress(observed, seen, expected, self._carried, memory, found)
+        regress(observed, seen, expected, self.carried, memory, found)
         return found, memory
 
     def bending(self, rows: Array) -> Array:

@@ -14,7 +14,7 @@ from elastic_env.core.csv_table import LARGEST_BYTES, read_table
 from elastic_env.core.errors import ConfigurationError, MissingExtraError, quote
 from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import parse_json
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 
 AngleUnit = Literal["rad", "deg"]
 """Unit of the angles of a file."""
@@ -222,18 +222,63 @@ def _is_number(value: Any) -> bool:
 
 
 def _read_parquet(path: Path, joint: str | None) -> Content:
-    """An episode of LeRobot: `timestamp`, and the lists `action` and `observation.state`."""
+    """An episode of LeRobot."""
+    table = read_episodes(path)
+    episodes = np.unique(table.episode)
+    if len(episodes) > 1:
+        raise ConfigurationError(
+            f"{path} has {len(episodes)} episodes; elastic lerobot FOLDER writes a log of each"
+        )
+    count = min(table.goal.shape[1], table.position.shape[1])
+    at = _joint_number(path, joint, count)
+    columns = {
+        "time": table.time,
+        "goal": table.goal[:, at],
+        "position": table.position[:, at],
+    }
+    return Content(columns, {})
+
+
+class EpisodeTable(NamedTuple):
+    """Rows of a parquet file of LeRobot.
+
+    Attributes:
+        time: Since the begin of the episode, (N,) [s].
+        goal: Values of `action`, (N, n).
+        position: Values of `observation.state`, (N, m).
+        episode: Number of the episode; 0 where the file has none, (N,).
+    """
+
+    time: Array
+    goal: Array
+    position: Array
+    episode: IntArray
+
+
+def read_episodes(path: Path, most_bytes: int = LARGEST_BYTES) -> EpisodeTable:
+    """Rows of a parquet file of LeRobot: `timestamp`, and the lists `action`, `observation.state`.
+
+    Args:
+        path: The file.
+        most_bytes: Bytes that it may have.
+
+    Raises:
+        ConfigurationError: It cannot be read, or has other columns.
+        MissingExtraError: The package pyarrow is missing.
+    """
     import pandas as pd
 
     try:
-        table = pd.read_parquet(io.BytesIO(read_bounded(path, LARGEST_BYTES)))
+        table = pd.read_parquet(io.BytesIO(read_bounded(path, most_bytes)))
     except ImportError:
         raise MissingExtraError(
             "reading parquet files needs the package pyarrow; install it with: pip install pyarrow"
         ) from None
+    except ConfigurationError:
+        raise
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"{path} is no parquet file that can be read: {error}") from None
-    names = {"timestamp": "time", "action": "goal", "observation.state": "position"}
+    names = ("timestamp", "action", "observation.state")
     if missing := [key for key in names if key not in table]:
         raise ConfigurationError(
             f"{path} has no column {missing[0]}; an episode of LeRobot has timestamp, action and"
@@ -243,10 +288,11 @@ def _read_parquet(path: Path, joint: str | None) -> Content:
         raise ConfigurationError(
             f"{path} must have 1 to {MOST_ROWS} rows, it has {len(table)}; give an episode"
         )
-    parts = {name: _parquet_column(path, key, list(table[key])) for key, name in names.items()}
-    count = min(parts["goal"].shape[1], parts["position"].shape[1])
-    at = _joint_number(path, joint, count)
-    return Content({name: part[:, 0 if name == "time" else at] for name, part in parts.items()}, {})
+    time, goal, position = (_parquet_column(path, key, list(table[key])) for key in names)
+    episode = np.zeros((len(table), 1))
+    if "episode_index" in table:
+        episode = _parquet_column(path, "episode_index", list(table["episode_index"]))
+    return EpisodeTable(time[:, 0], goal, position, episode[:, 0].astype(np.int64))
 
 
 def _parquet_column(path: Path, key: str, cells: list[Any]) -> Array:

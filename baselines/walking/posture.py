@@ -91,6 +91,10 @@ class PostureMemory(NamedTuple):
 class PostureFeedback(policies.PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
+    Attributes:
+        gains: Row of `POSTURE`, (1,).
+        ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
+
     Args:
         policy: What commands the robot.
         model: Assumed walker.
@@ -104,17 +108,17 @@ class PostureFeedback(policies.PolicyAround):
         super().__init__(policy, model)
         self.inputs = (*self.policy.inputs, "posture_gain")
         self._walk_view = policies.WalkView(model.observation_table)
-        self._ramp = Ramp(model, ramp_s).table
+        self.ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
-        self._gains: Any = np.zeros(1, POSTURE)
+        self.gains: Any = np.zeros(1, POSTURE)
         for name in _GAINS:
-            self._gains[name] = getattr(gains, name)
-        self._gains["period_s"] = period_s
-        self._gains["integral_limit"] = np.inf
+            self.gains[name] = getattr(gains, name)
+        self.gains["period_s"] = period_s
+        self.gains["integral_limit"] = np.inf
         if gains.integral > 0.0:
-            self._gains["integral_limit"] = gains.limit_rad / gains.integral
-        self._gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
-        self._gains["swing_share"] = period_s / max(gains.swing_s, period_s)
+            self.gains["integral_limit"] = gains.limit_rad / gains.integral
+        self.gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
+        self.gains["swing_share"] = period_s / max(gains.swing_s, period_s)
 
     @override
     def begin(self, rows: Array) -> PostureMemory:
@@ -132,7 +136,7 @@ class PostureFeedback(policies.PolicyAround):
         feedback = np.empty(len(rows), FEEDBACK)
         observed = self._walk_view.fields(rows)
         memories = (memory.feedback, feedback)
-        hold_posture(self._gains, observed, self._ramp, change, *memories, total)
+        hold_posture(self.gains, observed, self.ramp, change, *memories, total)
         return total.astype(np.float32), PostureMemory(feedback, inner)
 
 

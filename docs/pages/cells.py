@@ -57,6 +57,14 @@ _ENDS = ("link_error_imu_min_rad", "link_error_imu_max_rad")
 
 _BLOCK_METRICS = (("pelvis_error", "rad"), ("zmp_deviation", "m"))
 
+_BLOCKS = (
+    *_WALK,
+    *(f"{name}_{block}_rms_{unit}" for block in BLOCKS for name, unit in _BLOCK_METRICS),
+    "foot_drift_end_m",
+)
+_GAITS = {"walker": "3 s", "walker_1600ms": "1.6 s", "walker_1100ms": "1.1 s"}
+"""Step periods of the comparisons of residuals."""
+
 KEPT: Mapping[str, Kept] = {
     "paper": Kept((*_ATTITUDE, *_ZMP, *_FEET), ("median", "worst")),
     "walker": Kept((*_WALK, *_ATTITUDE, *_ZMP[1:], "early_touchdown_mean_s")),
@@ -70,14 +78,13 @@ KEPT: Mapping[str, Kept] = {
             "policy": ["input_output", "posture", "adaptive_posture"],
         },
     ),
-    "walks": Kept(
-        (
-            *_WALK,
-            *(f"{name}_{block}_rms_{unit}" for block in BLOCKS for name, unit in _BLOCK_METRICS),
-            "foot_drift_end_m",
-        ),
-        ("mean",),
-    ),
+    "walks": Kept(_BLOCKS, ("mean",)),
+    **{
+        f"learned_{name}": Kept(
+            _BLOCKS, ("mean",), f"walks_{name}", {"reference": [f"{gait} num_steps=20"]}
+        )
+        for name, gait in _GAITS.items()
+    },
     "footholds": Kept((*_WALK, "end_position_error_m", "end_heading_error_rad"), ("mean",)),
     "walker_sensitivity": Kept((*_ATTITUDE[:2], _ATTITUDE[3], _ZMP[2])),
     "testbed": Kept(("link_error_rms_rad",)),
@@ -185,12 +192,10 @@ def in_table_unit(row: Mapping[str, str], metric: str) -> float:
     return scale * float(row[metric]) if row[metric] else math.nan
 
 
-def format_metrics(
-    row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / "
-) -> str:
+def format_metrics(row: Mapping[str, str], metrics: Iterable[str], decimals: int) -> str:
     """Metrics side by side with so many decimals, - where there is none."""
     values = (in_table_unit(row, metric) for metric in metrics)
-    return between.join(
+    return " / ".join(
         "-" if math.isnan(value) else minus(f"{round(value, decimals) + 0.0:.{decimals}f}")
         for value in values
     )

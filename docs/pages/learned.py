@@ -10,6 +10,7 @@ from pathlib import Path
 from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import (
+    BEST_ANALYTIC,
     FEWEST_SEEDS,
     percent,
     percent_interval,
@@ -32,9 +33,12 @@ MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
-GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
-"""Groups of scenarios, and scenarios that stand for themselves."""
-BASE = "base of the residual"
+_TELLING = ("soft", "slope", "joined", "drawn")
+"""Scenarios and groups of the walker that say where a residual gains, beside those in short."""
+MOTIONS = ("nominal", "held out")
+ARM_SCENARIOS = ("nominal", "soft", "payload")
+"""Scenarios and groups of testbed and arm."""
+_BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
 
@@ -47,17 +51,11 @@ class LearnedMap:
     Attributes:
         policy: Title of the residual.
         metric: Column of the episodes.
-        x_is, y_is: What the axes are.
-        x, y: Their values as they are shown.
-        cells: Row of the CSV by (x, y).
+        cells: Row of the CSV by the values of both axes, as they are shown.
     """
 
     policy: str
     metric: str
-    x_is: str
-    y_is: str
-    x: Sequence[str]
-    y: Sequence[str]
     cells: Mapping[tuple[str, str], Mapping[str, str]]
 
     @classmethod
@@ -67,34 +65,28 @@ class LearnedMap:
         return cls(
             first["policy"],
             first["metric"],
-            first["x_is"],
-            first["y_is"],
-            list(dict.fromkeys(row["x"] for row in rows)),
-            list(dict.fromkeys(row["y"] for row in rows)),
             {(row["x"], row["y"]): row for row in rows},
         )
 
     @property
-    def table(self) -> str:
-        """Changes with x to the right and y upwards."""
-        head = [f"{self.y_is} \\ {self.x_is}", *self.x]
-        rows = [
-            [f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)
-        ]
-        return page_table(head, rows, words=0)
-
-    @property
-    def sentence(self) -> str:
-        """In how many cells the residual is ahead and behind, and whom it is compared with."""
-        verdicts = [row["verdict"] for row in self.cells.values()]
-        rivals = [row["best_without_learning"] or "none" for row in self.cells.values()]
+    def row(self) -> list[str]:
+        """Metric, policy, cells ahead and behind, range of the change, and the opponent."""
+        cells = list(self.cells.values())
+        verdicts = [cell["verdict"] for cell in cells]
+        opponents = [cell["best_without_learning"] or "none" for cell in cells]
+        common = max(dict.fromkeys(opponents), key=opponents.count)
+        changes = [float(cell["change"]) for cell in cells if cell["change"]]
+        failed = sum(int(cell["failed"] or 0) for cell in cells)
         title, _ = _METRICS[self.metric]
-        common = max(dict.fromkeys(rivals), key=rivals.count)
-        return (
-            f"**{title[:1].upper()}{title[1:]}, {self.policy}.** Ahead in {verdicts.count('lower')}"
-            f" of {len(verdicts)} cells, behind in {verdicts.count('higher')}. The best policy"
-            f" without learning is {common} in {rivals.count(common)} of {len(rivals)} cells."
-        )
+        return [
+            title,
+            self.policy,
+            f"{verdicts.count('lower')} of {len(cells)}",
+            str(verdicts.count("higher")),
+            f"{percent(min(changes))} to {percent(max(changes))}",
+            str(failed),
+            f"{common} ({opponents.count(common)})",
+        ]
 
 
 def learned_maps(path: Path) -> list[LearnedMap]:
@@ -124,35 +116,29 @@ def learned_maps(path: Path) -> list[LearnedMap]:
 
 
 def maps_markdown(maps: Iterable[LearnedMap]) -> str:
-    """A sentence and a table for each map."""
-    return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
+    """A row for each map."""
+    head = ["", "residual", "ahead", "behind", "change", "failed", "most often best without"]
+    return page_table(head, [each.row for each in maps], words=2)
 
 
-def changes_table(
-    rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = BASE
-) -> str:
-    """Paired changes of residuals in every scenario and group, from the rows of a `statistics.csv`.
+def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = ()) -> str:
+    """Paired changes of residuals against their base, from the rows of a `statistics.csv`.
 
     Args:
         rows: Its rows.
         metrics: The metrics that are shown, where the table has them.
         scopes: The scenarios and groups that are shown; empty for all.
-        against: What the residuals are compared with, as the rows say it.
     """
-    own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
-    own = [row for row in own if row["kind"] == "residual"]
-    own = [row for row in own if row["scope"] in scopes or not scopes]
+    own = _residuals(rows, metrics, scopes, _BASE)
     titles = {
         metric: _METRICS[metric]
         for metric in metrics
         if any(row["metric"] == metric for row in own)
     }
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
-    whom = "base" if against == BASE else f"`{own[0]['base']}`"
+    places = group_by(own, lambda row: (*(row[name] for name in names), row["scope"]))
     lines = []
-    for place, found in group_by(
-        own, lambda row: (*(row[name] for name in names), row["scope"])
-    ).items():
+    for place, found in places.items():
         by_metric = {row["metric"]: row for row in found}
         cells = (
             part
@@ -160,16 +146,81 @@ def changes_table(
             for part in _over_base(by_metric[metric], unit)
         )
         lines.append([*place[:-1], _scope(found[0]), *cells])
-    head = [
-        *names,
-        "",
-        *(
-            text
-            for title, unit in titles.values()
-            for text in (f"{whom}: {title} [{unit}]", "change")
-        ),
+    figures = (
+        text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change")
+    )
+    return page_table([*names, "", *figures], lines, words=len(names) + 1)
+
+
+_TWENTY = " num_steps=20"
+"""End of the name of a walk of twenty steps."""
+
+
+def twenty_steps(*tables: Rows) -> str:
+    """Paired changes against the best policy without learning, over walks of twenty steps.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
+    """
+    lines = []
+    for rows in tables:
+        walks = [row for row in rows if row["reference"].endswith(_TWENTY)]
+        own = _residuals(walks, _JUDGED[:2], ("mixture", "drawn"), BEST_ANALYTIC)
+        places = group_by(own, lambda row: (row["reference"], row["scope"]))
+        for (reference, _), found in places.items():
+            by_metric = {row["metric"]: row for row in found}
+            changes = (_over_base(by_metric[metric], "")[1] for metric in _JUDGED[:2])
+            lines.append([reference.removesuffix(_TWENTY), _scope(found[0]), *changes])
+    titles = (_METRICS[metric][0] for metric in _JUDGED[:2])
+    return page_table(["step", "", *titles], lines, words=2)
+
+
+def both_opponents(*tables: Rows) -> str:
+    """Paired changes of residuals of the walker, against the best policy without learning and
+    against their base.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
+    """
+    rows = [row for table in tables for row in table]
+    opponents = (BEST_ANALYTIC, _BASE)
+    own = {against: _residuals(rows, _JUDGED, _TELLING, against) for against in opponents}
+    cells = {
+        (against, row["reference"], row["scope"], row["metric"]): row
+        for against, found in own.items()
+        for row in found
+    }
+    columns = [(against, metric) for metric in _JUDGED[:2] for against in opponents]
+    places = group_by(own[_BASE], lambda row: (row["reference"], row["scope"]))
+    lines = [
+        [
+            reference,
+            _scope(found[0]),
+            *(
+                _over_base(cells[against, reference, scope, metric], "")[1]
+                for against, metric in columns
+            ),
+        ]
+        for (reference, scope), found in places.items()
     ]
-    return page_table(head, lines, words=len(names) + 1)
+    head = [
+        f"{_METRICS[metric][0]}, against `{own[against][0]['base']}`" for against, metric in columns
+    ]
+    return page_table(["walk", "", *head], lines, words=2)
+
+
+def _residuals(
+    rows: Rows, metrics: Sequence[str], scopes: Sequence[str], against: str
+) -> list[Mapping[str, str]]:
+    """The rows of residuals: in some metrics and scopes, compared with one opponent."""
+    return [
+        row
+        for row in rows
+        if row["kind"] == "residual"
+        and row["base_is"] == against
+        and row["metric"] in metrics
+        and (row["scope"] in scopes or not scopes)
+    ]
 
 
 def learning_in_short(*tables: Rows) -> str:
@@ -187,7 +238,9 @@ def learning_in_short(*tables: Rows) -> str:
         for (reference, base), found in places.items():
             cells = {(row["scope"], row["metric"]): row for row in found}
             changes = [
-                _over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT
+                _over_base(cells[scope, metric], "")[1] if (scope, metric) in cells else "-"
+                for metric in metrics
+                for scope in _SHORT
             ]
             lines.append([reference, f"`{base}`", *changes])
     head = [
@@ -199,10 +252,8 @@ def learning_in_short(*tables: Rows) -> str:
 
 
 def _scope(row: Mapping[str, str]) -> str:
-    """A group in bold letters, or a scenario with its marks."""
-    if row["pooled"] == "True":
-        return f"**{row['scope']}**"
-    return f"`{row['scope']}`" + (f", {row['marks']}" if row["marks"] else "")
+    """A group in bold letters, or a scenario."""
+    return f"**{row['scope']}**" if row["pooled"] == "True" else f"`{row['scope']}`"
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
@@ -230,15 +281,3 @@ def _without_breaks(interval: str) -> str:
     """A change whose interval stays on one line in a narrow table."""
     change, _, ends = interval.partition(" [")
     return "{} [{}".format(*(part.replace(" ", "\N{NO-BREAK SPACE}") for part in (change, ends)))
-
-
-def _change(row: Mapping[str, str]) -> str:
-    """Relative change, with a sign where it is not told from chance, and ✕ where a policy
-    failed.
-    """
-    failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
-    return (
-        signed_off(percent(float(row["change"])), row["verdict"]) + failed
-        if row["change"]
-        else f"-{failed}"
-    )

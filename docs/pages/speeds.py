@@ -71,14 +71,14 @@ def costs_of_cells(rows: Rows) -> str:
     """Costs of handing out a cell and of a kill, from `tests.cluster_trials`."""
     lines = []
     for row in rows:
-        what = f"{float(row['count']):,.0f}".replace(",", " ") + f" × {row['trial']}"
         if row["dask_to_local"]:
-            each = f"{float(row['local_ms']):.4g} ms each", f"{float(row['dask_ms']):.4g} ms each"
-            lines.append([what, *each, f"{float(row['dask_to_local']):.3f}"])
+            here, there = (f"{float(row[name]):.4g}" for name in ("local_ms", "dask_ms"))
+            lines.append(f"* {row['trial']}: {here} ms each here, {there} ms on dask")
         else:
+            what = f"{float(row['count']):.0f} × {row['trial']}"
             again = f"at most {row['played_again_most']} cells began again"
-            lines.append([what, "–", f"{row['identical']} complete and identical; {again}", "–"])
-    return page_table(["trial", "on this machine", "on dask", "dask / local"], lines)
+            lines.append(f"* {what}: {row['identical']} results complete and identical, {again}")
+    return "\n".join(lines) + "\n"
 
 
 def policies_alone(standings: Sequence[Standing]) -> str:

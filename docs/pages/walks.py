@@ -12,6 +12,7 @@ from docs.pages.cells import (
     page_table,
 )
 from elastic_env.robots.thormang.tables import BLOCKS
+from train.evaluate.changes import percent
 from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
@@ -21,17 +22,20 @@ ZMP = "zmp_deviation_rms_m"
 _ROLL, _PITCH = (
     tuple(f"pelvis_{axis}_{kind}_rad" for kind in ("rms", "peak")) for axis in ("roll", "pitch")
 )
-_ZMPS = (ZMP, "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
-_EARLY = "early_touchdown_mean_s"
+_LATERAL = "zmp_deviation_y_rms_m"
 _END = ("end_position_error_m", "end_heading_error_rad")
-_FRAME = "frame_error_mean_m"
-_JUMP = "com_jump_mean_m"
-_LARGE = 19.95
-"""From here on a figure has no decimal."""
-_NEVER_SHOWN = ("zero", "uncompensated_open")
-_FAST = ("uncompensated", "input_output", "input_wrench", "dynamic", "oracle")
-_PUBLISHED = ("uncompensated", "talos", "thormang")
-_MIXTURE = ("nominal", "soft", "spread", "payload", "sensor")
+_METHOD = ("uncompensated", "input", "input_output", "dynamic")
+_FAST = ("input_output", "dynamic")
+"""The paper's method by halves, and the full torque."""
+_JUDGED = ("uncompensated", "input_output", "dynamic", "oracle")
+_DRAWN = ("input_output", "adaptive_posture", "foothold", "residual of 3 s")
+"""Policies that are judged in all scenarios, and on drawn robots."""
+_LONG = ("nominal", "drawn")
+"""Scenarios of walks of twenty steps."""
+_LEARNED = ("nominal", "soft", "spread", "payload", "sensor", "push", "slope", "imu", "drawn")
+"""Scenarios in which a robot learns from walk to walk."""
+_FAR = ("nominal", "soft")
+"""Scenarios of walks of forty steps."""
 
 
 def margins(rows: Rows) -> str:
@@ -40,179 +44,149 @@ def margins(rows: Rows) -> str:
 
 
 def twenty_steps(rows: Rows) -> str:
-    """Pelvis error and ZMP deviation over all, the first four and the last four steps."""
+    """Pelvis error and ZMP deviation over the first and the last four steps at 3 s."""
     cells = Cells(rows)
-    places = [
-        (reference, scenario, policy)
-        for reference in cells.names("reference")
-        for scenario in cells.names("scenario")
-        for policy in cells.names("policy")
-        if cells.has(policy, reference, scenario)
-    ]
-    spans = [(PELVIS, ZMP)]
-    spans += [(f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS]
+    reference = "3 s num_steps=20"
+    spans = [(f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS]
     lines = []
-    for reference, scenario, policy in places:
-        row = cells.row(policy, reference, scenario)
-        fell, episodes = failure_counts(row)
-        lines.append(
-            [
-                reference.removesuffix(" num_steps=20"),
-                f"`{scenario}`",
-                _robot(policy),
-                *(format_metrics(row, span, 2) for span in spans),
-                format_metrics(row, ["foot_drift_end_m"], 1),
-                f"{fell}/{episodes}",
-            ]
-        )
-    blocks = ["all 20 steps", "steps 1 to 4", "steps 17 to 20"]
-    head = ["step", "scenario", "policy", *blocks, "drift at the end", "falls"]
-    return page_table(head, lines, words=3)
+    for scenario in _LONG:
+        for policy in _DRAWN:
+            row = cells.row(policy, reference, scenario)
+            blocks = (format_metrics(row, span, 1) for span in spans)
+            drift = format_metrics(row, ["foot_drift_end_m"], 0)
+            lines.append([f"`{scenario}`", _robot(policy), *blocks, drift])
+    head = ["scenario", "policy", "steps 1 to 4", "steps 17 to 20", "drift at the end"]
+    return page_table(head, lines, words=2)
+
+
+def walks_in_short(rows: Rows) -> str:
+    """Pelvis error and ZMP deviation of some policies over twenty steps of 3 s."""
+    cells = Cells(rows)
+    reference = "3 s num_steps=20"
+    lines = [
+        [
+            f"`{name}`",
+            *(format_metrics(cells.row(name, reference, s), (PELVIS, ZMP), 1) for s in _SHORT),
+        ]
+        for name in ("input_output", "adaptive_posture", "foothold", "phase_table")
+    ]
+    return page_table(["policy", *(f"`{scenario}`" for scenario in _SHORT)], lines)
+
+
+_SHORT = ("nominal", "payload", "drawn")
+_LAST_SHOWN = ("nominal", "soft", "drawn")
+
+
+def last_steps(*tables: Rows) -> str:
+    """Pelvis error and ZMP deviation of residuals over the first and the last four steps.
+
+    Args:
+        tables: Kept rows of a comparison each.
+    """
+    first, last = ((f"pelvis_error_{b}_rms_rad", f"zmp_deviation_{b}_rms_m") for b in BLOCKS)
+    lines = []
+    for rows in tables:
+        cells = Cells(rows)
+        (reference,) = cells.names("reference")
+        for scenario in _LAST_SHOWN:
+            own, base = (cells.row(name, reference, scenario) for name in ("residual", "foothold"))
+            changes = (
+                in_table_unit(own, b) / in_table_unit(own, a) - 1.0
+                for a, b in zip(first, last, strict=True)
+            )
+            lines.append(
+                [
+                    reference.removesuffix(" num_steps=20"),
+                    f"`{scenario}`",
+                    format_metrics(own, first, 2),
+                    format_metrics(own, last, 2),
+                    " / ".join(percent(change) for change in changes),
+                    format_metrics(base, last, 2),
+                ]
+            )
+    head = ["step", "scenario", "steps 1 to 4", "17 to 20", "change", "`foothold`, 17 to 20"]
+    return page_table(head, lines, words=2)
 
 
 def forty_steps(rows: Rows) -> str:
-    """Errors of the walk, and of place and heading at its end, of every policy."""
+    """Errors of the walk of `foothold`, and of place and heading at its end."""
     cells = Cells(rows)
     lines = []
     for reference in cells.names("reference"):
         walk = "full turn" if "turn_rad" in reference else "forward"
-        for scenario in cells.names("scenario"):
-            for policy in cells.names("policy"):
-                row = cells.row(policy, reference, scenario)
-                fell, episodes = failure_counts(row)
-                lines.append(
-                    [
-                        walk,
-                        f"`{scenario}`",
-                        _robot(policy),
-                        format_metrics(row, [PELVIS], 1),
-                        *(format_metrics(row, [metric], 0) for metric in (ZMP, *_END)),
-                        f"{fell}/{episodes}",
-                    ]
-                )
-    head = ["walk", "scenario", "policy", "pelvis", "ZMP", "place", "heading", "falls"]
-    return page_table(head, lines, words=3)
+        for scenario in _FAR:
+            row = cells.row("foothold", reference, scenario)
+            pelvis = format_metrics(row, [PELVIS], 1)
+            others = (format_metrics(row, [metric], 0) for metric in (ZMP, *_END))
+            lines.append([f"{walk}, `{scenario}`", pelvis, *others])
+    head = ["`foothold`", "pelvis [mrad]", "ZMP [mm]", "place [mm]", "heading [mrad]"]
+    return page_table(head, lines)
 
 
 def all_scenarios(rows: Rows) -> str:
-    """Pelvis error and ZMP deviation of every policy in every scenario, a table per step period."""
+    """Pelvis error and ZMP deviation in every scenario at 3 s."""
     cells = Cells(rows)
-    policies = [policy for policy in cells.names("policy") if policy not in _NEVER_SHOWN]
-    tables = []
-    for reference in cells.names("reference"):
-        lines = [
-            [
-                f"`{scenario}`",
-                *(_walk(cells.row(policy, reference, scenario)) for policy in policies),
-            ]
-            for scenario in cells.names("scenario")
-        ]
-        head = [reference, *(f"`{policy}`" for policy in policies)]
-        tables.append(page_table(head, lines))
-    return "\n".join(tables)
+    lines = [
+        [f"`{scenario}`", *(_walk(cells.row(policy, "3 s", scenario)) for policy in _JUDGED)]
+        for scenario in cells.names("scenario")
+    ]
+    return page_table(["scenario", *(f"`{policy}`" for policy in _JUDGED)], lines)
 
 
 def _walk(row: Mapping[str, str]) -> str:
     fell, episodes = failure_counts(row)
     if fell == episodes:
         return "fell"
-    text = f"{in_table_unit(row, PELVIS):.1f}, {in_table_unit(row, ZMP):.0f}"
+    text = f"{in_table_unit(row, PELVIS):.1f} / {in_table_unit(row, ZMP):.0f}"
     return f"{text} ({fell}/{episodes} fell)" if fell else text
 
 
 def paper_walks(rows: Rows, others: Rows) -> str:
-    """Roll, pitch, ZMP deviation and early touch-down of every baseline in the gaits of the
-    paper and faster.
-    """
+    """Roll, pitch and ZMP deviation in the gaits of the paper and faster."""
     cells = Cells(rows)
     fast = Cells(others)
-    places = [
-        (cells, policy, reference, scenario)
-        for reference in cells.names("reference")
-        for scenario in cells.names("scenario")
-        for policy in cells.names("policy")
-        if cells.has(policy, reference, scenario)
-    ]
-    places += [
-        (fast, policy, reference, "ideal") for reference in ("1.6 s", "1.1 s") for policy in _FAST
-    ]
+    gaits = [("24 s", "nominal"), ("3 s", "nominal"), ("3 s", "ideal")]
+    places = [(cells, policy, *gait) for gait in gaits for policy in _METHOD]
+    places += [(fast, policy, "1.1 s", "ideal") for policy in _FAST]
     lines = [
         [
-            reference,
-            f"`{scenario}`",
+            f"{reference}, `{scenario}`",
             _robot(policy),
             *_paper_walk(own.row(policy, reference, scenario)),
         ]
         for own, policy, reference, scenario in places
     ]
-    head = ["step", "scenario", "policy", "roll", "pitch", "ZMP", "early"]
-    return page_table(head, lines, words=3)
+    return page_table(["walk", "policy", "roll", "pitch", "ZMP"], lines, words=2)
 
 
 def _robot(policy: str) -> str:
-    return "rigid robot, `zero`" if policy == "rigid" else f"`{policy}`"
+    return policy if " " in policy else f"`{policy}`"
 
 
 def _paper_walk(row: Mapping[str, str]) -> list[str]:
     fell, episodes = failure_counts(row)
     if fell == episodes:
-        return [f"{fell} of {episodes} fell" if episodes > 1 else "fell", *["–"] * 3]
-    angles = (
-        f"{in_table_unit(row, rms):.2f} / {in_table_unit(row, peak):.1f}"
-        for rms, peak in (_ROLL, _PITCH)
-    )
-    return [*angles, format_metrics(row, _ZMPS, 1, ", "), format_metrics(row, [_EARLY], 0)]
-
-
-def local_frame(rows: Rows) -> str:
-    """Error of the local frame, and jump of the estimated center of mass, at the support
-    changes.
-    """
-    cells = Cells(rows)
-    lines = []
-    references = cells.names("reference")
-    for policy in cells.names("policy"):
-        found = [cells.row(policy, reference, "nominal") for reference in references]
-        if all(row[_FRAME] for row in found) and not policy.endswith("_open"):
-            lines.append(
-                [
-                    f"`{policy}`",
-                    *(format_metrics(row, [m], 1) for m in (_FRAME, _JUMP) for row in found),
-                ]
-            )
-    head = ["", *(f"{what}, {reference}" for what in ("e", "jump") for reference in references)]
-    return page_table(head, lines)
+        return [f"{fell} of {episodes} fell" if episodes > 1 else "fell", *["–"] * 2]
+    angles = (format_metrics(row, axis, 1) for axis in (_ROLL, _PITCH))
+    return [*angles, format_metrics(row, [ZMP], 1)]
 
 
 def sensitivity(rows: Rows) -> str:
-    """Effects of changes of robot, gait or controller on the walk, with and without
-    compensation.
-    """
+    """Effects of changes of robot, gait or controller on the compensated walk in `nominal`."""
     cells = Cells(rows)
-    changes = list(dict.fromkeys(policy.partition(": ")[2] for policy in cells.names("policy")))
-    columns = [
-        (policy, scenario)
-        for scenario in cells.names("scenario")
-        for policy in ("uncompensated", "input_output")
+    policies = [policy for policy in cells.names("policy") if policy.startswith("input_output: ")]
+    lines = [
+        [policy.partition(": ")[2], *_sway(cells.row(policy, "3 s", "nominal"))]
+        for policy in policies
     ]
-    lines = []
-    for change in changes:
-        places = [(f"{policy}: {change}", "3 s", scenario) for policy, scenario in columns]
-        lines.append(
-            [change, *(_sway(cells.row(*place)) if cells.has(*place) else "–" for place in places)]
-        )
-    head = ["", *(f"`{policy}`, `{scenario}`" for policy, scenario in columns)]
-    return page_table(head, lines)
+    return page_table(["", "roll rms", "pitch peak", "lateral ZMP"], lines)
 
 
-def _sway(row: Mapping[str, str]) -> str:
-    """Roll rms / peak, pitch peak, lateral ZMP deviation rms."""
+def _sway(row: Mapping[str, str]) -> list[str]:
+    """Roll rms, pitch peak, lateral ZMP deviation rms."""
     if failure_counts(row)[0]:
-        return "fell"
-    peaks = (in_table_unit(row, metric) for metric in (_ROLL[1], _PITCH[1], _ZMPS[2]))
-    return f"{in_table_unit(row, _ROLL[0]):.1f} / " + ", ".join(
-        f"{peak:.{0 if peak >= _LARGE else 1}f}" for peak in peaks
-    )
+        return ["fell", "–", "–"]
+    return [format_metrics(row, [metric], 1) for metric in (_ROLL[0], _PITCH[1], _LATERAL)]
 
 
 def gravity_torques(rows: Rows) -> str:
@@ -238,75 +212,31 @@ def gravity_torques(rows: Rows) -> str:
 
 
 def drawn_robots(rows: Rows) -> str:
-    """Mean, interquartile mean and worst tenth over drawn robots."""
-    found: dict[tuple[str, str], dict[str, Mapping[str, str]]] = {}
-    for row in rows:
-        found.setdefault((row["scenario"], row["policy"]), {})[row["metric"]] = row
-    lines = [
-        [
-            f"`{scenario}`",
-            policy if " " in policy else f"`{policy}`",
-            *(
-                " / ".join(
-                    f"{1e3 * float(own[metric][name]):.1f}"
-                    for name in ("mean", "interquartile_mean", "worst_tenth")
-                )
-                for metric in (PELVIS, ZMP)
-            ),
-            own[PELVIS]["failed"],
-            own[PELVIS]["episodes"],
-        ]
-        for (scenario, policy), own in sorted(found.items(), key=lambda item: item[0][0])
+    """Mean and worst tenth over drawn robots."""
+    found = {(row["policy"], row["scenario"], row["metric"]): row for row in rows}
+    columns = [
+        (scenario, metric, title)
+        for scenario in ("drawn", "drawn_beyond")
+        for metric, title in ((PELVIS, "pelvis"), (ZMP, "ZMP"))
     ]
-    head = ["scenario", "policy", "pelvis error", "ZMP deviation", "falls", "robots"]
-    return page_table(head, lines, words=2)
-
-
-def imu_errors(rows: Rows) -> str:
-    """Pelvis error, ZMP deviation and error of the IMU without and with the errors of the
-    device.
-    """
-    cells = Cells(rows)
-    metrics = (PELVIS, ZMP, "imu_error_rms_rad")
     lines = []
-    for policy in cells.names("policy"):
-        own = [cells.row(policy, "3 s", scenario) for scenario in ("nominal", "imu")]
-        lines.append(
-            [
-                f"`{policy}`",
-                *(format_metrics(row, metrics, 2) for row in own),
-                str(sum(failure_counts(row)[0] for row in own)),
-            ]
-        )
-    head = ["policy", "`nominal`: pelvis / ZMP / IMU", "`imu`: pelvis / ZMP / IMU", "falls"]
-    return page_table(head, lines)
+    for policy in _DRAWN:
+        own = (found[policy, scenario, metric] for scenario, metric, _ in columns)
+        lines.append([_robot(policy), *map(_mean_and_worst, own)])
+    return page_table(["", *(f"`{place}`: {title}" for place, _, title in columns)], lines)
 
 
-def published_controllers(standings: Sequence[Standing]) -> str:
-    """Controllers that two teams published for their robots, beside no compensation."""
-    found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s"}
-    lines = [
-        [
-            f"`{policy}`",
-            *(
-                _mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)])
-                for scope in _MIXTURE
-            ),
-        ]
-        for policy in _PUBLISHED
-    ]
-    head = ["policy", *(f"`{scope}`" for scope in _MIXTURE)]
-    return page_table(head, lines)
+def _mean_and_worst(row: Mapping[str, str]) -> str:
+    return " / ".join(f"{1e3 * float(row[name]):.1f}" for name in ("mean", "worst_tenth"))
 
 
 def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
-    """Scores of `iterative` on each robot, beside its base."""
+    """Scores of `iterative` on each robot, and of its base."""
     found = {
         (s.policy, s.scope, s.metric): s
         for s in standings
         if s.reference == "3 s" and not s.is_group
     }
-    scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
     lines = [
         [
             f"`{scope}`",
@@ -315,9 +245,9 @@ def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
                 for policy in ("adaptive_posture", "iterative")
             ),
         ]
-        for scope in scopes
+        for scope in _LEARNED
     ]
-    return page_table(["scenario", "without learning", "after ten walks"], lines)
+    return page_table(["scenario", "`adaptive_posture`", "after ten walks"], lines)
 
 
 def _mean(pair: Sequence[Standing], decimals: int = 1) -> str:

@@ -20,33 +20,28 @@ from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
-    GROUPS,
+    ARM_SCENARIOS,
     MAPS,
+    MOTIONS,
     LearnedMap,
+    both_opponents,
     changes_table,
     learned_maps,
     learning_in_short,
     maps_markdown,
+    twenty_steps,
 )
-from docs.pages.standings import claims_markdown
+from docs.pages.standings import board_markdown, claims_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
-from train.evaluate.changes import BEST_ANALYTIC
 from train.evaluate.standings import Standing
-from train.report.leaderboard import leaderboard_markdown, read_leaderboard
-from train.report.table_formats import Head, Row, Table, to_markdown
+from train.report.leaderboard import read_leaderboard
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
-_SAGS = (
-    "uncompensated_rms",
-    "uncompensated_peak",
-    "input_rms",
-    "soft_uncompensated_rms",
-    "soft_input_rms",
-)
-_WORDS = ("robot", "K [N·m/rad]", "source of K")
-"""Columns of the gallery that hold words."""
+_SAGS = ("uncompensated_rms", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
+FAST_WALKERS = ("learned_walker_1600ms", "learned_walker_1100ms")
+"""Comparisons of residuals of the walker at fast gaits."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -56,12 +51,11 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
-            "learned_posture_1600ms",
-            "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
             "learned_testbed_friction",
             "learned_walker",
+            *FAST_WALKERS,
         )
     },
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
@@ -141,38 +135,16 @@ def gallery_table(gallery: Rows) -> str:
     rows = []
     for row in gallery:
         least, most = (float(row[f"stiffness_{which}_Nm_per_rad"]) for which in ("least", "most"))
-        deviations = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
-        rows.append(
-            [
-                row["title"],
-                row["joints"],
-                f"{least:g} to {most:g}",
-                row["stiffness_source"],
-                f"{1e3 * float(row['deflection_peak_rad']):.0f}",
-                *deviations,
-            ]
-        )
-    head = [
-        "robot",
-        "joints",
-        "K [N·m/rad]",
-        "source of K",
-        "largest deflection [mrad]",
-        "sag [mm]",
-        "largest sag",
-        "`input`",
-        "sag, soft",
-        "`input`, soft",
-    ]
-    heads = tuple(Head(title, is_number=title not in _WORDS) for title in head)
-    return to_markdown(Table(heads, tuple(Row(tuple(row)) for row in rows))) + "\n"
+        sags = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
+        rows.append([row["title"], f"{least:g} to {most:g}", *sags])
+    head = ["robot", "K [N·m/rad]", "sag [mm]", "`input`", "sag, soft", "`input`, soft"]
+    return page_table(head, rows)
 
 
 def gallery_pictures(gallery: Rows) -> str:
     """Pictures of the robots of the gallery, each under its name."""
     return "\n".join(
-        f"**{row['title']}**\n\n![{row['title']} without and with"
-        f" compensation](images/gallery/{row['robot']}.png)\n"
+        f"**{row['title']}**\n\n![{row['title']}](images/gallery/{row['robot']}.png)\n"
         for row in gallery
     )
 
@@ -198,16 +170,15 @@ def _of_map(name: str) -> Part:
 
 
 PARTS: Mapping[str, Part] = {
-    "leaderboard": _of_standings(leaderboard_markdown),
+    "leaderboard": _of_standings(board_markdown),
     "what learning adds": _of_standings(claims_markdown),
     "learning in short": _of(
         learning_in_short,
         "learned_walker",
-        "learned_posture_1600ms",
-        "learned_posture_1100ms",
+        *FAST_WALKERS,
     ),
-    "learning at 3 s": _of(learning_in_short, "learned_walker"),
-    "published controllers": _of_standings(walks.published_controllers),
+    "learning over twenty steps": _of(twenty_steps, "learned_walker", *FAST_WALKERS),
+    "walks in short": _of(walks.walks_in_short, "walks"),
     "margins": _of(walks.margins, "margins"),
     "twenty steps": _of(walks.twenty_steps, "walks"),
     "forty steps": _of(walks.forty_steps, "footholds"),
@@ -216,7 +187,6 @@ PARTS: Mapping[str, Part] = {
     "one arm": _of(arms.one_arm, "gallery"),
     "recorded hands": _of(recorded.hands, "recorded_justin"),
     "recorded hands by poses": _of(recorded.by_poses, "recorded_justin"),
-    "recorded hands by masses": _of(recorded.by_masses, "recorded_justin"),
     "replays of recorded servos": _of(recorded.replays, "recorded_servos"),
     "recorded servos in slow motion": _of(recorded.slow_motion, "recorded_servos"),
     "priors of recorded servos": _of(recorded.priors, "recorded_servos"),
@@ -226,13 +196,26 @@ PARTS: Mapping[str, Part] = {
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
-    "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
-    "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
-    "learned on the testbed": _of(changes_table, "learned_testbed"),
-    "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
-    "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
-    "learned on the walker": _of(partial(changes_table, against=BEST_ANALYTIC), "learned_walker"),
-    "learned beyond a table": _of(partial(changes_table, scopes=GROUPS), "learned_walker"),
+    "learned at fast gaits": _of(
+        both_opponents,
+        *FAST_WALKERS,
+    ),
+    "learned on the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed",
+    ),
+    "learned on friction of the testbed": _of(
+        partial(changes_table, scopes=MOTIONS),
+        "learned_testbed_friction",
+    ),
+    "learned on an arm": _of(
+        partial(changes_table, metrics=ARM, scopes=ARM_SCENARIOS),
+        "learned_robot",
+    ),
+    "learned on the walker": _of(both_opponents, "learned_walker"),
+    "last steps of residuals": _of(
+        walks.last_steps, "walks_walker", "walks_walker_1600ms", "walks_walker_1100ms"
+    ),
     "speed of vector environments": _of(
         speeds.vector_environments, "speed_walker", "speed_testbed"
     ),
@@ -241,11 +224,9 @@ PARTS: Mapping[str, Part] = {
     "named policies": Part((), lambda _: policy_table()),
     "policies alone": _of_standings(speeds.policies_alone),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
-    "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
     "sensitivity of the walk": _of(walks.sensitivity, "walker_sensitivity"),
     "walks of the paper": _of(walks.paper_walks, "paper", "walker"),
-    "local frame": _of(walks.local_frame, "paper"),
     "walks in all scenarios": _of(walks.all_scenarios, "walker"),
     "testbed of the paper": _of(joints.paper_testbed, "paper_testbed", "identification"),
     "identification": _of(joints.identification, "identification"),

@@ -59,6 +59,7 @@ class ArmSettings(Model):
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = ARM_LIMITS
+    """What stops a motion or limits the goal; each joint also keeps to the range of the model."""
 
     @model_validator(mode="after")
     def _ids_differ(self) -> Self:

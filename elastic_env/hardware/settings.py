@@ -25,23 +25,23 @@ class SafetyLimits(Model):
     highest_rad: float = quantity("rad", 1.6, ge=-_TURN, le=_TURN)
     """Highest goal [rad]."""
     margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5)
-    """How far beyond that range a position may lie [rad]."""
+    """How far beyond that range a position may lie on the way; no motion begins there [rad]."""
     slew_rad_s: float = quantity("rad/s", 3.0, ge=0.01, le=10)
     """Fastest change of the goal [rad/s]."""
     speed_rad_s: float = quantity("rad/s", 4.5, ge=0.01, le=10)
     """Measured speed that stops the motion [rad/s]."""
     following_error_rad: float = quantity("rad", 0.35, ge=1e-3, le=1.5)
-    """Distance from the goal that stops it [rad]."""
+    """Distance from the goal that stops the motion: something blocks [rad]."""
     temperature_c: float = quantity("°C", 80.0, ge=1, le=80)
-    """Temperature above which the motion stops [°C]."""
+    """Temperature that stops the motion, or the servo's own limit where that is lower [°C]."""
     torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, ge=0.1, le=LARGEST_TORQUE_NM)
-    """Torque, by the current, that stops it [N·m]."""
+    """Torque, by the current, that stops the motion after `patience_cycles` [N·m]."""
     patience_cycles: int = quantity("1", 3, ge=1, le=10)
-    """Cycles without a reply, or too much torque [1]."""
+    """Cycles in a row without a usable reply, or with too much torque, that stop the motion [1]."""
     hang_s: float = quantity("s", 0.05, ge=0.005, le=0.09)
-    """Time without a command that stops the motion [s]."""
+    """Time without a command, or an answer of the supervisor, that stops the motion [s]."""
     release_s: float = quantity("s", 0.0, ge=0, le=5)
-    """Time in which torque falls before it is off [s]."""
+    """Time in which torque falls before it is off, on servos that can limit it [s]."""
 
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
@@ -73,7 +73,10 @@ class HardwareSettings(Model):
     imu_baudrate: int = quantity("bit/s", 115_200, **RANGE_OF_RATES)
     """Rate of the IMU's port [bit/s]."""
     imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1)
-    """Age at which an attitude counts as missing [s]."""
+    """Age at which an attitude counts as missing, and longest time without a change of any bit [s].
+
+    Both end the episode.
+    """
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1
@@ -81,12 +84,13 @@ class HardwareSettings(Model):
     imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi)
     """Euler angle that it shows at q = 0 [rad]."""
     largest_deflection_rad: float = quantity("rad", 0.2, ge=1e-3, le=1)
-    """Bend that stops it, by the IMU [rad]."""
+    """Angle between link, by the IMU, and servo that stops the motion [rad]."""
     approach_rad_s: float = quantity("rad/s", 0.2, ge=0.01, le=2)
     """Peak speed to the start and back to rest [rad/s]."""
     confirm: bool = True
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()
+    """What stops a motion, or limits the goal."""
 
     @model_validator(mode="after")
     def _wiring_is_possible(self) -> Self:

@@ -31,7 +31,6 @@ from elastic_env.motion.gait import RIGHT, Footholds, Gait, Timing
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.rigid.biped import Biped
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
-from elastic_env.rigid.floating_body import FloatingBody
 from elastic_env.rigid.leg_kinematics import turn
 
 _COM_TOLERANCE_M = 1e-10
@@ -371,6 +370,9 @@ class _Dynamics:
 
 def _dynamics(biped: Biped, pelvis: Array, heading: Array, q: Array, period_s: float) -> _Dynamics:
     """Inverse dynamics of the whole body; the force is in the world."""
+    # Pinocchio takes a tenth of the start of a robot that does not walk
+    from elastic_env.rigid.floating_body import FloatingBody
+
     body = FloatingBody(biped.rigid, biped.joint_names)
     q_dot, q_ddot = derivatives(q, period_s)
     moved = zip(derivatives(pelvis, period_s), derivatives(heading, period_s), strict=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -139,10 +140,10 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         self._render_human()
         return (
             result.observation[0],
-            float(result.reward[0]),
-            bool(result.terminated[0]),
-            bool(result.truncated[0]),
-            StepInfo({}, lambda: _first(result.info)),
+            result.reward.item(),
+            result.terminated.item(),
+            result.truncated.item(),
+            StepInfo({}, partial(_first, result.info)),
         )
 
     def render(self) -> Any:

@@ -213,6 +213,7 @@ class JointTask(Task):
         self._true_model = plant.true.observed_by(self.observation_table)
         stiffness = plant.true.rest_stiffness(config.form)
         lag_s = plant.true.servo_lag
+        self._rests = bool((self._reference.rest >= 0).any())
         self._rest_watch = RestWatch(plant.static_torque, stiffness, joints, lag_s)
         self._imu = _inertial_imu(config, plant, num_worlds)
         self._imu_bias = np.zeros(num_worlds)
@@ -240,13 +241,12 @@ class JointTask(Task):
 
     def score(self) -> None:
         """Score further steps, and look whether the joints rest in windows at rest."""
-        if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
-            for row in range(self._unscored, self._row + 1):
-                worlds = self._worlds[row]["truth"]
-                step = worlds["step"]
-                coming = self._reference.rest[np.minimum(step + 1, self.num_steps)]
-                is_last = (coming != worlds["rest"]) | (step >= self.num_steps)
-                self._rest_watch.see(worlds["rest"], is_last, self._joints[row]["truth"])
+        rows = slice(self._unscored, self._row + 1)
+        if self._rests and not self._rest_watch.is_said and rows.start < rows.stop:
+            truth = self._worlds[rows]["truth"]
+            coming = self._reference.rest[np.minimum(truth["step"] + 1, self.num_steps)]
+            is_last = (coming != truth["rest"]) | (truth["step"] >= self.num_steps)
+            self._rest_watch.see(truth["rest"], is_last, self._joints[rows]["truth"])
         super().score()
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:

@@ -1,13 +1,14 @@
 """Scores of an episode from the samples of its steps, such as RMS and peak. One row per world."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from elastic_env.core.signals import Array, BoolArray, Signals
+from elastic_env.core.compiled import compiled
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
+from elastic_env.world.rows import WHOLE, record_type
 
 Statistic: TypeAlias = Literal["rms", "peak", "min", "max", "mean", "last", "count"]
 
@@ -33,94 +34,105 @@ def metrics_of(
     return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
 
 
-def _join(join: np.ufunc, values: Array) -> Array:
-    """Values joined in the order of their steps, (num_rows, num_steps, num_worlds)."""
-    return join.accumulate(values, axis=1)[:, -1].copy()
-
-
-def _last_known(values: Array) -> Array:
-    """The last value that is not nan, of those that `_join` takes; nan where all are."""
-    back = (~np.isnan(values[:, ::-1])).argmax(axis=1)
-    row = values.shape[1] - 1 - back
-    return np.take_along_axis(values, row[:, None], axis=1)[:, 0]
-
-
-_FOLDS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array], float]] = {
-    "rms": (np.square, partial(_join, np.add), 0.0),
-    "mean": (np.positive, partial(_join, np.add), 0.0),
-    "min": (np.positive, partial(_join, np.minimum), np.inf),
-    "max": (np.positive, partial(_join, np.maximum), -np.inf),
-    "peak": (np.abs, partial(_join, np.maximum), 0.0),
-    "last": (np.positive, _last_known, np.nan),
-    "count": (np.ones_like, partial(_join, np.add), 0.0),
+_NEUTRAL: dict[Statistic, float] = {
+    "rms": 0.0,
+    "mean": 0.0,
+    "min": np.inf,
+    "max": -np.inf,
+    "peak": 0.0,
+    "last": np.nan,
+    "count": 0.0,
 }
-"""A function of every sample, how its values are joined, and what changes nothing, by statistic."""
+"""What a statistic is before its first sample. `joined` knows a statistic by its place here."""
+
+FOLD = record_type(("statistic", WHOLE), ("signal", WHOLE), ("mask", WHOLE))
+"""A metric as places in `_NEUTRAL` and in the rows of signals and masks."""
 
 
-class RunningStatistic:
-    """One statistic of the rows of an array over the sampled steps, in every world."""
+@compiled
+def fold(folds: Any, signals: Array, masks: BoolArray, total: Array, count: IntArray) -> None:
+    """Take samples into the statistics in the order of their steps.
 
-    def __init__(self, name: str, num_rows: int, num_worlds: int) -> None:
-        self._name = name
-        self._function, self._join, self._neutral = _FOLDS[name]
-        self._total = np.full((num_rows, num_worlds), self._neutral)
-        self._count = np.zeros((num_rows, num_worlds), dtype=np.int64)
+    The result does not depend on how many steps are taken at once.
 
-    def restart(self, worlds: BoolArray) -> None:
-        """Forget the samples of some worlds, (num_worlds,) mask."""
-        self._total[:, worlds] = self._neutral
-        self._count[:, worlds] = 0
+    Args:
+        folds: Records of `FOLD`, (rows,).
+        signals: (signals, num_steps, num_worlds).
+        masks: Whether a sample counts, (masks, num_steps, num_worlds).
+        total: To be brought up to date, (rows, num_worlds).
+        count: Number of samples, likewise.
+    """
+    for row in range(len(folds)):
+        statistic = folds[row].statistic
+        values = signals[folds[row].signal]
+        is_sampled = masks[folds[row].mask]
+        for step in range(values.shape[0]):
+            for world in range(values.shape[1]):
+                if is_sampled[step, world]:
+                    before = total[row, world]
+                    total[row, world] = joined(statistic, before, values[step, world])
+                    count[row, world] += 1
 
-    def update(self, values: Array, sampled: BoolArray) -> None:
-        """Take samples where `sampled` is true, (num_rows, num_steps, num_worlds) both.
 
-        The result does not depend on how many steps are taken at once: they are added in order.
-        """
-        # where, not a product: a nan outside does not count
-        samples = np.where(sampled, self._function(values), self._neutral)
-        self._count += sampled.sum(axis=1)
-        steps = np.concatenate([self._total[:, None], samples], axis=1)
-        self._total = self._join(steps)
-
-    def values(self) -> Array:
-        """The statistic of every row, (num_rows, num_worlds); nan without a sample."""
-        if self._name == "count":
-            return self._total.copy()
-        value = self._total
-        if self._name in ("rms", "mean"):
-            value = value / np.maximum(self._count, 1)
-        if self._name == "rms":
-            value = np.sqrt(value)
-        return np.where(self._count > 0, value, np.nan)
+@compiled
+def joined(statistic: int, before: float, value: float) -> float:
+    """A statistic and the next sample; a sample that is nan makes all but the last value nan."""
+    if statistic == 0:
+        return before + value * value
+    if statistic == 1:
+        return before + value
+    if statistic == 2:
+        return value if value < before or np.isnan(value) else before
+    if statistic == 3:
+        return value if value > before or np.isnan(value) else before
+    if statistic == 4:
+        return abs(value) if abs(value) > before or np.isnan(value) else before
+    if statistic == 5:
+        return before if np.isnan(value) else value
+    return before + 1.0
 
 
 class EpisodeMetrics:
     """The metrics of a task, accumulated step by step in every world."""
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
-        self._names = [metric.name for metric in metrics]
-        self._folded = [
-            (RunningStatistic(name, len(own), num_worlds), own)
-            for name in _FOLDS
-            if (own := [metric for metric in metrics if metric.statistic == name])
-        ]
+        statistics = [*_NEUTRAL]
+        self._metrics = metrics
+        self._signals = [*dict.fromkeys(metric.signal for metric in metrics)]
+        self._masks = [*dict.fromkeys(metric.over for metric in metrics)]
+        self._folds = np.zeros(len(metrics), FOLD)
+        self._folds["statistic"] = [statistics.index(metric.statistic) for metric in metrics]
+        self._folds["signal"] = [self._signals.index(metric.signal) for metric in metrics]
+        self._folds["mask"] = [self._masks.index(metric.over) for metric in metrics]
+        neutral = [[_NEUTRAL[metric.statistic]] for metric in metrics]
+        self._neutral = np.tile(neutral, num_worlds)
+        self._total = self._neutral.copy()
+        self._count = np.zeros(self._total.shape, dtype=np.int64)
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""
-        for statistic, _ in self._folded:
-            statistic.restart(worlds)
+        self._total[:, worlds] = self._neutral[:, worlds]
+        self._count[:, worlds] = 0
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
         """Take signals and masks by name, (num_steps, num_worlds) or (num_worlds,) each."""
-        for statistic, metrics in self._folded:
-            values = [np.atleast_2d(signals[metric.signal]) for metric in metrics]
-            sampled = [np.atleast_2d(masks[metric.over]) for metric in metrics]
-            statistic.update(np.array(values, dtype=np.float64), np.array(sampled))
+        values = np.array([signals[name] for name in self._signals], dtype=np.float64)
+        sampled = np.array([masks[name] for name in self._masks])
+        steps = (-1, self._total.shape[1])
+        by_signal = values.reshape(len(values), *steps)
+        by_mask = sampled.reshape(len(sampled), *steps)
+        fold(self._folds, by_signal, by_mask, self._total, self._count)
 
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
-        rows: dict[str, Array] = {}
-        for statistic, metrics in self._folded:
-            names = [metric.name for metric in metrics]
-            rows |= zip(names, statistic.values(), strict=True)
-        return {name: rows[name] for name in self._names}
+        found: dict[str, Array] = {}
+        for metric, total, count in zip(self._metrics, self._total, self._count, strict=True):
+            value = total.copy()
+            if metric.statistic in ("rms", "mean"):
+                value /= np.maximum(count, 1)
+            if metric.statistic == "rms":
+                value = np.sqrt(value)
+            if metric.statistic != "count":
+                value[count == 0] = np.nan
+            found[metric.name] = value
+        return found

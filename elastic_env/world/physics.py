@@ -104,7 +104,7 @@ _OTHERS = {
 }
 
 
-class _Worlds(Simulation):
+class Worlds(Simulation):
     """Bound fields, warnings and varying friction of both simulations."""
 
     _counts: IntArray
@@ -161,7 +161,7 @@ class _Worlds(Simulation):
         pass
 
 
-class SingleWorld(_Worlds):
+class SingleWorld(Worlds):
     """One world on `mj_step`."""
 
     num_worlds = 1
@@ -236,7 +236,7 @@ class SingleWorld(_Worlds):
             mujoco.mj_forward(self.model, self._data)
 
 
-class ManyWorlds(_Worlds):
+class ManyWorlds(Worlds):
     """Many worlds on `mujoco.batch`, stepped by a pool of threads."""
 
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:

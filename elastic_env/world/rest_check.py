@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -56,26 +57,35 @@ class RestWatch:
             self._window[worlds] = -1
 
     def see(self, rest: IntArray, is_last: BoolArray, joints: Records) -> None:
-        """Look at a control step.
+        """Look at control steps; how many are seen at once makes no difference.
 
         Args:
-            rest: Number of the window at rest, −1 elsewhere, (num_worlds,).
-            is_last: Whether the window ends with this step, (num_worlds,).
-            joints: Truth of the joints, (num_worlds, n).
+            rest: Number of the window at rest, −1 elsewhere, (steps, num_worlds).
+            is_last: Whether the window ends with a step, (steps, num_worlds).
+            joints: Truth of the joints, (steps, num_worlds, n).
         """
-        now = np.stack([joints["q"], joints["offset"]])
-        if self._window.shape != rest.shape:
-            self._window = np.full(rest.shape, -1)
-            self._least = now.copy()
-            self._most = now.copy()
-        fresh = rest != self._window
-        self._least = np.where(fresh[:, None], now, np.minimum(self._least, now))
-        self._most = np.where(fresh[:, None], now, np.maximum(self._most, now))
-        ended = (rest >= 0) & is_last
-        self._window = np.where(ended, -1, rest)
-        if ended.any():
-            moved = (self._most - self._least)[:, ended]
-            self._judge(joints["q_ref"][ended], moved, rest[ended])
+        if self._window.shape != rest.shape[1:]:
+            self._window = np.full(rest.shape[1:], -1)
+            self._least = self._most = np.zeros((2, *joints.shape[1:]))
+        is_cut = ((rest[1:] != rest[:-1]) | is_last[:-1]).any(axis=1)
+        cuts = (1 + np.flatnonzero(is_cut)).tolist()
+        for begin, end in pairwise([0, *cuts, len(rest)]):
+            window = rest[begin]
+            if (window < 0).all():
+                self._window = window.copy()
+                continue
+            within = joints[begin:end]
+            seen = np.stack([within["q"], within["offset"]])
+            least = seen.min(axis=1)
+            most = seen.max(axis=1)
+            is_fresh = (window != self._window)[:, None]
+            self._least = np.where(is_fresh, least, np.minimum(self._least, least))
+            self._most = np.where(is_fresh, most, np.maximum(self._most, most))
+            ended = (window >= 0) & is_last[end - 1]
+            self._window = np.where(ended, -1, window)
+            if ended.any():
+                moved = (self._most - self._least)[:, ended]
+                self._judge(within[-1]["q_ref"][ended], moved, window[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
         """Warn of windows that end.

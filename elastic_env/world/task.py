@@ -149,6 +149,7 @@ class Task(ABC):
         self._robots: dict[int, DrawnRobot] = {}
         self._noise = NoiseStream(num_worlds, self.noise_type)
         self._bound = self.action_table.space(np.float32).high.astype(np.float64)
+        self._action_shape = (num_worlds, len(self._bound))
         self._failures = (DIVERGED, *self.failure_names)
         self._no_reason = np.full(num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
@@ -357,8 +358,7 @@ class Task(ABC):
     def _command(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
         """Command offsets within their bounds; where an action was beyond them, (num_worlds,)."""
         given = np.asarray(action)
-        shape = (self.num_worlds, len(self._bound))
-        if given.dtype.kind not in "fiub" or given.shape != shape:
+        if given.dtype.kind not in "fiub" or given.shape != self._action_shape:
             raise self._refused(given)
         offset = given.astype(np.float64, order="C")
         is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
@@ -439,7 +439,8 @@ class Task(ABC):
         self._take_rows(1)
         self._sense(offset, is_clipped)
         self.observe()
-        self.signals()
+        self.score()
+        self._metrics.restart(every)
         joints = np.zeros_like(self._joints[:2])
         self._begin_block(joints, np.zeros_like(self._worlds[:2]))
 
@@ -453,7 +454,7 @@ class Task(ABC):
 
     def _refused(self, given: npt.NDArray[Any]) -> ActionError:
         """The error that says what is wrong with an action."""
-        shape = (self.num_worlds, len(self._bound))
+        shape = self._action_shape
         bounds = f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
             kind = given.dtype

@@ -20,7 +20,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.identify import identify
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
-from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.buses.servo_models import ServoModel, servo_model
 from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
 from elastic_env.hardware.safety.processes import child_command, child_environment
@@ -55,7 +55,8 @@ _FAST = 4_000_000
 """For twelve servos on one bus [bit/s]: the fastest of their rates that the SDK can set; not
 every adapter can."""
 _PAIR = (1, 2)
-_UNIT = servo_model(54024).position_unit
+_MODEL = servo_model(54024)
+_UNIT = _MODEL.position_unit
 
 Event = tuple[float, int, str, int]
 
@@ -251,7 +252,7 @@ def faults(share: float) -> Trial:
                 events = emulator.events()
                 is_moving = not message
                 left = left - 1
-                counts, some_wrong = _taken(events, seen)
+                counts, some_wrong = compare_replies(events, seen)
                 tally.update(counts)
                 wrong += some_wrong
                 beyond += _beyond(events, limits)
@@ -331,10 +332,19 @@ def _cycles(
     return seen, ""
 
 
-def _taken(
-    events: Sequence[Event], seen: Sequence[tuple[float, States]]
+def compare_replies(
+    events: Sequence[Event],
+    seen: Sequence[tuple[float, States]],
+    ids: Sequence[int] = _PAIR,
+    model: ServoModel = _MODEL,
 ) -> tuple[dict[str, int], list[dict[str, Any]]]:
     """Compare each position that was taken with what the servo had to say to that very request.
+
+    Args:
+        events: Of the emulator.
+        seen: When each cycle was read [s], and what came.
+        ids: Of the servos.
+        model: Of them all.
 
     Returns:
         Counts, and what there is to know of the wrong ones: a figure that is not 0 must be
@@ -344,7 +354,7 @@ def _taken(
     accepted = 0
     missing = 0
     for read_s, states in seen:
-        for column, servo in enumerate(_PAIR):
+        for column, servo in enumerate(ids):
             if not states.is_fresh[column]:
                 missing += 1
                 continue
@@ -356,7 +366,7 @@ def _taken(
                 and read_s - _CLOCK_S <= t <= states.time_s
             ]
             accepted += 1
-            taken = round(states.position[column] / _UNIT)
+            taken = round(states.position[column] / model.position_unit) + model.zero_count
             if not asked or taken != asked[-1]:
                 around = [event for event in events if abs(event[0] - read_s) < _AROUND_S]
                 wrong.append(

@@ -175,6 +175,7 @@ def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
         return
     if len(episodes) != condition.episodes:
         yield f"it has {len(episodes)} episodes, the cell has {condition.episodes}"
+    names = {name for record in episodes for name in record}
     for number, record in enumerate(episodes):
         for name, value in episode_labels(condition, number).items():
             own = record.get(name)
@@ -194,8 +195,11 @@ def _problems_of_episodes(evaluation: Evaluation) -> Iterator[str]:
                     f"{column.metric} of episode {number} must be a finite number, it is"
                     f" {quote(value)}"
                 )
-        if record.keys() != episodes[0].keys():
-            yield f"episode {number} has other metrics than the first one"
+        # an episode that ended early lacks what it did not come to, as a robot that fell at once
+        # has no step behind it
+        lacks = names - record.keys()
+        if lacks and not record.get("termination"):
+            yield f"episode {number} lacks {quote(min(lacks))}, which others have"
 
 
 def _problems_of_arrays(evaluation: Evaluation) -> Iterator[str]:

@@ -30,7 +30,7 @@ from train.runs.progress import say_what_is_compiled
 
 COMMANDS = (
     "identify evaluate compare train iterate export bench speed margins play view robot hardware"
-    " demo"
+    " lerobot hub demo"
 )
 """Modules of this folder, each with a class of its name: options, and `run` with a console."""
 

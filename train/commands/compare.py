@@ -84,9 +84,13 @@ class CompareConfig(CodeNamingModel):
     name: str = Field(pattern=r"^[\w.-]*\w$", max_length=100)
     """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
+    """Environment: testbed, walker, robot, hardware, ROBOT.yaml, or FILE.py:ROBOT."""
     references: Entries[GivenReference]
-    """Motions, see `Condition.reference`; default the environment's."""
+    """Motions: names, step periods, durations, or mappings with further arguments of the
+    environment; default the environment's.
+    """
     scenarios: Annotated[Entries[Title], Once] = ["nominal"]
+    """Scenarios by name."""
     policies: Entries[PolicySpec] = _USUAL_POLICIES
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: NumEpisodes = 1

@@ -19,8 +19,8 @@ from train.commands.options import StiffnessOrFile, option_name
 from train.export.c_arm import c_example, c_header
 from train.export.c_text import prefix_of, require_prefix
 
-_OF_WALKER = "input_output"
-"""The only policy of a walker that is there in C."""
+_OF_WALKER = ("input_output", "adaptive_posture")
+"""Policies of a walker that are there in C."""
 _OF_ARMS = ["joints", "order", "position_gain", "limit_rad", "ramp_s", "period_s", "friction"]
 
 
@@ -68,12 +68,12 @@ class C(Output):
 
     Example, of a residual: elastic export c residual:testbed/seed_0 -o net.h
 
-    Example, of the walker's policy input_output: elastic export c input_output -o walker.h
+    Example, of a policy of the walker: elastic export c adaptive_posture -o walker.h
     """
 
     model: Annotated[Locator, tyro.conf.Positional]
     """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, residual:PATH, or
-    input_output, a policy of the walker.
+    input_output or adaptive_posture, policies of the walker.
     """
     joints: StiffnessOrFile = None
     """YAML file of the elastic joints of an arm (elastic identify --robot writes one), or one K of
@@ -111,7 +111,7 @@ class C(Output):
         if self.model.startswith(RESIDUAL):
             export = self._residual
             name = _short_name(self.model)
-        elif self.model == _OF_WALKER:
+        elif self.model in _OF_WALKER:
             export = self._walker
             name = "walker"
         self._refuse(["env"] if export == self._arm else _OF_ARMS)

@@ -8,7 +8,7 @@ import os
 import pstats
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -34,6 +34,10 @@ class Speed(Model):
 
     Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024
         --no-others --no-ppo
+
+    With --backend warp the physics of the vector environment runs on a GPU, still against raw
+    mj_step on the CPU. Example: elastic speed --backend warp --num-envs 4096 16384
+        --policy input_output --no-others --no-ppo
 
     With --real-time one policy is timed alone, as on a robot: it is called with recorded
     observations, once in every control period. Printed are late cycles and latencies. Example:
@@ -61,6 +65,11 @@ class Speed(Model):
     """Rounds; medians are reported."""
     threads: int = quantity("1", 0, ge=0, le=1024)
     """Threads of both contenders, 0 for all cores."""
+    backend: Literal["mujoco", "warp"] = "mujoco"
+    """Physics of the vector environment: "mujoco" on the CPU, or "warp" on a GPU, of the extra
+    `gpu`."""
+    device: str | None = None
+    """Device of --backend warp; default cuda:0."""
     real_time: bool = False
     """Time a policy alone against the clock, in place of all that; reads env, policy, seconds
     and output alone.
@@ -81,6 +90,12 @@ class Speed(Model):
     def looped_policy(self) -> str:
         """The policy in the loop: the named one, or the environment's best that needs no truth."""
         return self.policy or environment(self.env).looped_policy
+
+    def vector_loop(self, num_envs: int, policy: str | None, residual: bool) -> loops.VectorLoop:
+        """The vector environment with a policy, and perhaps a network, in its loop."""
+        threads = min(self.threads_used, num_envs)
+        where = {"backend": self.backend, "device": self.device}
+        return loops.VectorLoop(self.env, num_envs, threads, policy, residual, **where)
 
     def run(self, console: Console) -> None:
         """Measure, print, and write what was measured."""
@@ -123,7 +138,7 @@ def measure_throughput(config: Speed, console: Console) -> Path:
     if config.others or config.ppo:
         # what is missing is said before the work
         importlib.import_module("stable_baselines3")
-    loops.VectorLoop(config.env, 1, 1, config.policy)
+    config.vector_loop(1, config.policy, residual=False)
     unused = {"output", "profile", "real_time", "seconds"}
     recorded = config.model_dump(mode="json", exclude=unused)
     with run_folder("speed", recorded, None, config.output) as folder:
@@ -198,9 +213,9 @@ def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
     against: list[int] = []
     for n in config.num_envs:
         threads = min(config.threads_used, n)
-        loop = loops.VectorLoop(env, n, threads)
-        with_policy = loops.VectorLoop(env, n, threads, policy)
-        with_network = loops.VectorLoop(env, n, threads, policy, residual=True)
+        loop = config.vector_loop(n, None, residual=False)
+        with_policy = config.vector_loop(n, policy, residual=False)
+        with_network = config.vector_loop(n, policy, residual=True)
         against += [len(contenders) + 1] * 4
         contenders += [loop, loops.RawWorlds(loop, threads), with_policy, with_network]
     if config.others:
@@ -220,9 +235,7 @@ def _contenders(config: Speed) -> tuple[list[loops.Contender], list[int]]:
 
 def profile(config: Speed) -> str:
     """Profile of the vector environment with its policy, as text."""
-    n = config.num_envs[0]
-    threads = min(config.threads_used, n)
-    loop = loops.VectorLoop(config.env, n, threads, config.looped_policy)
+    loop = config.vector_loop(config.num_envs[0], config.looped_policy, residual=False)
     loop.run(config.steps)
     profiler = cProfile.Profile()
     profiler.runcall(loop.run, config.steps * config.rounds)

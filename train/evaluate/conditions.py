@@ -97,6 +97,7 @@ class PolicySpec(Model):
     """A policy of a comparison: a baseline, or "FILE.py:function" for one's own, with options."""
 
     name: Locator
+    """A baseline, residual:PATH, iterative:PATH, FILE.py:function or module:function."""
     label: Locator | None = None
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}

@@ -87,7 +87,7 @@ which of them it takes.
 """
 
 UNPLACED = (
-    *("num_envs", "num_threads", "autoreset_mode", "render_mode"),
+    *("num_envs", "num_threads", "autoreset_mode", "render_mode", "backend", "device"),
     *("id", "vectorization_mode", "vector_kwargs", "wrappers", "self"),
 )
 """Arguments of the environments, and of the functions that make them, that have no place in a

@@ -1,6 +1,9 @@
-"""The policy `input_output` of a walker as a header in C99, its test vector, and an example.
+"""Policies `input_output` and `adaptive_posture` of a walker as headers in C99.
 
-The plan stays outside: a planner hands the header a row of it in every control step.
+Each has its test vector and an example.
+
+The plan stays outside: a planner hands the header a row of it in every control step. Without joint
+torque sensors, `adaptive_posture` estimates from rolls alone: pitches are left out here.
 """
 
 from collections.abc import Iterator
@@ -10,10 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import elastic_env
+from baselines.adaptation.estimators import ASSUMED_LOADS, LegEstimator
+from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensators import Compensated, GravityCompensator
 from baselines.compensation.contact_torque import ContactGravity
 from baselines.compensation.policy import NO_INPUTS
+from baselines.estimation.bending import (
+    DISAGREEMENT_RAD,
+    LOADED_SHARE,
+    MODEL_ERROR,
+    OFFSET_RAD,
+)
 from baselines.walking.controller import WalkingController
+from baselines.walking.posture import PostureFeedback
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import WalkerModel
@@ -23,13 +35,16 @@ _TEST_STEPS = 12
 _NOISE_RAD = 0.02
 _NOISE_N = 30.0
 _NOISE_M = 0.01
-"""Spread of encoders, attitude, forces and ZMP of the test vector about the plan."""
+"""Spread of encoders, attitude, forces, moments [N·m], rates [rad/s] and ZMP of the test vector
+about the plan."""
 _OF_CONTROLLER = (
     *("thigh", "shank", "weight", "weight_of_feet", "omega"),
     *("velocity_share", "zmp_share", "weight_share"),
     *("force_difference", "force_difference_decay_s", "force_difference_limit_m"),
     *("dcm", "zmp_limit_m", "friction_rate_rad_s"),
 )
+_OF_POSTURE = ("proportional", "integral", "derivative", "leak_s", "trim", "integral_limit")
+_SHARES_OF_POSTURE = ("filter_share", "swing_share")
 
 
 class PlayedSteps(NamedTuple):
@@ -40,26 +55,31 @@ class PlayedSteps(NamedTuple):
         plan: Fields of the struct `plan`, in order.
         offset: What Python commands, in single precision, (T, 12) [rad].
         links: Link angles that its controller sees, (T, 12) [rad].
+        memory: That of the policy after the last step.
     """
 
     shown: list[Array]
     plan: list[Array]
     offset: Array
     links: Array
+    memory: Any
 
 
 def c_walker(policy: Any, prefix: str) -> str:
-    """The header of a policy `input_output`, with a test vector behind the macro <PREFIX>_TEST.
+    """The header of a policy, with a test vector behind the macro <PREFIX>_TEST.
 
     Args:
-        policy: Of `baselines.make("input_output", env)`.
+        policy: Of `baselines.make("input_output", env)`, or of `adaptive_posture`.
         prefix: Of all names in the header.
 
     Raises:
         ConfigurationError: Another policy, or the prefix is none.
     """
-    model = _require_input_output(policy)
-    tables = _tables(policy, model)
+    layers = _layers(policy)
+    model = layers.model
+    tables = _tables(layers.compensated, model)
+    of_layers = {} if layers.posture is None else _tables_of_layers(layers)
+    tables |= of_layers
     digest = sha256("\n".join(tables.values()).encode()).hexdigest()
     version = elastic_env.__version__
     names = model.joint_names
@@ -71,6 +91,9 @@ def c_walker(policy: Any, prefix: str) -> str:
         "walker.h.in",
         prefix,
         **tables,
+        policy="adaptive_posture" if of_layers else "input_output",
+        is_adaptive=str(int(bool(of_layers))),
+        adaptive=fill("walker_adaptive.h.in", prefix, **tables) if of_layers else "",
         vectors=fill("common_vectors.h.in", prefix),
         version=version,
         digest=digest,
@@ -102,30 +125,65 @@ def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
         count: Rows of the plan, evenly over the walk.
         seed: Of the sensors.
     """
-    model = _require_input_output(policy)
+    model = _layers(policy).model
     row = np.linspace(1.0, model.plan.num_steps, count).astype(np.int64)
-    rows = _observations(model, row, np.random.default_rng(seed))
+    return play_observations(policy, _observations(model, row, np.random.default_rng(seed)))
+
+
+def play_observations(policy: Any, rows: Array) -> PlayedSteps:
+    """What a policy makes of observations, from its begin.
+
+    Args:
+        policy: See `c_walker`.
+        rows: One per control step, (T, m).
+    """
+    layers = _layers(policy)
+    count = len(rows)
     offset = np.empty((count, 12))
     links = np.empty((count, 12))
     memory = policy.begin(rows[:1])
     for step in range(count):
-        action, memory = policy.act(rows[step : step + 1], memory, NO_INPUTS)
+        row = rows[step : step + 1]
+        action, memory = policy.act(row, memory, NO_INPUTS)
         offset[step] = action[0]
-        links[step] = memory.links[0]
-    return PlayedSteps(_shown(model, rows), _planned(model, row), offset, links)
+        links[step] = policy.link_angles(row, memory)[0]
+    planned = _planned(layers.model, policy.view.plan_row(rows))
+    return PlayedSteps(_shown(layers, rows), planned, offset, links, memory)
 
 
-def _require_input_output(policy: Any) -> WalkerModel:
-    """The model of a policy, which must be the paper's compensator around its controller."""
-    made = policy.compensator if isinstance(policy, Compensated) else None
-    if isinstance(made, GravityCompensator) and isinstance(policy.policy, WalkingController):
+class _Layers(NamedTuple):
+    """What a policy is made of; `input_output` has neither posture feedback nor adaptation."""
+
+    compensated: Compensated
+    model: WalkerModel
+    posture: PostureFeedback | None = None
+    adaptive: OnlineStiffness | None = None
+
+
+def _layers(policy: Any) -> _Layers:
+    """Layers of a policy around the paper's compensator around its controller."""
+    posture = policy if isinstance(policy, PostureFeedback) else None
+    adaptive: Any = None if posture is None else posture.policy
+    inner: Any = policy
+    if isinstance(adaptive, OnlineStiffness) and _is_by_feet(adaptive.estimator):
+        inner = adaptive.policy
+        if not np.array_equal(policy.ramp, getattr(inner, "ramp", ())):
+            raise ConfigurationError("in C, posture feedback and compensation have the same ramp")
+    made = inner.compensator if isinstance(inner, Compensated) else None
+    if isinstance(made, GravityCompensator) and isinstance(inner.policy, WalkingController):
         model = made.model
         assert isinstance(model, WalkerModel)  # as its controller needs one
         if made.output == "taylor" and made.gravity.chains is model.biped.chains:
-            return model
+            return _Layers(inner, model, posture, adaptive)
     raise ConfigurationError(
-        "only input_output of a walker is there in C, with output: taylor and gravity: com or ankle"
+        "only input_output and adaptive_posture of a walker are there in C, with output: taylor and"
+        " gravity: com or ankle"
     )
+
+
+def _is_by_feet(estimator: Any) -> bool:
+    """Whether an estimator needs no sensors of joints."""
+    return isinstance(estimator, LegEstimator) and estimator.sensors is None
 
 
 def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
@@ -158,6 +216,47 @@ def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
         "steps": str(len(policy.ramp)),
         "ramp": numbers(policy.ramp),
     }
+
+
+def _tables_of_layers(layers: _Layers) -> dict[str, str]:
+    """What posture feedback and adaptation compute with, as text in C."""
+    adaptive: Any = layers.adaptive
+    gains: Any = layers.posture.gains[0]  # type: ignore[union-attr]
+    carried = adaptive.estimator.observer.carried
+    mass, point = _below_sensors(layers.model)
+    given = {
+        **{name: gains[name] for name in (*_OF_POSTURE, *_SHARES_OF_POSTURE)},
+        "turn_limit": gains["limit_rad"],
+        "correction_limit": adaptive.limit,
+        "correction_share": adaptive.share,
+        "error_variance": MODEL_ERROR**2,
+        "offset_variance": OFFSET_RAD**2,
+        "measured_variance": DISAGREEMENT_RAD**2,
+        "loaded_n": LOADED_SHARE * carried,
+        "carried_n": carried,
+        "assumed_loads": ASSUMED_LOADS,
+    }
+    return {
+        **{name: number(value) for name, value in given.items()},
+        "estimate_every": str(adaptive.every),
+        "foot_mass": numbers(-mass),
+        "foot_point": ", ".join(map(braced, point)),
+    }
+
+
+def _below_sensors(model: WalkerModel) -> tuple[Array, Array]:
+    """Masses below the foot sensors, (2,) [kg], and their centers from the ankles, (2, 3) [m]."""
+    mass = np.empty(2)
+    point = np.empty((2, 3))
+    biped = model.biped
+    for whole, above in zip(biped.chains.links, biped.chains_above_feet.links, strict=True):
+        foot = whole["tip"]
+        if foot >= 0:
+            mass[foot] = whole["weight"] - above["weight"]
+            moment = whole["weight_moment"] - above["weight_moment"]
+            place = moment / mass[foot] - whole["tip_place"]
+            point[foot] = whole["tip_R"].T @ place
+    return mass, point
 
 
 def _link(row: Any) -> str:
@@ -208,6 +307,8 @@ def _observations(model: WalkerModel, row: IntArray, generator: np.random.Genera
         rows[:, table.group(name)] = values
     shares = np.column_stack([1.0 - plan.share[row], plan.share[row]])
     force = model.biped.weight * shares + generator.normal(0.0, _NOISE_N, shares.shape)
+    rows[:, table.group("wrench")] = generator.normal(0.0, _NOISE_N, (len(row), 12))
+    rows[:, table.group("imu_rate")] = generator.normal(0.0, _NOISE_RAD, (len(row), 3))
     rows[:, table.columns(*_FORCES)] = force
     rows[:, table.columns("clock.time")] = plan.timing.time[row, None]
     rows[:, table.columns("clock.support")] = plan.timing.support[row, None]
@@ -217,23 +318,29 @@ def _observations(model: WalkerModel, row: IntArray, generator: np.random.Genera
 _FORCES = ("wrench.l_fz", "wrench.r_fz")
 
 
-def _shown(model: WalkerModel, rows: Array) -> list[Array]:
+def _shown(layers: _Layers, rows: Array) -> list[Array]:
     """Fields of the struct `shown` from observations."""
-    table = model.observation_table
+    table = layers.model.observation_table
     names = ("reference_angle", "reference_rate")
     sensors = [rows[:, table.group(name)] for name in ("encoder_angle", "imu_attitude")]
+    if layers.posture is None:
+        sensors.append(rows[:, table.columns(*_FORCES)])
+    else:
+        sensors.append(rows[:, table.group("imu_rate")][:, :2])
+        sensors.append(rows[:, table.group("wrench")].reshape(len(rows), 2, 6))
     reference = [rows[:, table.group(name)] for name in names]
     share = rows[:, table.group("load_share")][:, 0]
     support: Any = rows[:, table.columns("clock.support")][:, 0].astype(np.int64)
     zmp = rows[:, table.group("zmp_reference")]
-    return [*sensors, rows[:, table.columns(*_FORCES)], *reference, share, zmp, support]
+    return [*sensors, *reference, share, zmp, support]
 
 
 def _planned(model: WalkerModel, row: IntArray) -> list[Array]:
     """Fields of the struct `plan` for control periods that end at rows of the plan."""
     plan = model.plan
     local = plan.local
-    before = row - 1
+    before = np.clip(row - 1, 0, plan.num_steps)
+    row = np.minimum(before + 1, plan.num_steps)
     now = [plan.share[before], local.com[before], local.com_dot[before]]
     feet = [local.ankles[before][..., :2], local.foot_yaw[before]]
     return [*now, *feet, plan.ankles[row][..., :2], plan.foot_yaw[row]]

@@ -45,7 +45,9 @@ class TrainConfig(CodeNamingModel):
     """A training: worlds, base policy, algorithm, and how long."""
 
     name: Title = "train"
+    """Name of the result folder under runs/."""
     env: str = "walker"
+    """Environment, as in a comparison."""
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: Entries[Title] = ["nominal"]

@@ -28,6 +28,7 @@ _EXTRAS = {
     "cluster": ("dask", "distributed", "submitit"),
     "hardware": ("dynamixel_sdk", "serial", "mscl"),
     "robots": ("example_robot_data",),
+    "hub": ("huggingface_hub",),
 }
 _CURES = {
     errno.ENOSPC: "free some space; a run goes on with --resume",

@@ -79,7 +79,16 @@ class _OurLoop(Contender):
 
 
 class VectorLoop(_OurLoop):
-    """Our vector environment, with zero offsets or a policy in its loop."""
+    """Our vector environment, with zero offsets or a policy in its loop.
+
+    Args:
+        env: Environment.
+        num_envs: Worlds.
+        threads: Of the physics on the CPU.
+        policy: In the loop; None for zero offsets.
+        residual: Whether an untrained network corrects the policy.
+        **backend: Arguments `backend` and `device` of the environment.
+    """
 
     def __init__(
         self,
@@ -88,13 +97,15 @@ class VectorLoop(_OurLoop):
         threads: int,
         policy: str | None = None,
         residual: bool = False,
+        **backend: Any,
     ) -> None:
+        on_warp = " on warp" if backend.get("backend") == "warp" else ""
         with_policy = "" if policy is None else f" with {policy}"
         with_network = " and residual network" if residual else ""
-        self.title = f"vector env{with_policy}{with_network}"
+        self.title = f"vector env{on_warp}{with_policy}{with_network}"
         self.num_envs = num_envs
         self._condition = _condition(env, policy)
-        super().__init__(make_vector_env(self._condition, num_envs, threads))
+        super().__init__(make_vector_env(self._condition, num_envs, threads, **backend))
         spec = self._condition.policy
         self._policy = None if policy is None else make_policy(spec, self.env)
         if residual:

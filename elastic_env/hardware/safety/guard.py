@@ -218,7 +218,7 @@ def explain_heat(which: str, hottest: Array) -> str:
         which: Their names with their temperatures [°C].
         hottest: Temperature that each may have, (n,) [°C].
     """
-    allowed = ", ".join(f"{degrees:g}" for degrees in np.atleast_1d(hottest))
+    allowed = ", ".join(dict.fromkeys(f"{degrees:g}" for degrees in np.atleast_1d(hottest)))
     return (
         f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own "
         "temperature_limit); let it cool, and look for what it has to hold or what blocks it"

@@ -20,7 +20,7 @@ from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
 from elastic_env.robots.thormang import model as thormang
 from elastic_env.robots.thormang.model import DRAWN_LOAD, LEG_JOINTS, Thormang
-from elastic_env.robots.thormang.standing import Equilibrium, settle
+from elastic_env.robots.thormang.standing import Equilibrium, equilibrium
 from elastic_env.world.drawn_robot import set_joints, spring_ids, stiffest_plant
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.world.joint_config import TaskConfig
@@ -189,7 +189,7 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel,
     model = drawn_model(config, robot)
     q = plan.q[0] - np.array(robot.homing_rad)
     try:
-        return model, settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+        return model, equilibrium(model, LEG_JOINTS, plan.pelvis[0], q, q)
     except ElasticError as error:
         if config.scenario.has_one_robot:
             raise

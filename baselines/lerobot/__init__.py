@@ -1,0 +1,18 @@
+"""Arms that LeRobot commands: its units and calibration, its processor steps, its recordings.
+
+`baselines.lerobot.steps` needs the package lerobot, and registers its steps when it is imported.
+The other modules need neither it nor torch.
+"""
+
+from baselines.lerobot.arm import LeRobotArm
+from baselines.lerobot.settings import ArmSettings, JointPlace, MotorCalibration, read_calibration
+from baselines.lerobot.units import JointUnits
+
+__all__ = [
+    "ArmSettings",
+    "JointPlace",
+    "JointUnits",
+    "LeRobotArm",
+    "MotorCalibration",
+    "read_calibration",
+]

@@ -1,0 +1,198 @@
+"""An arm of LeRobot with its compensator: actions and observations, in LeRobot's own units."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.compensation.position_compensator import PositionCompensator
+from baselines.lerobot.settings import GRIPPER, ArmSettings, JointPlace, Motor
+from baselines.lerobot.units import units_of
+from elastic_env.core.config import read_mapping
+from elastic_env.core.errors import ActionError, ConfigurationError, choices_listed, quote
+from elastic_env.core.signals import Array
+from elastic_env.joint.joint_settings import HELD, RIGID, key_of
+from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.supported_models import hinges_of
+
+_FAR_RAD = 0.35
+"""Distance from which the middle of a calibrated range is not that of the model's range."""
+_TURN_RAD = 6.0
+"""Width from which a calibrated range is a whole turn, and not that of the joint."""
+_BEYOND = 1.3
+"""Share of LeRobot's range beyond which a value has another unit."""
+
+
+class LeRobotArm:
+    """Compensates what LeRobot sends to an arm, and corrects what it reads.
+
+    Motors that move no joint of the model keep their values, and so do the gripper, unless a place
+    says which joint it moves, and the motors of joints that are held.
+
+    Attributes:
+        settings: With the content of the files of joints and calibration in place of their names.
+        compensator: In rad, for the joints of `motors`.
+        motors: Names of the motors that are compensated, (n,).
+        units: LeRobot's values and angles of these.
+
+    Args:
+        settings: The arm.
+
+    Raises:
+        ConfigurationError: A file, a name or a value cannot be used.
+
+    Warns:
+        UserWarning: The calibrated range of a motor is far from the middle of its joint's range; or
+            as `PositionCompensator` says.
+    """
+
+    def __init__(self, settings: ArmSettings) -> None:
+        calibration = settings.content_of_calibration
+        joints = settings.joints
+        content = read_mapping(Path(joints)) if isinstance(joints, str) else joints
+        self.settings = settings.replace(calibration=calibration, joints=_without_infinity(content))
+        model = compiled_model(settings.model)
+        moved = _moved(settings, hinges_of(model), content)
+        self.motors = tuple(motor.name for motor, _ in moved)
+        places = [place for _, place in moved]
+        self.units = units_of([motor for motor, _ in moved], places, calibration)
+        self.compensator = PositionCompensator(
+            model,
+            content,
+            joints=[str(place.joint) for place in places],
+            position_gain=settings.position_gain,
+            limit_rad=settings.limit_rad,
+            ramp_s=settings.ramp_s,
+            period_s=settings.period_s,
+            friction=settings.friction,
+        )
+        self._keys = [f"{name}.pos" for name in self.motors]
+        self._has_said_range = False
+        self._warn_of_zeros(places)
+
+    def reset(self) -> None:
+        """Begin anew: the ramp starts at zero."""
+        self.compensator.reset()
+
+    def command(self, action: Mapping[str, Any]) -> dict[str, Any]:
+        """Action that brings the links to where an action wants them.
+
+        Args:
+            action: Values by names such as elbow_flex.pos; others are handed on.
+
+        Returns:
+            The same with compensated values, within LeRobot's ranges.
+
+        Raises:
+            ActionError: A value is missing, or no finite number; nothing changes.
+        """
+        wanted = self._values("action", action)
+        found = self.units.value(self.compensator.command(self.units.angle(wanted)))
+        within = np.clip(found, self.units.lowest, self.units.highest)
+        return {**action, **dict(zip(self._keys, within.tolist(), strict=True))}
+
+    def link_angles(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Observation with the angles of the links in the place of those of the encoders, at rest.
+
+        Arguments, result and errors are as of `command`.
+
+        Raises:
+            ElasticError: The load overcomes a spring.
+        """
+        shown = self._values("observation", observation)
+        found = self.units.value(self.compensator.link_angle(self.units.angle(shown)))
+        return {**observation, **dict(zip(self._keys, found.tolist(), strict=True))}
+
+    def _values(self, what: str, given: Mapping[str, Any]) -> Array:
+        """Values of the motors, (n,)."""
+        missing = [key for key in self._keys if key not in given]
+        if missing:
+            raise ActionError(
+                f"the {what} lacks {missing[0]!r}: put this step where LeRobot has the positions of"
+                f" motors, it has {quote(list(given))}"
+            )
+        try:
+            values = np.array([float(given[key]) for key in self._keys])
+        except (TypeError, ValueError):
+            raise ActionError(
+                f"the {what} must hold numbers at {', '.join(self._keys)}, got"
+                f" {quote([given[key] for key in self._keys])}"
+            ) from None
+        if not self._has_said_range:
+            self._warn_of_range(values)
+        return values
+
+    def _warn_of_range(self, values: Array) -> None:
+        """Say once that a value is so far beyond LeRobot's range that it has another unit."""
+        middle = self.units.centre
+        beyond = np.abs(values - middle) > _BEYOND * (self.units.highest - middle)
+        if beyond.any():
+            self._has_said_range = True
+            worst = int(np.argmax(beyond))
+            ends = f"{self.units.lowest[worst]:.4g} to {self.units.highest[worst]:.4g}"
+            _warn(
+                f"{self._keys[worst]} is {values[worst]:.4g}, and LeRobot's range is {ends}: does"
+                " use_degrees say what the robot's configuration says?"
+            )
+
+    def _warn_of_zeros(self, places: Sequence[JointPlace]) -> None:
+        """Warn of calibrated ranges that do not lie over the model's."""
+        lower, upper = self.units.ends
+        known = self.compensator.constants
+        middle = 0.5 * (known.lowest + known.highest)
+        off = 0.5 * (lower + upper) - middle
+        is_turn = ~(upper - lower < _TURN_RAD)
+        for joint in np.flatnonzero(np.isfinite(off) & ~is_turn & (np.abs(off) > _FAR_RAD)):
+            place = places[int(joint)]
+            _warn(
+                f"LeRobot's zero of {self.motors[joint]} is the middle of the calibrated range, and"
+                f" the model's range has its middle at {middle[joint]:.3g} rad: is zero_rad"
+                f" {-place.direction * middle[joint]:.3g} in the place of {place.zero_rad:.3g}?"
+            )
+
+
+def _moved(
+    settings: ArmSettings, hinges: Sequence[str], content: Any
+) -> list[tuple[Motor, JointPlace]]:
+    """Motors that are compensated, with the joints that they move."""
+    found: list[tuple[Motor, JointPlace]] = []
+    for motor in settings.motors:
+        default = None if motor.name == GRIPPER else JointPlace()
+        place = settings.places.get(motor.name, default)
+        if place is None:
+            continue
+        joint = place.joint or motor.name
+        if joint not in hinges:
+            raise ConfigurationError(
+                f"the model has no joint {joint!r} for the motor {motor.name!r}; name it by"
+                f" places={{{motor.name!r}: {{'joint': NAME}}}}, or give None for a motor that"
+                f" keeps its goal; {choices_listed(joint, hinges)}"
+            )
+        if not _is_held(content, joint):
+            found.append((motor, place.replace(joint=joint)))
+    names = [place.joint for _, place in found]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"two motors move the joint {twice[0]!r}; correct `places`")
+    if not found:
+        raise ConfigurationError("no motor is left to compensate; correct `places` or `joints`")
+    return found
+
+
+def _is_held(content: Any, joint: str) -> bool:
+    if not isinstance(content, Mapping):
+        return False
+    key = key_of(content, joint)
+    return key is not None and content[key] == HELD
+
+
+def _without_infinity(content: Any) -> Any:
+    """Content of a file of joints for JSON, which knows no infinite number."""
+    if isinstance(content, Mapping):
+        return {str(key): _without_infinity(value) for key, value in content.items()}
+    return RIGID if content == np.inf else content
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, stacklevel=3)

@@ -1,0 +1,219 @@
+"""LeRobot's data sets as logs in time of single joints, which `elastic identify --log` reads.
+
+A data set is a folder: `meta/info.json` names the columns, and `data/**/*.parquet` has the rows, an
+episode a file (v2.1) or several (v3.0). Pictures are not read.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.identification.servo_file import read_episodes
+from baselines.identification.servo_log import ServoLog
+from baselines.lerobot.arm import LeRobotArm
+from elastic_env.core.errors import ConfigurationError, list_names, shorten
+from elastic_env.core.files import read_bounded
+from elastic_env.core.json_text import parse_json
+from elastic_env.core.signals import Array
+
+_MOST_BYTES = 200_000_000
+"""Of a file of rows; LeRobot begins another one at 100 MB."""
+_OLD_PREFIX = "main_"
+"""Before the motors' names in data sets of 2024."""
+_KINDS = {"so_follower": "so101_follower"}
+"""Names of data sets for robots with the same motors."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode in LeRobot's own values.
+
+    Attributes:
+        episode: Its number.
+        motors: Names of the motors that have a goal and a position, (n,).
+        time: Since its begin, (N,) [s].
+        goal: Of these motors, (N, n).
+        position: Likewise.
+    """
+
+    episode: int
+    motors: tuple[str, ...]
+    time: Array
+    goal: Array
+    position: Array
+
+
+@dataclass(frozen=True)
+class JointLog:
+    """A log in time of one joint.
+
+    Attributes:
+        joint: Name in the model.
+        episode: Number of the episode.
+        time: Clock, (N,) [s].
+        goal: Commanded angle of the joint, (N,) [rad].
+        position: Measured one.
+        tau_known: Torque of weight and of the other joints' motion, positive where it turns the
+            joint forward, (N,) [N·m].
+    """
+
+    joint: str
+    episode: int
+    time: Array
+    goal: Array
+    position: Array
+    tau_known: Array
+
+
+def robot_of(folder: Path) -> str:
+    """Type of the robot that a data set names.
+
+    Raises:
+        ConfigurationError: The folder is no data set, or names none.
+    """
+    found = _info(folder).get("robot_type")
+    if not isinstance(found, str) or not found:
+        raise ConfigurationError(f"{shorten(folder)} names no robot; say it by --robot")
+    name = found if found.endswith("_follower") else f"{found}_follower"
+    return _KINDS.get(name, name)
+
+
+def read_recordings(folder: Path, episodes: Sequence[int] = ()) -> list[Recording]:
+    """Episodes of a data set.
+
+    Args:
+        folder: Of the data set.
+        episodes: Their numbers; empty for all.
+
+    Raises:
+        ConfigurationError: The folder is no data set, or an episode is not in it.
+    """
+    info = _info(folder)
+    goals = _motors(folder, info, "action")
+    positions = _motors(folder, info, "observation.state")
+    motors = tuple(name for name in goals if name in positions)
+    if not motors:
+        raise ConfigurationError(
+            f"{shorten(folder)} has no motor with an action and a position; its actions are"
+            f" {list_names(goals)}"
+        )
+    files = sorted((folder / "data").rglob("*.parquet"))
+    parts = (part for file in files for part in _episodes(file, motors, goals, positions, episodes))
+    found = sorted(parts, key=lambda one: one.episode)
+    known = {one.episode for one in found}
+    missing = [f"episode {episode}" for episode in episodes if episode not in known]
+    if missing or not found:
+        which = missing[0] if missing else "episodes"
+        raise ConfigurationError(f"{shorten(folder)} has no {which} in its folder data")
+    return found
+
+
+def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
+    """Logs of the joints of an arm, in rad, with the torque that its model knows.
+
+    Args:
+        recording: An episode.
+        arm: Units and model; the stiffness of its joints has no effect.
+
+    Raises:
+        ConfigurationError: The episode lacks a motor of the arm.
+    """
+    if missing := [name for name in arm.motors if name not in recording.motors]:
+        raise ConfigurationError(
+            f"episode {recording.episode} has no motor {missing[0]!r}; it has"
+            f" {list_names(recording.motors)}"
+        )
+    at = [recording.motors.index(name) for name in arm.motors]
+    goal = arm.units.angle(recording.goal[:, at])
+    position = arm.units.angle(recording.position[:, at])
+    rates = [
+        ServoLog("", recording.time, *both, np.ones(len(recording.time), bool)).derivatives()
+        for both in zip(goal.T, position.T, strict=True)
+    ]
+    q_dot, q_ddot = np.moveaxis(np.array(rates), 0, -1)
+    body = arm.compensator.constants.body
+    logs: list[JointLog] = []
+    for joint, name in enumerate(arm.compensator.joints):
+        of_others = q_ddot.copy()
+        of_others[:, joint] = 0.0  # its own inertia is sought
+        torque = body.inverse_dynamics(position, q_dot, of_others)[:, joint]
+        logs.append(
+            JointLog(
+                joint=name,
+                episode=recording.episode,
+                time=recording.time,
+                goal=goal[:, joint],
+                position=position[:, joint],
+                tau_known=-torque,
+            )
+        )
+    return logs
+
+
+def log_text(log: JointLog) -> str:
+    """A log as the CSV file that `elastic identify --log` reads."""
+    rows = np.column_stack([log.time, log.goal, log.position, log.tau_known])
+    lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
+    return "\n".join(["time [s],goal [rad],position [rad],tau_known [N·m]", *lines, ""])
+
+
+def _info(folder: Path) -> Mapping[str, Any]:
+    """Content of meta/info.json."""
+    path = folder / "meta" / "info.json"
+    try:
+        content = parse_json(read_bounded(path, _MOST_BYTES).decode("utf-8"))
+    except OSError as error:
+        raise ConfigurationError(
+            f"{shorten(folder)} is no data set of LeRobot, which has meta/info.json and data/"
+            f" ({error.strerror})"
+        ) from None
+    except ConfigurationError:
+        raise
+    except ValueError as error:
+        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+    if not isinstance(content, Mapping) or not isinstance(content.get("features"), Mapping):
+        raise ConfigurationError(f"{shorten(path)} describes no features; record the data set anew")
+    return content
+
+
+def _motors(folder: Path, info: Mapping[str, Any], key: str) -> dict[str, int]:
+    """Columns of the positions of motors within `action` or `observation.state`, by their names."""
+    feature = info["features"].get(key)
+    names = feature.get("names") if isinstance(feature, Mapping) else None
+    if isinstance(names, Mapping):  # {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigurationError(f"{shorten(folder)} does not name the motors of {key}")
+    plain = [name.removeprefix(_OLD_PREFIX).removesuffix(".pos") for name in names]
+    return {name: at for at, name in enumerate(plain) if "." not in name}
+
+
+def _episodes(
+    file: Path,
+    motors: Sequence[str],
+    goals: Mapping[str, int],
+    positions: Mapping[str, int],
+    wanted: Sequence[int],
+) -> Iterator[Recording]:
+    """Episodes of a file of rows."""
+    table = read_episodes(file, _MOST_BYTES)
+    for values, columns in ((table.goal, goals), (table.position, positions)):
+        if values.shape[1] <= max(columns.values()):
+            raise ConfigurationError(
+                f"{shorten(file)} has {values.shape[1]} columns, and meta/info.json names"
+                f" {max(columns.values()) + 1}"
+            )
+    for episode in np.unique(table.episode):
+        if wanted and episode not in wanted:
+            continue
+        rows = table.episode == episode
+        yield Recording(
+            episode=int(episode),
+            motors=tuple(motors),
+            time=table.time[rows],
+            goal=table.goal[rows][:, [goals[name] for name in motors]],
+            position=table.position[rows][:, [positions[name] for name in motors]],
+        )

@@ -1,0 +1,197 @@
+"""Settings of an arm of LeRobot: which motor moves which joint, its calibration, the model."""
+
+import csv
+import math
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
+
+from pydantic import model_validator
+
+from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.config_problems import ModelError
+from elastic_env.core.errors import ConfigurationError, require_known, shorten
+from elastic_env.core.files import read_bounded
+from elastic_env.core.json_text import parse_json
+
+Units = Literal["degrees", "range", "percent"]
+"""Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
+GRIPPER = "gripper"
+"""Motor that keeps its goal, unless a place says which joint it moves."""
+_COUNTS = 2**31
+_MOST_BYTES = 1_000_000
+
+
+class Motor(Model):
+    """A motor of an arm as LeRobot has it."""
+
+    name: Title
+    units: Units
+    counts_per_turn: int | None = None
+    """None for a motor that is read in degrees [1]."""
+
+
+class MotorCalibration(Model):
+    """What LeRobot's calibration says of a motor, in counts of its encoder."""
+
+    id: int
+    drive_mode: int = quantity("1", ge=0, le=1)
+    """1 where LeRobot turns the sign of values; these have it already [1]."""
+    homing_offset: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
+    """In the motor's own register, so that its counts have it already [1]."""
+    range_min: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
+    """Least count of the range that the user showed [1]."""
+    range_max: int = quantity("1", ge=-_COUNTS, le=_COUNTS)
+    """Largest one [1]."""
+
+    @model_validator(mode="after")
+    def _range_has_a_width(self) -> Self:
+        if self.range_min >= self.range_max:
+            raise ValueError(
+                f"range_min must be below range_max, got {self.range_min} and {self.range_max};"
+                " calibrate the arm anew"
+            )
+        return self
+
+
+class JointPlace(Model):
+    """The joint of the model that a motor moves."""
+
+    joint: Title | None = None
+    """Its name; default that of the motor."""
+    direction: Literal[1, -1] = 1
+    """1 where LeRobot's value grows with the joint's angle, -1 where it falls."""
+    zero_rad: float = quantity("rad", 0.0, ge=-2.0 * math.pi, le=2.0 * math.pi)
+    """LeRobot's angle where the model's joint is at zero, from the middle of the calibrated range
+    [rad].
+    """
+
+
+class ArmSettings(Model):
+    """An arm of LeRobot and its compensator: the configuration of a processor step, as JSON."""
+
+    robot: Title = "so101_follower"
+    """Type of the robot, as LeRobot names it."""
+    model: str
+    """Model of the arm: a file of MJCF or URDF, or the text of one."""
+    joints: str | float | dict[str, Any]
+    """YAML file of its joints, as `elastic identify` writes it, its content, or one K of all
+    [N·m/rad].
+    """
+    calibration: str | dict[str, MotorCalibration] = {}
+    """JSON file that LeRobot wrote for this arm, or its content; none for motors in degrees."""
+    use_degrees: bool | None = None
+    """As in LeRobot's configuration of the robot; default its own default."""
+    places: dict[Title, JointPlace | None] = {}
+    """What motors move, where it is not the joint of their name; None for one that keeps its
+    goal.
+    """
+    position_gain: float | dict[str, float] | None = None
+    """k_p of servos that give way under a load; default what `joints` says [N·m/rad]."""
+    limit_rad: float = quantity("rad", 0.2, gt=0)
+    """Largest offset between command and desired angle [rad]."""
+    ramp_s: float = quantity("s", 1.0, ge=0)
+    """Time in which offsets grow from zero after the start [s]."""
+    period_s: float = quantity("s", 1.0 / 30.0, gt=0)
+    """Time between two actions [s]."""
+    friction: bool | None = None
+    """Whether dry friction is compensated; default where any of it grows with the load."""
+
+    @model_validator(mode="after")
+    def _places_are_of_its_motors(self) -> Self:
+        require_known("motor", self.places, [motor.name for motor in self.motors])
+        return self
+
+    @property
+    def motors(self) -> tuple[Motor, ...]:
+        """Motors of the robot, with the units that it uses."""
+        return motors_of(self.robot, self.use_degrees)
+
+    @property
+    def content_of_calibration(self) -> dict[str, MotorCalibration]:
+        """The calibration, from its file or as it was given."""
+        given = self.calibration
+        return read_calibration(Path(given)) if isinstance(given, str) else given
+
+
+@cache
+def _known_motors() -> dict[str, tuple[Motor, ...]]:
+    """Motors of the robots of motors.csv, by the robot's type."""
+    text = resources.files("baselines.lerobot").joinpath("motors.csv").read_text(encoding="utf-8")
+    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    found: dict[str, tuple[Motor, ...]] = {}
+    for row in rows:
+        counts = row["counts_per_turn"]
+        motor = Motor(
+            name=row["motor"],
+            units=_units(row["units"]),
+            counts_per_turn=int(counts) if counts else None,
+        )
+        found[row["robot"]] = (*found.get(row["robot"], ()), motor)
+    return found
+
+
+def _units(name: str) -> Units:
+    return next(units for units in get_args(Units) if units == name)
+
+
+def robot_types() -> list[str]:
+    """Types of robots that are known, as LeRobot names them."""
+    return list(_known_motors())
+
+
+def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
+    """Motors of a robot in LeRobot's order.
+
+    Args:
+        robot: Its type, such as so101_follower.
+        use_degrees: As in LeRobot's configuration of the robot; None for its default.
+
+    Raises:
+        ConfigurationError: The type is not known, or its motors know degrees alone.
+    """
+    known = _known_motors()
+    require_known("robot of LeRobot", [robot], known)
+    motors = known[robot]
+    if use_degrees is None:
+        return motors
+    if not use_degrees and any(motor.counts_per_turn is None for motor in motors):
+        raise ConfigurationError(
+            f"the motors of {robot} are in degrees always; leave use_degrees out"
+        )
+    units: Units = "degrees" if use_degrees else "range"
+    return tuple(
+        motor.replace(units=motor.units if motor.units == "percent" else units) for motor in motors
+    )
+
+
+class _Calibration(Model):
+    """Motors by their names."""
+
+    motors: dict[Title, MotorCalibration]
+
+
+def read_calibration(path: Path) -> dict[str, MotorCalibration]:
+    """Calibration of an arm, the JSON file that LeRobot writes.
+
+    Raises:
+        ConfigurationError: It cannot be read, or is no calibration.
+    """
+    try:
+        content = parse_json(read_bounded(path, _MOST_BYTES).decode("utf-8"))
+    except OSError as error:
+        raise ConfigurationError(
+            f"no calibration at {shorten(path)} ({error.strerror}); LeRobot writes it to"
+            " calibration/robots/TYPE/ID.json in its folder of the cache"
+        ) from None
+    except ConfigurationError:
+        raise
+    except ValueError as error:
+        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+    try:
+        return _Calibration(motors=content).motors
+    except ModelError as error:
+        raise ConfigurationError(
+            f"{shorten(path)} is no calibration of LeRobot: {error.describe()}"
+        ) from None

@@ -1,0 +1,86 @@
+"""Processor steps of LeRobot, registered by importing this module; it needs the package lerobot.
+
+`elastic_env_compensate_action` belongs at the end of the pipeline before `send_action`, and
+`elastic_env_correct_observation` at the begin of the one after `get_observation`.
+"""
+
+from typing import Any
+
+try:
+    from lerobot.configs.types import (  # pyright: ignore[reportMissingImports]
+        PipelineFeatureType,
+        PolicyFeature,
+    )
+    from lerobot.processor import (  # pyright: ignore[reportMissingImports]
+        ObservationProcessorStep,
+        ProcessorStepRegistry,
+        RobotAction,
+        RobotActionProcessorStep,
+        RobotObservation,
+    )
+except ImportError as error:
+    from elastic_env.core.errors import missing_extra
+
+    raise missing_extra("lerobot", "lerobot", "a processor step of LeRobot") from error
+
+from baselines.lerobot.arm import LeRobotArm
+from baselines.lerobot.settings import ArmSettings
+
+Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
+
+
+@ProcessorStepRegistry.register("elastic_env_compensate_action")
+class CompensateActionStep(RobotActionProcessorStep):
+    """Leads the positions of an action by what springs and servos give way.
+
+    Args:
+        **settings: As of `ArmSettings`.
+
+    Attributes:
+        arm: Units and compensator; `arm.compensator.set_payload` takes a payload.
+
+    Raises:
+        ConfigurationError: A setting cannot be used.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self.arm = LeRobotArm(ArmSettings(**settings))
+
+    def action(self, action: RobotAction) -> RobotAction:
+        """Action with compensated positions."""
+        return self.arm.command(action)
+
+    def get_config(self) -> dict[str, Any]:
+        """Settings as JSON, with the content of files in the place of their names."""
+        return self.arm.settings.model_dump(mode="json")
+
+    def reset(self) -> None:
+        """Begin anew: the ramp starts at zero."""
+        self.arm.reset()
+
+    def transform_features(self, features: Features) -> Features:
+        """The same features."""
+        return features
+
+
+@ProcessorStepRegistry.register("elastic_env_correct_observation")
+class CorrectObservationStep(ObservationProcessorStep):
+    """Puts the angles of the links in the place of those that encoders show.
+
+    Arguments, attributes and errors are as of `CompensateActionStep`.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        self.arm = LeRobotArm(ArmSettings(**settings))
+
+    def observation(self, observation: RobotObservation) -> RobotObservation:
+        """Observation with positions of the links."""
+        return self.arm.link_angles(observation)
+
+    def get_config(self) -> dict[str, Any]:
+        """Settings as JSON, with the content of files in the place of their names."""
+        return self.arm.settings.model_dump(mode="json")
+
+    def transform_features(self, features: Features) -> Features:
+        """The same features."""
+        return features

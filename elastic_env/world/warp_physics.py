@@ -1,0 +1,281 @@
+"""N worlds of one MuJoCo model on a GPU, by MuJoCo Warp.
+
+The control step stays on the CPU, and so does the state that it sees, in double precision. A step
+of the physics sends the state to the device, and reads back what was bound. The device computes in
+single precision: its worlds agree with those of `elastic_env.world.physics`, and are not the same
+bits.
+
+No other module imports MuJoCo Warp, which the extra `gpu` brings.
+"""
+
+import copy
+import dataclasses
+import warnings
+from functools import lru_cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from typing_extensions import override
+
+from elastic_env.core.errors import ConfigurationError, missing_extra, quote
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.joint.varying_friction import VaryingFriction
+from elastic_env.world.physics import Worlds
+
+try:
+    import mujoco_warp
+    import warp
+except ImportError as error:
+    raise missing_extra(str(error.name), "gpu", 'the backend "warp"') from None
+
+warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)  # no line per kernel
+
+_CONTACTS = 16
+_ROWS = 64
+"""Memory of a world for contacts, and for rows of constraints; a walker has up to 8 and 44."""
+_STATE = ("qpos", "qvel", "act", "qacc_warmstart")
+_COMMANDS = ("ctrl", "xfrc_applied", "qfrc_applied")
+"""What a step changes, and what it only needs; all other fields of `MjData` are results."""
+_READ_HERE = ("numeric_data",)
+"""Fields of `MjModel` that the device does not need."""
+_OF_A_WORLD = {
+    field.name
+    for field in dataclasses.fields(mujoco_warp.Model)
+    if getattr(field.type, "shape", ())[:1] == ("*",)
+}
+"""Fields of models that the device can have a row of for every world."""
+_BAD = 1e10
+"""MuJoCo takes a number beyond it for a bad one."""
+_FULL = int(
+    mujoco_warp.OverflowType.NEFC
+    | mujoco_warp.OverflowType.BROADPHASE
+    | mujoco_warp.OverflowType.NARROWPHASE
+)
+
+
+def for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The same plant in terms that MuJoCo Warp knows.
+
+    It refuses PID actuators. A DC motor with K = R = 1 and these gains is one: its controller adds
+    K ω to the voltage, and its back-EMF takes K ω off. Both have the integral as their only state.
+    It refuses the flag that says not to restart a diverged world, which it never does.
+
+    Raises:
+        ConfigurationError: A PID actuator has a `slewmax`.
+    """
+    plant = copy.copy(model)
+    plant.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    servos = np.flatnonzero(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_PID)
+    integral_limit, slew_limit = model.actuator_dynprm[servos, :2].T
+    if slew_limit.any():
+        raise ConfigurationError(
+            'the backend "warp" needs PID actuators with slewmax = 0, got'
+            f' {slew_limit.max():g} rad/s; choose the backend "mujoco"'
+        )
+    _, position_gain, velocity_gain = -model.actuator_biasprm[servos, :3].T
+    integral_gain = model.actuator_gainprm[servos, 0]
+    plant.actuator_dyntype[servos] = mujoco.mjtDyn.mjDYN_DCMOTOR
+    plant.actuator_gaintype[servos] = mujoco.mjtGain.mjGAIN_DCMOTOR
+    plant.actuator_biastype[servos] = mujoco.mjtBias.mjBIAS_DCMOTOR
+    plant.actuator_dynprm[servos] = 0.0
+    plant.actuator_gainprm[servos] = 0.0
+    plant.actuator_biasprm[servos] = 0.0
+    plant.actuator_dynprm[servos, 8] = integral_limit
+    plant.actuator_gainprm[servos, :2] = 1.0
+    plant.actuator_gainprm[servos, 4] = position_gain
+    plant.actuator_gainprm[servos, 5] = integral_gain
+    plant.actuator_gainprm[servos, 6] = velocity_gain
+    return plant
+
+
+class WarpWorlds(Worlds):
+    """Many worlds on a device of Warp.
+
+    An array of `vary` goes to the device once: ask for it again before every change.
+
+    Args:
+        model: Of every world.
+        num_worlds: How many.
+        device: "cuda:0", the default, another GPU, or "cpu" for tests.
+
+    Raises:
+        ConfigurationError: The device is not there, or the model has what MuJoCo Warp lacks.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_worlds: int, device: str | None = None) -> None:
+        self.model = model
+        self.num_worlds = num_worlds
+        self._device = _find_device(device or "cuda:0")
+        self._said = set()
+        self._views = {}
+        self._friction = VaryingFriction.of(model)
+        self._counts = np.zeros((num_worlds, int(mujoco.mjtWarning.mjNWARNING)), dtype=np.int64)
+        self._plant = for_warp(model)
+        self._shapes = mujoco.MjData(model)
+        self._bound: dict[str, Array] = {}
+        self._varied: dict[str, Array] = {}
+        self._unsent: set[str] = set()
+        self._graph: Any = None
+        with warp.ScopedDevice(self._device):
+            try:
+                self._model = mujoco_warp.put_model(self._plant)
+            except (NotImplementedError, ValueError) as error:
+                raise ConfigurationError(f'the backend "warp" refuses the model: {error}') from None
+            self._data = mujoco_warp.make_data(
+                self._plant, nworld=num_worlds, nconmax=_CONTACTS, njmax=_ROWS
+            )
+        self._model.opt.warn_overflow = 0  # `_watch` warns
+        self.qpos, self.qvel, self.act, _ = self.views(_STATE)
+        self.ctrl = self.bind("ctrl")
+        self.restart(np.ones(num_worlds, dtype=np.bool_))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without what is on the device, for copies and pickle."""
+        return {
+            "made": (self.model, self.num_worlds, self._device.alias),
+            "varied": self._varied,
+            "bound": self._bound,
+            "counts": self._counts,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["made"])
+        for field, values in state["varied"].items():
+            self.vary(field)[:] = values
+        for field, values in state["bound"].items():
+            self.bind(field)[:] = values
+        self._counts[:] = state["counts"]
+
+    @override
+    def bind(self, field: str) -> Array:
+        if field not in self._bound:
+            shape = getattr(self._shapes, field).shape
+            self._bound[field] = np.zeros((self.num_worlds, *shape))
+        return self._bound[field]
+
+    @override
+    def vary(self, field: str) -> Array:
+        is_sent = field not in _READ_HERE
+        if field not in self._varied:
+            if is_sent:
+                self._expand(field)
+            of_plant = getattr(self._plant, field)
+            self._varied[field] = np.repeat(of_plant[None], self.num_worlds, axis=0)
+        if is_sent:
+            self._unsent.add(field)
+        return self._varied[field]
+
+    @override
+    def take(self, world: int, model: mujoco.MjModel) -> None:
+        plant = for_warp(model)
+        for name in {*_differing(model, self.model), *self._varied}:
+            # names and sizes differ too, and the device has none
+            if name in _READ_HERE or hasattr(self._model, name):
+                self.vary(name)[world] = getattr(plant, name)
+
+    @override
+    def restart(self, worlds: BoolArray) -> None:
+        for name in self._bound.keys() & {*_STATE, *_COMMANDS}:
+            self._bound[name][worlds] = 0.0
+        self.qpos[worlds] = self.model.qpos0
+        self._counts[worlds] = 0
+
+    @override
+    def refresh(self, worlds: BoolArray) -> None:
+        if not worlds.any():
+            return
+        if self._friction is not None:
+            self._rub(self._friction)
+        self._send()
+        with warp.ScopedDevice(self._device):
+            mujoco_warp.forward(self._model, self._data)
+        for name in self._bound.keys() - {*_STATE, *_COMMANDS}:
+            self._bound[name][worlds] = self._read(name)[worlds]
+
+    @override
+    def _field(self, name: str) -> Array:
+        return self._varied[name] if name in self._varied else getattr(self.model, name)[None]
+
+    @override
+    def _step(self, num_substeps: int) -> None:
+        self._send()
+        with warp.ScopedDevice(self._device):
+            for _ in range(num_substeps):
+                self._step_once()
+        for name in self._bound.keys() - {*_COMMANDS}:
+            self._bound[name][:] = self._read(name)
+        self._watch()
+
+    def _step_once(self) -> None:
+        """A physics step: the first one compiles, later ones repeat its launches as one graph."""
+        if self._graph is not None:
+            warp.capture_launch(self._graph)
+            return
+        mujoco_warp.step(self._model, self._data)
+        with warp.ScopedCapture() as capture:
+            mujoco_warp.step(self._model, self._data)
+        self._graph = capture.graph
+
+    def _watch(self) -> None:
+        """Count bad numbers, and warn of too little memory, once."""
+        state = np.concatenate([self.qpos, self.qvel], axis=1)
+        is_good = np.abs(state) < _BAD  # nan is not
+        self._counts[:, int(mujoco.mjtWarning.mjWARN_BADQPOS)] += ~is_good.all(axis=1)
+        is_full = (self._data.overflow.numpy() & _FULL) != 0
+        if "full" not in self._said and is_full[is_good.all(axis=1)].any():
+            self._said.add("full")
+            warnings.warn(
+                f'the backend "warp" goes on, less exact: a world has more than {_CONTACTS}'
+                f' contacts or {_ROWS} rows of constraints; the backend "mujoco" has no such limit',
+                stacklevel=2,
+            )
+
+    def _expand(self, field: str) -> None:
+        """Give every world a row of a field of the model on the device."""
+        if field not in _OF_A_WORLD:
+            raise ConfigurationError(
+                f'in the backend "warp" all worlds have the same {field}; choose the backend'
+                ' "mujoco" for models that differ in it'
+            )
+        shared = getattr(self._model, field)
+        shape = (self.num_worlds, *shared.shape[1:])
+        setattr(self._model, field, warp.empty(shape, shared.dtype, device=self._device))
+        self._graph = None  # it reads the shared row
+
+    def _send(self) -> None:
+        """Bring state, commands and changed fields of models to the device."""
+        for name in self._bound.keys() & {*_STATE, *_COMMANDS}:
+            getattr(self._data, name).assign(self._bound[name].astype(np.float32))
+        for name in self._unsent:
+            getattr(self._model, name).assign(self._varied[name].astype(np.float32))
+        self._unsent.clear()
+
+    def _read(self, field: str) -> Array:
+        """A field of the device, shaped as in MuJoCo."""
+        return getattr(self._data, field).numpy().reshape(self._bound[field].shape)
+
+
+@lru_cache(maxsize=1024)
+def _differing(model: mujoco.MjModel, other: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the arrays in which two models differ."""
+    arrays = [name for name in dir(model) if isinstance(getattr(model, name), np.ndarray)]
+    return tuple(
+        name for name in arrays if not np.array_equal(getattr(model, name), getattr(other, name))
+    )
+
+
+def _find_device(name: str) -> Any:
+    """A device of Warp by its name.
+
+    Raises:
+        ConfigurationError: It is not there.
+    """
+    try:
+        return warp.get_device(name)
+    except ValueError:
+        found = " or ".join(f'device="{device.alias}"' for device in warp.get_devices())
+        raise ConfigurationError(
+            f'the backend "warp" finds no device {quote(name)}, which needs CUDA, on this computer;'
+            f' choose {found}, or for speed without a GPU the backend "mujoco"'
+        ) from None

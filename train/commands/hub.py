@@ -1,0 +1,83 @@
+"""`elastic hub`: residuals to the Hugging Face hub and back."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from pydantic import Field
+from rich.console import Console
+
+from baselines.residual.settings import RESIDUAL
+from elastic_env.core.config import Locator, Model, Title
+from train.export.hub import pull_residual, push_residual
+
+
+class Push(Model):
+    """Put a residual's folder into a repository of the hub: description, weights and a card.
+
+    Log in before by: hf auth login
+
+    Example: elastic hub push residual:testbed/seed_0 me/testbed-residual
+    """
+
+    residual: Annotated[Locator, tyro.conf.Positional]
+    """Its folder, or residual:NAME of one that comes with the package."""
+    repository: Annotated[Title, tyro.conf.Positional]
+    """OWNER/NAME; a repository that is not there is made."""
+    public: bool = False
+    """Let everybody read a new repository; default its owner alone."""
+
+    def run(self, console: Console) -> None:
+        """Push."""
+        folder = Path(self.residual.removeprefix(RESIDUAL))
+        pushed = push_residual(folder, self.repository, self.public)
+        console.print(f"wrote {pushed.url}")
+        console.print(f"elastic hub pull {self.repository} --sha256 {pushed.digest}")
+
+
+class Pull(Model):
+    """Take a residual from a repository of the hub.
+
+    Sizes and kinds of files are checked before they are fetched, and the digest of the weights
+    after. Nothing of it runs as code.
+
+    Example: elastic hub pull me/testbed-residual
+
+    Then: elastic evaluate --policy residual:hub/me/testbed-residual
+    """
+
+    repository: Annotated[Title, tyro.conf.Positional]
+    """OWNER/NAME."""
+    revision: Title = "main"
+    """Branch, tag or commit."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """Digest that the weights must have, as elastic hub push prints it."""
+    offline: bool = False
+    """Ask no server: take what was pulled before from the hub's cache."""
+    output: Path | None = None
+    """Folder for the residual, new or empty; default hub/OWNER/NAME."""
+
+    def run(self, console: Console) -> None:
+        """Pull."""
+        pulled = pull_residual(
+            self.repository,
+            revision=self.revision,
+            digest=self.sha256,
+            offline=self.offline,
+            output=self.output,
+        )
+        console.print(f"commit {pulled.commit}, of the {pulled.description.robot}")
+        console.print(f"play it as residual:{pulled.folder}")
+
+
+class Hub(Model):
+    """Share residuals on the Hugging Face hub.
+
+    push: a folder to a repository. pull: a repository to a folder.
+    """
+
+    command: Push | Pull
+
+    def run(self, console: Console) -> None:
+        """Do what was asked for."""
+        self.command.run(console)

@@ -1,0 +1,66 @@
+"""`elastic lerobot`: recordings of LeRobot as logs of joints."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from baselines.lerobot import ArmSettings, LeRobotArm
+from baselines.lerobot.recordings import joint_logs, log_text, read_recordings, robot_of
+from elastic_env.core.config import Locator, Model, Title, read_mapping
+from elastic_env.core.files import write_whole
+from train.runs.folders import run_folder
+
+
+class Lerobot(Model):
+    """Make logs of joints out of a data set of LeRobot, for elastic identify --log.
+
+    Goals and positions become angles of the model, by the arm's calibration. The model says the
+    torque of weight and motion on each joint. Writes JOINT_EPISODE.csv for each joint and episode.
+
+    Example: elastic lerobot recordings/sweep --model so101.urdf --calibration my_arm.json
+
+    Then: elastic identify --log runs/lerobot/elbow_flex_0.csv
+    """
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the data set, with meta/info.json and data/ (v2.1 or v3.0)."""
+    model: Locator
+    """File of MJCF or URDF of the arm, with its masses."""
+    calibration: Locator | None = None
+    """JSON file that LeRobot wrote for the arm; none for motors in degrees, such as OpenArm's."""
+    robot: Title | None = None
+    """Type of the robot, as LeRobot names it; default what the data set says."""
+    use_degrees: bool | None = None
+    """As in LeRobot's configuration of the robot; default its own default."""
+    places: Path | None = None
+    """YAML file that says which joint a motor moves, its direction and zero_rad, see
+    docs/lerobot.md; default the joints of the motors' names.
+    """
+    episodes: list[int] = []
+    """Numbers of episodes; default all."""
+    output: Path | None = None
+    """Folder for the logs, new or empty; default runs/lerobot, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Convert."""
+        settings = ArmSettings(
+            robot=self.robot or robot_of(self.dataset),
+            model=self.model,
+            joints={"*": "rigid"},
+            calibration=self.calibration or {},
+            use_degrees=self.use_degrees,
+            places={} if self.places is None else read_mapping(self.places),
+        )
+        arm = LeRobotArm(settings)
+        recordings = read_recordings(self.dataset, self.episodes)
+        with run_folder("lerobot", self.model_dump(mode="json"), None, self.output) as folder:
+            for recording in recordings:
+                for log in joint_logs(recording, arm):
+                    write_whole(folder / f"{log.joint}_{log.episode}.csv", log_text(log))
+            rows = sum(len(recording.time) for recording in recordings)
+            console.print(
+                f"{len(recordings)} episodes, {rows} rows, of {', '.join(arm.compensator.joints)}"
+            )
+            console.print(f"elastic identify --log {folder}/{arm.compensator.joints[0]}_*.csv")

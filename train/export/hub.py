@@ -1,0 +1,281 @@
+"""Residuals on the Hugging Face hub: two files and a card, as data alone.
+
+A repository is a model's, with `residual.json` and `weights.safetensors` at its top. What comes
+from there is untrusted: names, sizes and kinds are known before anything is fetched, nothing of it
+is run or unpickled, and the digest of the weights must be that of the description. Everything else
+in a repository is left there.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from json import JSONDecodeError
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from baselines.residual.residual_policy import (
+    DESCRIPTION,
+    WEIGHTS,
+    find_folder,
+    load_residual,
+)
+from baselines.residual.settings import ResidualDescription
+from elastic_env.core.errors import (
+    ConfigurationError,
+    SystemFailedError,
+    list_names,
+    missing_extra,
+    quote,
+    shorten,
+)
+from elastic_env.core.files import read_bounded, write_whole
+from train.runs.folders import own_folder
+
+HUB = Path("hub")
+"""Folder of residuals that were pulled, in the working folder."""
+_MOST_BYTES = {DESCRIPTION: 4_000_000, WEIGHTS: 100_000_000}
+_ENDPOINT = "HF_ENDPOINT"
+_PATIENCE_S = 10.0
+
+_CARD = """---
+library_name: elastic-env
+tags: [robotics, elastic-joints, residual]
+---
+A learned residual for the policy `{base}` of the {robot}, by [elastic-env](https://pypi.org/project/elastic-env/).
+
+    elastic hub pull {repository} --sha256 {digest}
+    elastic evaluate --policy residual:hub/{repository}
+
+The weights are in `{weights}`, described by `{description}`. Neither holds code.
+"""
+
+
+class Pushed(NamedTuple):
+    """What went to the hub.
+
+    Attributes:
+        url: Address of the commit.
+        digest: SHA-256 of the weights.
+    """
+
+    url: str
+    digest: str
+
+
+class Pulled(NamedTuple):
+    """What came from the hub.
+
+    Attributes:
+        folder: Where it is.
+        commit: Of the repository.
+        description: Of the residual.
+    """
+
+    folder: Path
+    commit: str
+    description: ResidualDescription
+
+
+def push_residual(folder: Path, repository: str, public: bool = False) -> Pushed:
+    """Put a residual into a repository of the hub, which is made if there is none.
+
+    Args:
+        folder: A residual's folder, or the name of one that comes with the package.
+        repository: OWNER/NAME.
+        public: True for a new repository that everybody may read.
+
+    Raises:
+        ConfigurationError: It is no residual, is damaged or without a digest, or the repository
+            cannot be written.
+        MissingExtraError: The package huggingface_hub is missing.
+        SystemFailedError: The hub does not answer.
+    """
+    folder = find_folder(folder)
+    description, _ = load_residual(folder)
+    digest = _digest_of(description, folder)
+    hub = _hub()
+    card = _CARD.format(
+        base=description.base,
+        robot=description.robot,
+        repository=repository,
+        digest=digest,
+        weights=WEIGHTS,
+        description=DESCRIPTION,
+    )
+    files = {name: read_bounded(folder / name, most) for name, most in _MOST_BYTES.items()}
+    files["README.md"] = card.encode()
+    additions = [
+        hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=content)
+        for name, content in files.items()
+    ]
+    api = hub.HfApi(endpoint=_endpoint())
+    with _one_sentence(repository, None):
+        api.create_repo(repository, private=not public, exist_ok=True)
+        commit = api.create_commit(
+            repository, additions, commit_message=f"Residual with weights {digest[:12]}"
+        )
+    return Pushed(str(commit.commit_url), digest)
+
+
+def pull_residual(
+    repository: str,
+    *,
+    revision: str = "main",
+    digest: str | None = None,
+    offline: bool = False,
+    output: Path | None = None,
+) -> Pulled:
+    """Take a residual from a repository of the hub, or from the hub's cache on this computer.
+
+    Args:
+        repository: OWNER/NAME.
+        revision: Branch, tag or commit.
+        digest: SHA-256 that the weights must have; None for that of the description alone.
+        offline: True to ask nobody, and take what was pulled before.
+        output: Folder for it, new or empty; None for hub/OWNER/NAME.
+
+    Raises:
+        ConfigurationError: There is no such repository or revision, it holds no residual, one of
+            its files is too large, or a digest differs; nothing is written then.
+        MissingExtraError: The package huggingface_hub is missing.
+        ResultsExistError: The folder is not empty.
+        SystemFailedError: The hub does not answer.
+    """
+    hub = _hub()
+    with _one_sentence(repository, revision):
+        if not offline:
+            _require_small(repository, _sizes(hub, repository, revision))
+        paths = [
+            Path(
+                hub.hf_hub_download(
+                    repository,
+                    name,
+                    revision=revision,
+                    local_files_only=offline,
+                    endpoint=_endpoint(),
+                )
+            )
+            for name in _MOST_BYTES
+        ]
+    commits = {path.parent.name for path in paths}
+    if len(commits) > 1:
+        raise SystemFailedError(f"{repository} changed while it was pulled; pull it again")
+    files = {path.name: read_bounded(path, _MOST_BYTES[path.name]) for path in paths}
+    with TemporaryDirectory() as place:
+        description = _checked(files, Path(place), repository, digest)
+    with own_folder("hub", HUB / repository if output is None else output) as folder:
+        for name, content in files.items():
+            write_whole(folder / name, content)
+    return Pulled(folder, commits.pop(), description)
+
+
+def _hub() -> Any:
+    """The package of the hub."""
+    try:
+        import huggingface_hub
+    except ImportError:
+        raise missing_extra("huggingface_hub", "hub", "sharing residuals") from None
+    return huggingface_hub
+
+
+def _endpoint() -> str | None:
+    """Address of the hub, where the environment names another one."""
+    return os.environ.get(_ENDPOINT)
+
+
+def _sizes(hub: Any, repository: str, revision: str) -> dict[str, int | None]:
+    """Sizes of a repository's files by their names."""
+    api = hub.HfApi(endpoint=_endpoint())
+    found = api.model_info(repository, revision=revision, files_metadata=True, timeout=_PATIENCE_S)
+    return {file.rfilename: file.size for file in found.siblings or []}
+
+
+def _require_small(repository: str, sizes: dict[str, int | None]) -> None:
+    """Refuse a repository without the files of a residual, or with files that are too large."""
+    for name, most in _MOST_BYTES.items():
+        if name not in sizes:
+            raise ConfigurationError(
+                f"{shorten(repository)} holds no residual: it needs {DESCRIPTION} and {WEIGHTS} at"
+                f" its top, and has {list_names(sizes) or 'no files'}"
+            )
+        size = sizes[name]
+        if size is None or not 0 < size <= most:
+            said = "says no size" if size is None else f"has {size}"
+            raise ConfigurationError(
+                f"{name} of {shorten(repository)} must have 1 to {most} bytes, it {said}"
+            )
+
+
+def _checked(
+    files: dict[str, bytes], place: Path, repository: str, digest: str | None
+) -> ResidualDescription:
+    """Description of a residual whose network and digest are right."""
+    for name, content in files.items():
+        write_whole(place / name, content)
+    try:
+        description, _ = load_residual(place)
+    except ConfigurationError as error:
+        said = str(error).replace(f"{place}/", "").replace(str(place), shorten(repository))
+        raise ConfigurationError(f"{shorten(repository)} is not used: {said}") from None
+    found = _digest_of(description, Path(repository))
+    if digest is not None and digest != found:
+        raise ConfigurationError(
+            f"the weights of {shorten(repository)} have the SHA-256 digest {found}, and --sha256"
+            f" {quote(digest)[1:-1]} was asked for; ask who pushed it which one is right"
+        )
+    return description
+
+
+def _digest_of(description: ResidualDescription, folder: Path) -> str:
+    if description.weights_sha256 is None:
+        raise ConfigurationError(
+            f"{DESCRIPTION} of {shorten(folder)} names no digest of its weights; give it their"
+            " SHA-256 as weights_sha256"
+        )
+    return description.weights_sha256
+
+
+@contextmanager
+def _one_sentence(repository: str, revision: str | None) -> Iterator[None]:
+    """Say what the hub refuses in one sentence each."""
+    from httpx2 import HTTPError  # what the package speaks with
+    from huggingface_hub import errors
+
+    name = shorten(repository)
+    try:
+        yield
+    except errors.HFValidationError:
+        raise ConfigurationError(
+            f"a repository is OWNER/NAME, in letters, digits, and . _ -, got {quote(repository)}"
+        ) from None
+    except errors.RevisionNotFoundError:
+        raise ConfigurationError(
+            f"{name} has no revision {quote(revision)}; give a branch, a tag or a commit"
+        ) from None
+    except errors.RepositoryNotFoundError:
+        raise ConfigurationError(
+            f"no repository {name} that you may use; check its name, or log in by: hf auth login"
+        ) from None
+    except errors.LocalEntryNotFoundError:
+        raise ConfigurationError(
+            f"{name} at {revision} is not in the cache of this computer, and the hub was not"
+            " reached; pull it once with a network"
+        ) from None
+    except errors.HfHubHTTPError as error:
+        status = getattr(error.response, "status_code", None)
+        if status in (401, 403):
+            raise ConfigurationError(
+                f"the hub refuses {name} ({status}); log in by: hf auth login, with a token that"
+                " may write"
+            ) from None
+        raise SystemFailedError(f"the hub answers {status} for {name}; try again later") from None
+    except JSONDecodeError:
+        raise SystemFailedError(
+            f"something else than a hub answers for {name}; check the network, and {_ENDPOINT}"
+        ) from None
+    except (OSError, HTTPError) as error:
+        raise SystemFailedError(
+            f"the hub was not reached ({type(error).__name__}); check the network, or pull with"
+            " --offline what was pulled before"
+        ) from None
