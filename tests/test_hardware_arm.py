@@ -48,10 +48,11 @@ from tests.test_hardware_arm_servos import servos
 from tests.test_hardware_faults import SERVO, Case, named
 from tests.virtual_bus import VirtualBus
 from train.commands import hardware_arm as command
+from train.commands import hardware_compensate
 from train.commands.cli import main
 from train.commands.hardware import Emulate
 from train.commands.hardware_arm import KnownArm
-from train.commands.hardware_compensate import Compensate, approached, write_rests
+from train.commands.hardware_compensate import Compensate, LogPoses, approached, write_rests
 from train.runs.console import PlainConsole
 
 FOLDER = Path("docs/hardware")
@@ -446,6 +447,43 @@ def test_a_joint_without_an_id_is_named() -> None:
     del joints["wrist_roll"]
     with pytest.raises(ConfigurationError, match=r"'wrist_roll' has no servo: give its id"):
         SETTINGS.replace(joints=joints).servos(NAMES)
+
+
+SOUND = MOUNTING.read_text()
+POSES = (FOLDER / "so101_poses.csv").read_text()
+DEGREES = "elbow_flex\n30\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "words"),
+    [
+        (
+            "mounting",
+            f"{SOUND}\n  knee: {{id: 9}}\n",
+            "names joint 'knee', which the model does not",
+        ),
+        ("mounting", SOUND.replace("STS3215", "STS32", 1), "no servo 'STS32'"),
+        ("targets", DEGREES, "elbow_flex"),
+        ("targets", POSES.replace("elbow_flex", "elbow"), "elbow"),
+    ],
+)
+@pytest.mark.parametrize("which", [Compensate, LogPoses])
+def test_bad_files_are_told_before_a_port_is_opened(
+    which: Any, file: str, text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches angles in degrees, another arm's joint and an unknown servo that are found when the
+    arm is already under torque."""
+
+    def move(*_: Any) -> None:
+        pytest.fail("the arm has moved")
+
+    monkeypatch.setattr(hardware_compensate, "move_arm", move)
+    path = tmp_path / "file"
+    path.write_text(text)
+    files = {"mounting": MOUNTING, "targets": FOLDER / "so101_poses.csv", file: path}
+    options = which(robot=ROBOT, joints=JOINTS, port="/dev/none", **files)
+    with pytest.raises(ConfigurationError, match=words):
+        options.run(PlainConsole(file=io.StringIO()))
 
 
 def checked(monkeypatch: pytest.MonkeyPatch, number: int, **registers: int) -> str:

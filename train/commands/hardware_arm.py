@@ -124,6 +124,7 @@ class KnownArm:
                 raise ConfigurationError(problem)
             given = {"port": "emulated"}
         self.settings = load_yaml(options.mounting, ArmSettings, given)
+        require_known_servos(self.settings, self.model)
         self.mapping: dict[str, Any] = (
             _typical(self.settings) if joints is None else dict(read_mapping(joints))
         )
@@ -148,10 +149,33 @@ class KnownArm:
         self.tool = EndEffector(self.model, self.joints, tool, held)
 
     @property
+    def middle(self) -> Array:
+        """Middles of the joints' ranges, (n,) [rad]; where one has none, zero."""
+        ends = np.stack([self.lowest, self.highest])
+        return np.where(np.isfinite(ends).all(axis=0), ends, 0.0).mean(axis=0)
+
+    @property
     def joint_settings(self) -> dict[str, JointSettings]:
         """Settings of the joints by name."""
         found = read_joints(self.mapping, self.joints, _others(self.model, self.joints))
         return {name: own for name, own in found.items() if own is not None}
+
+
+def require_known_servos(settings: ArmSettings, model: mujoco.MjModel) -> None:
+    """Refuse a mounting that names what nobody knows, before a port is opened.
+
+    Raises:
+        ConfigurationError: A joint that is not in the model, or an unknown servo.
+    """
+    names = [model.joint(j).name for j in range(model.njnt)]
+    for name, place in settings.joints.items():
+        if name not in names:
+            raise ConfigurationError(
+                f"the mounting names joint {name!r}, which the model does not have; it has"
+                f" {', '.join(names)}"
+            )
+        if place.model is not None:
+            _number(place.model)
 
 
 def _typical(settings: ArmSettings) -> dict[str, Any]:
@@ -285,7 +309,8 @@ def _number(name: str) -> int:
     """
     by_name = {model.name: number for number, model in servo_models().items()}
     if name not in by_name:
-        raise ConfigurationError(f"no servo {name!r}; choose from {', '.join(by_name)}")
+        problem = f"no servo {name!r}, as the mounting has it"
+        raise ConfigurationError(f"{problem}; choose from {', '.join(by_name)}")
     return by_name[name]
 
 

@@ -53,6 +53,8 @@ class Compensate(OnArm):
                 "name targets: --targets FILE.csv, --targets - for standard input, or --listen PORT"
             )
         known = KnownArm(self, self.joints, self.limit_rad)
+        if self.listen is None and str(self.targets) != "-":
+            self._targets(known, known.middle)  # a bad file is told before anything moves
         compensator = Plain(known.compensator) if self.plain else known.compensator
         move_arm(known, compensator, lambda start: self._targets(known, start), console)
 
@@ -101,6 +103,7 @@ class LogPoses(OnArm):
     def run(self, console: Console) -> None:
         """Check, visit the poses, log."""
         known = KnownArm(self, self.joints)
+        self._drawn(known, known.middle)  # a bad file is told before anything moves
 
         def make_targets(start: Array) -> Targets:
             return Poses(approached(self._drawn(known, start), self.apart_rad), self.hold_s)
