@@ -224,8 +224,8 @@ def _residuals(
 
 
 def learning_in_short(*tables: Rows) -> str:
-    """Gains of residuals over their bases, and over the best policy without learning where that is
-    another, in groups of scenarios, on the motions that they are compared on.
+    """Gains of residuals over the best policy without learning, in groups of scenarios, on the
+    motions that they are compared on.
 
     Args:
         tables: Rows of a `statistics.csv` each.
@@ -233,22 +233,20 @@ def learning_in_short(*tables: Rows) -> str:
     metrics = _JUDGED[:2]
     lines = []
     for rows in tables:
-        own = [row for row in rows if row["kind"] == "residual" and row["scope"] in _SHORT]
-        places = group_by(own, lambda row: (row["reference"], row["base"]))
-        for (reference, base), found in places.items():
+        own = _residuals(rows, metrics, _SHORT, BEST_ANALYTIC)
+        for (reference,), found in group_by(own, lambda row: (row["reference"],)).items():
             cells = {(row["scope"], row["metric"]): row for row in found}
             changes = [
                 _over_base(cells[scope, metric], "")[1] if (scope, metric) in cells else "-"
                 for metric in metrics
                 for scope in _SHORT
             ]
-            lines.append([reference, f"`{base}`", *changes])
+            lines.append([reference, *changes])
     head = [
-        "step",
-        "against",
+        "walk",
         *(f"{_METRICS[metric][0]}, {scope}" for metric in metrics for scope in _SHORT),
     ]
-    return page_table(head, lines, words=2)
+    return page_table(head, lines)
 
 
 def _scope(row: Mapping[str, str]) -> str:
