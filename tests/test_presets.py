@@ -132,7 +132,7 @@ def test_fewer_episodes_are_played_than_a_configuration_says(
     played: list[CompareConfig] = []
     monkeypatch.setattr(
         "train.commands.compare.compare",
-        lambda config, *_: played.append(config) or Comparison(Path(), [], []),
+        lambda config, *_, **__: played.append(config) or Comparison(Path(), [], []),
     )
     main(["compare", "own.yaml", "--episodes", "1"])
     assert {condition.episodes for condition in played[0].conditions()} == {1}

@@ -163,9 +163,8 @@ def test_rivals_and_replay_are_shown_over_the_same_rows() -> None:
     assert "replay_all_mrad" not in rows[1]
     texts = [{name: str(value) for name, value in row.items()} for row in rows]
     shown = recorded.replays(texts).splitlines()
-    assert shown[0].count("|") == 8
-    assert "| identified | identified, torque off included |" in shown[0]
-    assert "| 10.0 | 90.0 |" in shown[2]
+    assert "| identified | torque off included |" in shown[0]
+    assert shown[2].endswith("| 10.0 | 90.0 |")
     assert "torque off" not in recorded.slow_motion(texts)
 
 
