@@ -19,6 +19,7 @@ from docs.pages.write import (
     TABLES,
     Results,
     figure,
+    in_words,
     marks,
     page_with,
     pages,
@@ -183,7 +184,7 @@ def test_a_page_is_written_between_its_marks_and_nowhere_else(checkout: Path) ->
         write_pages([])
         assert (
             page.read_text()
-            == f"before\n{BEGIN}\n\n{PARTS['leaderboard'].text(results)}\n{END}\nafter\n"
+            == f"before\n{BEGIN}\n\n{in_words(PARTS['leaderboard'].text(results))}\n{END}\nafter\n"
         )
     assert Path("docs", "other.md").read_text() == "no marks"
     for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):

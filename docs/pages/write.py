@@ -266,6 +266,11 @@ def figure(results: Results, place: str, now: str) -> str:
     return minus(f"{in_table_unit(row, metric):.{decimals}f}")
 
 
+def in_words(table: str) -> str:
+    """Names of walks as a reader says them: "3 s, 20 steps" for "3 s num_steps=20"."""
+    return re.sub(r" num_steps=(\d+)", r", \1 steps", table)
+
+
 def marks(part: str) -> tuple[str, str]:
     """Lines of a page, between which a part is written."""
     return f"<!-- {part}: begin -->", f"<!-- {part}: end -->"
@@ -293,7 +298,8 @@ def page_with(text: str, results: Results) -> str:
                 f"a page for the {part} needs the lines {begin!r} and {end!r}, each once"
             )
         before, _, rest = text.partition(begin)
-        text = f"{before}{begin}\n\n{PARTS[part].text(results)}\n{end}{rest.partition(end)[2]}"
+        own = in_words(PARTS[part].text(results))
+        text = f"{before}{begin}\n\n{own}\n{end}{rest.partition(end)[2]}"
     return _FIGURE.sub(lambda m: f"<!-- = {m[1]} -->{figure(results, m[1], m[2])}<!-- / -->", text)
 
 
