@@ -27,6 +27,7 @@ from elastic_env.core.signals import Signal
 from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
 from elastic_env.world.scenario import scenario_names
+from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
@@ -141,7 +142,7 @@ def gains_page() -> str:
 
 
 def configurations_page() -> str:
-    """Every key of the configurations of comparisons and trainings."""
+    """Every key of the configurations of comparisons, trainings and benches."""
     intro = (
         "Written from the declarations in the code. [Options](../options.md) explains the"
         " environments, and [Training](../training.md) the settings."
@@ -151,6 +152,8 @@ def configurations_page() -> str:
         _model(PolicySpec, "policies"),
         _model(TrainConfig, "Trainings: elastic train"),
         _model(ResidualSettings, "settings"),
+        _model(BenchConfig, "Figures in CI: elastic bench"),
+        _model(BenchCase, "cases"),
     ]
     return "\n\n".join(["# Keys of configurations", intro, *parts]) + "\n"
 

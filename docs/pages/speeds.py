@@ -10,6 +10,11 @@ from train.evaluate.standings import Standing
 
 _RAW = "raw mj_step"
 _OURS = "vector env"
+_SHOWN = ("1", "64", "1024")
+"""Numbers of worlds in the table; `speed_*.csv` has more."""
+_OTHERS = ("Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv")
+_POLICIES = ("uncompensated", "input_output", "adaptive_posture", "foothold", "residual of 3 s")
+"""Vector environments in two processes, and policies that are timed alone."""
 
 
 def vector_environments(*tables: Rows) -> str:
@@ -18,7 +23,10 @@ def vector_environments(*tables: Rows) -> str:
     """
     lines = []
     rows = [
-        row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"
+        row
+        for table in tables
+        for row in table
+        if row["against"] == f"{_RAW}, {row['num_envs']}" and row["num_envs"] in _SHOWN
     ]
     rows = sorted(rows, key=lambda row: int(row["num_envs"]))
     for (env, worlds), own in sorted(
@@ -45,7 +53,13 @@ def _robot(place: tuple[tuple[str, ...], Rows]) -> str:
 
 def other_ways(*tables: Rows) -> str:
     """Scalar environments under other vector environments, and PPO end to end."""
-    rows = [row for table in tables for row in table if not row["against"].startswith(_RAW)]
+    rows = [
+        row
+        for table in tables
+        for row in table
+        if row["contender"].startswith("PPO")
+        or (row["contender"] in _OTHERS and row["num_envs"] == "2")
+    ]
     lines = [
         [
             row["env"],
@@ -83,6 +97,6 @@ def costs_of_cells(rows: Rows) -> str:
 
 def policies_alone(standings: Sequence[Standing]) -> str:
     """Time of `predict` for one world of the walker, as measured with the leaderboard."""
-    took = sorted({s.policy: s.step_us for s in standings}.items(), key=lambda own: own[1])
-    lines = [[policy, f"{step_us:.0f}"] for policy, step_us in took]
-    return page_table(["policy", "`predict` [µs]"], lines)
+    took = {s.policy: s.step_us for s in standings}
+    shown = [f"`{policy}` {took[policy]:.0f} µs" for policy in _POLICIES[:-1]]
+    return f"{', '.join(shown)}, {_POLICIES[-1]} {took[_POLICIES[-1]]:.0f} µs.\n"
