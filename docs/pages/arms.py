@@ -70,7 +70,11 @@ def arm_identification(rows: Rows) -> str:
     `tests.identification_trials`.
     """
     kinds = group_by(rows, lambda row: (row["poses"], row["log"]))
-    lines = [[f"{poses} poses, {log}", *_found(own)] for (poses, log), own in kinds.items()]
+    lines = [
+        [f"{poses} poses", *_found(own)]
+        for (poses, log), own in kinds.items()
+        if log != "no friction"
+    ]
     head = [
         "log",
         f"intervals that hold the true K, of {rows[0]['trials']}",

@@ -226,7 +226,7 @@ PARTS: Mapping[str, Part] = {
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
     "sensitivity of the walk": _of(walks.sensitivity, "walker_sensitivity"),
-    "walks of the paper": _of(walks.paper_walks, "paper", "walker"),
+    "walks of the paper": _of(walks.paper_walks, "paper"),
     "walks in all scenarios": _of(walks.all_scenarios, "walker"),
     "testbed of the paper": _of(joints.paper_testbed, "paper_testbed", "identification"),
     "identification": _of(joints.identification, "identification"),
