@@ -63,7 +63,8 @@ def test_the_notebook_runs_and_shows_two_films(
     mpl.use("Agg")
     shown: list[Any] = []
     notebook: Any = types.ModuleType("IPython")
-    notebook.get_ipython = lambda: None  # Matplotlib asks
+    notebook.get_ipython = lambda: None  # Matplotlib asks for both
+    notebook.version_info = (9, 0)
     notebook.display = types.SimpleNamespace(
         Video=lambda film, **_: Path(film).read_bytes(), display=shown.append
     )
