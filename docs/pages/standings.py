@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from train.evaluate.standings import Standing
-from train.report.leaderboard import board, claims_table
-from train.report.table_formats import Cell, Table, parts_of, plain_text, to_markdown
+from train.report.leaderboard import board
+from train.report.table_formats import Cell, parts_of, to_markdown
 
 _JUDGED = (
     ("mixture", "3 s"),
@@ -17,8 +17,6 @@ _JUDGED = (
     ("mixture", "1.1 s"),
 )
 """Columns of the leaderboard that the page shows."""
-_GAITS = ("mixture, 3 s", "mixture, 1.6 s", "mixture, 1.1 s")
-"""Columns that show a residual at every gait."""
 
 
 def board_markdown(found: Sequence[Standing]) -> str:
@@ -35,17 +33,3 @@ def board_markdown(found: Sequence[Standing]) -> str:
 def _score(cell: Cell) -> Cell:
     """A cell without its intervals."""
     return tuple(part for part in parts_of(cell) if part.style != "small")
-
-
-def claims_markdown(found: Sequence[Standing]) -> str:
-    """The paired changes of residuals against the best policy without learning, at every gait."""
-    table = claims_table(found)
-    for place in (4, 2):  # against the base
-        table = table.without(place)
-    rows = tuple(
-        replace(row, cells=(plain_text(row.cells[0]).removeprefix("residual of "), *row.cells[1:]))
-        for row in table.rows
-        if row.cells[1] in _GAITS
-    )
-    heads = tuple(replace(head, title=head.title.partition(",")[0]) for head in table.heads)
-    return to_markdown(Table(heads, rows, keys=table.keys)) + "\n"

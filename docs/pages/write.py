@@ -31,7 +31,7 @@ from docs.pages.learned import (
     maps_markdown,
     twenty_steps,
 )
-from docs.pages.standings import board_markdown, claims_markdown
+from docs.pages.standings import board_markdown
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
 from train.commands.demo import PAPER_PELVIS
@@ -171,7 +171,6 @@ def _of_map(name: str) -> Part:
 
 PARTS: Mapping[str, Part] = {
     "leaderboard": _of_standings(board_markdown),
-    "what learning adds": _of_standings(claims_markdown),
     "learning in short": _of(
         learning_in_short,
         "learned_walker",
