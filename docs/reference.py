@@ -19,18 +19,21 @@ from unittest.mock import patch
 import gymnasium
 from pydantic.fields import FieldInfo
 
+import baselines
 from baselines.options import PolicyOptions
 from baselines.residual.settings import ResidualSettings
 from elastic_env import IDS
 from elastic_env.core.config import Model
+from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Signal
 from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
-from elastic_env.world.scenario import scenario_names
+from elastic_env.world.scenario import RANGES_BEYOND, TRAINING_RANGES, scenario_names
 from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main
 from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
+from train.learn.algorithm_options import MODELS
 from train.learn.train_config import TrainConfig
 
 PARTS = {
@@ -126,13 +129,20 @@ def commands_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def policy_table() -> str:
+    """The table of `baselines.make`."""
+    lines = [line.strip() for line in (baselines.make.__doc__ or "").splitlines()]
+    return "\n".join(line for line in lines if line.startswith("|"))
+
+
 def gains_page() -> str:
-    """Every option of a policy, and of those that are mappings of gains every gain."""
+    """Every named policy and option, and every gain of the options that are mappings of gains."""
     intro = (
         "Written from the declarations in the code. [Options](../options.md#policies) says how"
         " they are given."
     )
-    parts = ["# Options and gains of policies", intro, _model(PolicyOptions, "Options")]
+    parts = ["# Policies, their options and gains", intro, "## Named policies", policy_table()]
+    parts.append(_model(PolicyOptions, "Options"))
     for option, field in PolicyOptions.model_fields.items():
         models = [
             kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)
@@ -155,6 +165,12 @@ def configurations_page() -> str:
         _model(BenchConfig, "Figures in CI: elastic bench"),
         _model(BenchCase, "cases"),
     ]
+    parts.append(_ranges())
+    for algorithm, model in MODELS.items():
+        parts.append(_model(model, f"Options of {algorithm}"))
+        network = model.model_fields.get("policy_kwargs")
+        if network and _is_model(network.annotation):
+            parts.append(_model(network.annotation, f"Options of {algorithm}: policy_kwargs"))
     return "\n\n".join(["# Keys of configurations", intro, *parts]) + "\n"
 
 
@@ -181,6 +197,26 @@ def _model(model: type[Model], title: str) -> str:
     rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
     head = ["name", "default", "bounds", "meaning"]
     return "\n\n".join([f"## {shown}", about, table(head, rows)])
+
+
+def _ranges() -> str:
+    """Ranges from which robots are drawn."""
+    rows = []
+    for name, parameter in RobotRanges.model_fields.items():
+        *_, meaning = _parameter(name, parameter)
+        beyond = "; ".join(_range(own[name]) for own in RANGES_BEYOND if name in own)
+        rows.append([f"`{name}`", _range(getattr(TRAINING_RANGES, name)), beyond, meaning])
+    about = (
+        "`drawn` takes every quantity from its range. A robot of `drawn_beyond` has one quantity"
+        " from beyond."
+    )
+    head = ["name", "`drawn`", "`drawn_beyond`", "meaning"]
+    return "\n\n".join(["## Ranges of drawn robots", about, table(head, rows)])
+
+
+def _range(value: float | tuple[float, float]) -> str:
+    low, high = value if isinstance(value, tuple) else (value, value)
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def _is_model(kind: object) -> bool:

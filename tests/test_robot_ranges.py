@@ -3,7 +3,6 @@ who may know of it."""
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -32,7 +31,7 @@ from elastic_env.robots.thormang.environment import configure_walk
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
-from elastic_env.world.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
+from elastic_env.world.scenario import RANGES_BEYOND, TRAINING_RANGES, Scenario, make_scenario
 from tests.three_joints import ARM
 
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
@@ -209,8 +208,8 @@ def test_every_robot_of_drawn_beyond_has_one_quantity_beyond_the_ranges_of_drawn
     assert all(is_within(TRAINING_RANGES, robot) for robot in robot_bank(make_scenario("drawn")))
     bank = robot_bank(make_scenario("drawn_beyond"))
     assert len(bank) == 256
-    shares = np.linspace(0, 256, len(_BEYOND) + 1).round().astype(int)
-    for beyond, begin, end in zip(_BEYOND, shares, shares[1:], strict=False):
+    shares = np.linspace(0, 256, len(RANGES_BEYOND) + 1).round().astype(int)
+    for beyond, begin, end in zip(RANGES_BEYOND, shares, shares[1:], strict=False):
         for robot in bank[begin:end]:
             assert is_within(TRAINING_RANGES.replace(**beyond), robot)
         (name, (low, high)), *_ = beyond.items()
@@ -641,34 +640,6 @@ def test_checkers_of_gymnasium_and_stable_baselines3_find_nothing() -> None:
     env: Any = make_walk_vector(num_envs=2, **SHORT, scenario="drawn")
     first, second = (env.reset(seed=1) for _ in range(2))
     assert data_equivalence(first[0], second[0])
-
-
-def test_the_table_of_ranges_is_that_of_the_code() -> None:
-    """Catches a range in docs/walker.md that is not drawn from, and one that is missing there."""
-    text = (Path(__file__).parents[1] / "docs" / "walker.md").read_text(encoding="utf-8")
-    section = text[text.index("## Drawn robots") : text.index("* A bank")].replace("−", "-")
-    rows = [
-        [cell.strip() for cell in line.split("|")[1:-1]]
-        for line in section.splitlines()
-        if line.startswith("| `")
-    ]
-    table = {cells[0].strip("`"): (cells[1], cells[2]) for cells in rows}
-    beyond: dict[str, list[str]] = {}
-    for changes in _BEYOND:
-        (name, (low, high)), *_ = changes.items()
-        beyond.setdefault(name, []).append(f"{low:.4g} to {high:.4g}")
-    for name in RobotRanges.model_fields:
-        value = getattr(TRAINING_RANGES, name)
-        drawn = f"{value:g}" if isinstance(value, float) else "{:.4g} to {:.4g}".format(*value)
-        assert table.pop(name) == (
-            drawn,
-            (
-                "1, where `push_n` is beyond"
-                if name == "push_share"
-                else "; ".join(beyond.get(name, []))
-            ),
-        ), name
-    assert not table
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

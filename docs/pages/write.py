@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import baselines
 from docs.pages import arms, joints, recorded, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
@@ -220,7 +219,6 @@ PARTS: Mapping[str, Part] = {
     ),
     "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
     "costs of cells": _of(speeds.costs_of_cells, "cluster"),
-    "named policies": Part((), lambda _: policy_table()),
     "policies alone": _of_standings(speeds.policies_alone),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
@@ -312,12 +310,6 @@ def reads(text: str) -> set[str]:
         for name in own.reads
     }
     return shown | {place.partition("; ")[0] for place, _ in _FIGURE.findall(text)}
-
-
-def policy_table() -> str:
-    """The table of `baselines.make`."""
-    lines = [line.strip() for line in (baselines.make.__doc__ or "").splitlines()]
-    return "\n".join(line for line in lines if line.startswith("|"))
 
 
 def pages(root: Path) -> list[Path]:

@@ -190,7 +190,7 @@ TRAINING_RANGES = RobotRanges(
 )
 """Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named
 changes but `stiff`'s on all joints at once."""
-_BEYOND: tuple[dict[str, Any], ...] = (
+RANGES_BEYOND: tuple[dict[str, Any], ...] = (
     {"stiffness": (0.6, 0.7)},
     {"stiffness": (1.3, 1.5)},
     {"friction": (_MOST_FRICTION, 11.0 / H54_200_S500_R.coulomb_friction)},
@@ -216,7 +216,7 @@ ranges of its own, which have equal shares of the robots."""
 
 def _distribution(name: str, ranges: RangeChanges) -> dict[str, Any]:
     """Parameters of one of `DISTRIBUTIONS`."""
-    each = _BEYOND if name == "drawn_beyond" else ranges
+    each = RANGES_BEYOND if name == "drawn_beyond" else ranges
     if not isinstance(each, Mapping):
         return {"mixture": [TRAINING_RANGES.replace(**own) for own in each]}
     named = TRAINING_RANGES.model_fields_set | each.keys()

@@ -127,6 +127,8 @@ class _OnPolicy(_StableBaselines):
 
 
 class _PPO(_OnPolicy):
+    """Options of PPO."""
+
     batch_size: int = quantity("1", 512, ge=2, le=10**7)
     """Decisions in a minibatch."""
     n_epochs: int = quantity("1", 10, ge=1, le=1000)
@@ -140,12 +142,16 @@ class _PPO(_OnPolicy):
 
 
 class _A2C(_OnPolicy):
+    """Options of A2C; left out, they are those of stable_baselines3 and not these defaults."""
+
     rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1)
     """Smallest divisor of the optimiser."""
     use_rms_prop: bool = True
 
 
 class _SAC(_StableBaselines):
+    """Options of SAC."""
+
     ent_coef: _Auto | Annotated[float, Field(ge=0, le=_LARGEST_WEIGHT)] = "auto"
     """Weight of the entropy, at most 1000; auto to learn it, auto_0.1 to begin at 0.1."""
     batch_size: int = quantity("1", 512, ge=1, le=10**7)
@@ -170,6 +176,8 @@ class _SAC(_StableBaselines):
 
 
 class _CMAES(Model):
+    """Options of the search for residuals that never change."""
+
     population_size: int = quantity("1", 16, ge=2, le=100_000)
     """Candidates of a generation."""
     sigma: float = quantity("1", 0.3, gt=0, le=2)
@@ -180,7 +188,8 @@ class _OnesOwn(_Options, extra="allow"):
     """Options of a class of one's own, which itself checks those that are not among these."""
 
 
-_MODELS = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
+MODELS = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
+"""Options by the name of the algorithm."""
 
 
 def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,11 +198,11 @@ def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any
     Raises:
         ModelError: One does not exist, is set by the training itself, or is beyond its bound.
     """
-    return _MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)
+    return MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)
 
 
 def complete_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of an algorithm with our defaults; A2C and a class of one's own keep theirs."""
     if algorithm not in ("PPO", "SAC", CONSTANTS):
         return dict(options)
-    return _MODELS[algorithm](**options).model_dump()
+    return MODELS[algorithm](**options).model_dump()
