@@ -130,7 +130,7 @@ class CompensatorConstants:
 
 
 class PositionCompensator:
-    """Commands and link angles of a robot whose joints give way, see the module.
+    """Commands and link angles of a robot with elastic joints, see the module.
 
     A value that is no angle raises `ActionError` and changes nothing: keep the last command then.
 

@@ -1,7 +1,7 @@
 r"""Errors of a policy's local frame where the support foot changes, against the truth.
 
 The local frame of a walking controller stands at the sole of the support foot, where joint angles
-and IMU put it (section II.B of the paper). Where joints give way, it is off by the vector e; for a
+and IMU put it (section II.B of the paper). With elastic joints it is off by the vector e; for a
 deflection δ of the hip roll joint alone (the paper's θ), with leg length L, that is Eq. 1:
 
 .. math:: e = L \, [0, \; 2 \sin(δ/2) \cos(δ/2), \; 2 \sin²(δ/2)]
