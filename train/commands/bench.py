@@ -150,9 +150,10 @@ class Bench(Model):
         if self.update:
             short = [one for one in figures if one["measured"] is None]
         in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
+        place = Path(os.path.relpath(path, os.environ.get("GITHUB_WORKSPACE")))
         for one in short:
             problem = f"{one['case']}: {one['problem']}"
-            console.print(annotation(problem, path) if in_workflow else problem)
+            console.print(annotation(problem, place) if in_workflow else problem)
         if short:
             sys.exit(1)
 
