@@ -148,7 +148,7 @@ def try_installed(programs: Path, folder: Path, wheel: Path) -> None:
     Args:
         programs: Of its environment.
         folder: Where it is used; it holds nothing of the checkout.
-        wheel: For its extra `report`.
+        wheel: For its extras `train` and `report`.
     """
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     code, printed = (
@@ -174,10 +174,19 @@ def try_installed(programs: Path, folder: Path, wheel: Path) -> None:
     _require_shadow_is_named([elastic, "--version"], own)
     _require_shadow_is_named([*python, "from elastic_env import baselines"], own)
 
-    install(programs, f"{wheel}[report]")
-    _run([elastic, "compare", "paper_testbed", "--episodes", "1", "--output", "run"], folder)
-    if not (folder / "run" / "report.html").is_file():
-        raise ConfigurationError("elastic compare paper_testbed wrote no report.html")
+    install(programs, f"{wheel}[train,report]")
+    shutil.copy2(ROOT / "docs" / "identification" / "arm.xml", folder)
+    for command in (
+        ["compare", "paper_testbed", "--episodes", "1", "--output", "run"],
+        ["robot", "arm.xml", "--stiffness", "1000", "--output", "arm"],
+        ["demo", "--output", "demo"],
+    ):
+        _run([elastic, *command], folder)
+    for report in ("run/report.html", "arm/comparison/report.html", "demo/report.html"):
+        if not (folder / report).is_file():
+            raise ConfigurationError(f"{report} was not written")
+    for tutorial in sorted((ROOT / "examples").glob("[1-5]_*.py")):
+        _run([python[0], str(shutil.copy2(tutorial, folder))], folder)
     found = _run([*python, _PUBLISHED], folder)
     if int(found) < 100:
         raise ConfigurationError(f"the published leaderboard has {found} rows")

@@ -368,8 +368,9 @@ def test_compare_summarises_every_cell(compared: Compared) -> None:
         values = [float(row["link_error_rms_rad"]) for row in rows if row["policy"] == policy]
         median = f"{1e3 * np.median(values):.2f}"
         assert median not in [f"{1e3 * value:.2f}" for value in values]
+        least, most = (f"{1e3 * value:.2f}" for value in (min(values), max(values)))
         assert line.startswith(
-            f"| multisine | soft | {policy} | {median} ({1e3 * max(values):.2f}) |"
+            f"| multisine | soft | {policy} | {median} [{least}, {most}] ({most}) |"
         )
         assert line.endswith("| 0/2 |")
         assert any(
@@ -405,7 +406,7 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
     table = Console(width=160, record=True, file=StringIO())
     train.report.summary.print_summary([Evaluation(condition(), episodes)], table)
     row = next(line for line in table.export_text().splitlines() if "input" in line)
-    assert "2.00" in row
+    assert "2.00 [1.00, 3.00]" in row
     assert "2/4" in row
     assert train.report.summary.failure_notes([Evaluation(condition(), episodes)]) == []
     failed = Evaluation(condition(), [episode for episode in episodes if episode["termination"]])

@@ -20,12 +20,14 @@ from train.evaluate.statistics import (
     interquartile_mean,
     mean_of_part,
     mean_of_robots,
+    middle,
     middle_half,
     over_seeds,
     worst_share,
     worst_share_mean,
 )
 from train.evaluate.table import EpisodeTable, over_cells, per_robot, score
+from train.report.score_tables import scores_table
 
 BOOTSTRAP: dict[str, Any] = {
     "n_resamples": RESAMPLES,
@@ -74,6 +76,7 @@ def test_means_of_resamples_are_those_of_the_repeated_robots() -> None:
     counts = np.array([np.bincount(own, minlength=13) for own in drawn], dtype=np.float64)
     for mean, known in (
         (mean_of_robots, np.mean),
+        (mean_of_part(middle), np.median),
         (mean_of_part(middle_half), interquartile_mean),
         (mean_of_part(worst_share), worst_share_mean),
     ):
@@ -149,6 +152,15 @@ def test_every_cell_draws_its_own_robots() -> None:
     width, single = (own.ends[1] - own.ends[0] for own in (found, alone))
     assert width == pytest.approx(single / np.sqrt(2.0), rel=0.05)
     assert found.over == "60 robots"
+
+
+def test_many_episodes_are_resampled_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches resamples of a hundred thousand episodes that fill the memory."""
+    monkeypatch.setattr(statistics, "MOST_DRAWS", 41_000)
+    asked = []
+    found = estimate(lambda counts: asked.append(counts[0].shape) or np.ones((1, 1)), [41])
+    assert asked == [(1, 41), (1000, 41)]
+    assert found.ends == (1.0, 1.0)
 
 
 def test_one_robot_and_one_seed_have_no_interval() -> None:
@@ -264,3 +276,21 @@ def test_drawn_robots_and_episodes_of_one_robot_are_told_apart() -> None:
     (row, *_) = [r for r in changes(played, {"both": ["drawn", "payload"]}) if r.is_group]
     assert row.relative.over == "3 robots and 3 episodes"
     assert row.verdict == "lower"
+
+
+def test_scores_of_a_policy_alone_have_intervals_over_its_episodes() -> None:
+    """Catches a score that nobody compares without an interval, and one of equal episodes."""
+    played = [
+        cell("alone", {"all": [2.0, 4.0, 9.0]}, "payload"),
+        cell("alone", {"all": [2.0, 2.0]}, "ideal"),
+        cell("alone", {"all": [2.0, 4.0, 9.0]}, "drawn"),
+    ]
+    table = EpisodeTable(played)
+    columns = [column for column in table.environment.judged if column.metric == METRIC]
+    shown = {row.cells[1]: row.cells[3:] for row in scores_table(table, columns).rows}
+    assert shown["payload"][1:] == ("3 episodes",)
+    assert shown["drawn"][1:] == ("3 robots",)
+    assert shown["ideal"][1:] == ("-",)
+    assert shown["payload"][0] == shown["drawn"][0]
+    assert "[" in str(shown["payload"][0])
+    assert "[" not in str(shown["ideal"][0])

@@ -12,7 +12,6 @@ from docs.pages.cells import (
     page_table,
 )
 from elastic_env.robots.thormang.tables import BLOCKS
-from train.evaluate.changes import percent
 from train.evaluate.margins import margin_table
 from train.evaluate.standings import Standing
 
@@ -95,21 +94,16 @@ def last_steps(*tables: Rows) -> str:
         (reference,) = cells.names("reference")
         for scenario in _LAST_SHOWN:
             own, base = (cells.row(name, reference, scenario) for name in ("residual", "foothold"))
-            changes = (
-                in_table_unit(own, b) / in_table_unit(own, a) - 1.0
-                for a, b in zip(first, last, strict=True)
-            )
             lines.append(
                 [
                     reference.removesuffix(" num_steps=20"),
                     f"`{scenario}`",
                     format_metrics(own, first, 2),
                     format_metrics(own, last, 2),
-                    " / ".join(percent(change) for change in changes),
                     format_metrics(base, last, 2),
                 ]
             )
-    head = ["step", "scenario", "steps 1 to 4", "17 to 20", "change", "`foothold`, 17 to 20"]
+    head = ["step", "scenario", "steps 1 to 4", "17 to 20", "`foothold`, 17 to 20"]
     return page_table(head, lines, words=2)
 
 

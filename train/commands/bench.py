@@ -35,6 +35,8 @@ from train.evaluate.conditions import (
     cell_of,
 )
 from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.statistics import Estimate
+from train.evaluate.table import over_cells
 from train.report.table_formats import Head, Row, Table, to_markdown, to_terminal
 from train.runs.folders import run_folder
 from train.runs.user_code import CodeNamingModel, is_a, load_without_code
@@ -148,9 +150,10 @@ class Bench(Model):
         if self.update:
             short = [one for one in figures if one["measured"] is None]
         in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
+        place = Path(os.path.relpath(path, os.environ.get("GITHUB_WORKSPACE")))
         for one in short:
             problem = f"{one['case']}: {one['problem']}"
-            console.print(annotation(problem, path) if in_workflow else problem)
+            console.print(annotation(problem, place) if in_workflow else problem)
         if short:
             sys.exit(1)
 
@@ -180,35 +183,43 @@ def configuration(path: Path, update: bool = False) -> Path:
     return _SHIPPED
 
 
+_UNITS = ("_m", "_rad", "_s", "_nm")
+"""Ends of the names of metrics."""
 _Figure = dict[str, Any]
 """A figure of a rollout: measured, accepted and largest value, and what is wrong in words.
 
-`measured` is None where the episode failed or does not have the figure.
+`measured` is None where the episode failed or does not have the figure; `interval` is that of
+several episodes, 95 %.
 """
 
 
 def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
     motion = found.condition.reference_name
     policy = f"{case.policy} {case.options}" if case.options else case.policy
+    known = [name for name in found.episodes[0] if name.endswith(_UNITS)]
+    if not found.num_failed:
+        require_known(f"metric of the {case.env}", case.figures, known)
     for metric, accepted in case.figures.items():
-        measured = _measured(found, metric)
+        score = _score(found, metric)
+        measured = score and score.value
         own = case.margins.get(metric, margin)
         bound = None if accepted is None else accepted + own * abs(accepted)
         yield {
             "case": f"{case.env}, {motion}, {case.scenario}, {policy}",
             "metric": metric,
             "measured": measured,
+            "interval": score.ends if score and score.has_interval else None,
             "accepted": accepted,
             "bound": bound,
             "problem": _problem(metric, measured, accepted, bound, found),
         }
 
 
-def _measured(found: Evaluation, metric: str) -> float | None:
+def _score(found: Evaluation, metric: str) -> Estimate | None:
     """Mean of a metric over the episodes; None where one of them failed or does not have it."""
     values = found.values(metric)
     is_whole = len(values) == len(found.episodes) and not np.isnan(values).any()
-    return float(values.mean()) if is_whole else None
+    return over_cells([values[None]]) if is_whole else None
 
 
 def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evaluation) -> str:
@@ -216,16 +227,10 @@ def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evalu
         who = f"{found.num_failed} of {len(found.episodes)} episodes"
         who = "the episode" if len(found.episodes) == 1 else who
         return f"{metric} has no value: {who} ended as {' and '.join(map(repr, ends))}"
-    episode = found.episodes[0]
-    if metric not in episode:
-        units = ("_m", "_rad", "_s", "_nm")
-        known = ", ".join(name for name in episode if name.endswith(units))
-        return f"{metric} is no metric of this episode; those are {known}"
     if measured is None:
         return f"{metric} of this episode is not a number"
     if bound is None:
-        accept = "elastic bench --update accepts it"
-        return f"{metric} is {measured:.4g}, and nothing was accepted yet; {accept}"
+        return f"{metric} is {measured:.4g}, and nothing was accepted yet; --update accepts it"
     if measured <= bound:
         return ""
     worse = f" ({_change(measured, accepted)})" if accepted else ""
@@ -239,10 +244,9 @@ def _accept(path: Path, evaluations: list[Evaluation]) -> None:
     changes = []
     for case, evaluation in zip(cases, evaluations, strict=True):
         for key, value in _child(case, "figures").value:
-            measured = _measured(evaluation, key.value)
-            if measured is not None:
+            if (measured := _score(evaluation, key.value)) is not None:
                 place = (value.start_mark.index, value.end_mark.index)
-                changes.append((*place, f"{measured:.4g}"))
+                changes.append((*place, f"{measured.value:.4g}"))
     for begin, end, value in sorted(changes, reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text)  # the user named it, maybe by a link
@@ -261,11 +265,16 @@ def _table(figures: list[_Figure]) -> Table:
     for case, own in group_by(figures, lambda figure: figure["case"]).items():
         rows.append(Row((case,), kind="heading"))
         for figure in own:
-            _, metric, *numbers, problem = figure.values()
+            _, metric, measured, interval, *bounds, problem = figure.values()
             verdict = "falls short" if problem else "kept"
+            if measured is not None and bounds[0] is not None:
+                is_better = measured < 2.0 * bounds[0] - bounds[1]
+                verdict = "better: --update keeps it" if is_better else verdict
             if figure["bound"] is None and figure["measured"] is not None:
                 verdict = "new"
-            texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
+            texts = ["-" if number is None else f"{number:.4g}" for number in (measured, *bounds)]
+            if interval:
+                texts[0] += " [{:.4g}, {:.4g}]".format(*interval)
             change = _change(figure["measured"], figure["accepted"])
             rows.append(Row((metric, *texts, change, verdict)))
     title = "short rollouts against what was accepted"

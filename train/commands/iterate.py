@@ -21,8 +21,10 @@ from elastic_env.world.robot_model import WalkerModel
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec, Seed, cell_of
 from train.evaluate.rollout import make_policy, make_vector_env
+from train.evaluate.table import over_cells
 from train.figures import plots
 from train.figures.chart import trials_chart
+from train.report.table_formats import number_interval
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder
@@ -179,8 +181,10 @@ def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
     head = ["trial", *(column.label for column in known.judged), known.failures]
     rows = []
     for trial in trials:
-        means = pd.DataFrame(trial.metrics)[~trial.failed].mean(numeric_only=True)
-        scores = [f"{c.scale * means[c.metric]:.{c.decimals}f}" for c in known.judged]
+        robots = pd.DataFrame(trial.metrics)[~trial.failed]
+        scores = [
+            number_interval(over_cells([robots[[c.metric]].to_numpy().T]), c) for c in known.judged
+        ]
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])
     return make_table(title, head, rows, left=0)

@@ -314,8 +314,8 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
         column=column,
         is_judged=column in table.environment.judged,
         per_seed=change(means, base_means),
-        relative=_of_units(estimate(relative, robots), robots, drawn),
-        improvement=_of_units(improvement(won, played), robots, drawn),
+        relative=of_units(estimate(relative, robots), robots, drawn),
+        improvement=of_units(improvement(won, played), robots, drawn),
         mine=_mean(means),
         theirs=_mean(base_means),
         num_pairs=int(sum(values.sum() for values in played)),
@@ -327,7 +327,7 @@ def change_of(table: EpisodeTable, scope: Scope, base: str, column: Column) -> C
     )
 
 
-def _of_units(found: Estimate, units: Sequence[int], drawn: Sequence[bool]) -> Estimate:
+def of_units(found: Estimate, units: Sequence[int], drawn: Sequence[bool]) -> Estimate:
     """An estimate that tells drawn robots from episodes of one robot, of units in all cells."""
     if not found.robots:
         return found

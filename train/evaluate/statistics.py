@@ -25,6 +25,8 @@ from elastic_env.core.signals import Array, IntArray
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
+MOST_DRAWS = 10**7
+"""Units that all resamples draw at most: many episodes make fewer resamples, which need less."""
 WORST = 0.1
 """Share of the robots that count as the worst ones."""
 _CUT = 0.25
@@ -204,6 +206,11 @@ def worst_share(n: Array) -> tuple[Array, Array]:
     return n - np.maximum(WORST * n, 1.0), n
 
 
+def middle(n: Array) -> tuple[Array, Array]:
+    """The part of the median: the value in the middle, or half of each of the two there."""
+    return (n - 1.0) / 2.0, (n + 1.0) / 2.0
+
+
 def mean_of_part(part: Part) -> Callable[[Array, Array], Array]:
     """A mean over a part of the robots, from the best to the worst; as `mean_of_robots`."""
 
@@ -223,7 +230,7 @@ def _mean_of_part(values: Array, counts: Array, part: Part) -> Array:
     above = own.cumsum(axis=1)
     low, high = part(above[:, -1:])
     counted = np.minimum(above, high) - np.maximum(above - own, low)
-    share = high - low
+    share = np.where(above[:, -1:] > 0.0, high - low, 0.0)
     total = np.maximum(counted, 0.0) @ known
     return total / np.where(share > 0.0, share, np.nan)[:, 0]
 
@@ -257,7 +264,7 @@ def estimate(
         return Estimate(value)
     chosen, counts = _resamples(seeds, tuple(robots))
     found = np.asarray(figures(counts) if drawn else once)[..., order]
-    found = np.broadcast_to(found, (*found.shape[:-2], RESAMPLES, seeds))
+    found = np.broadcast_to(found, (*found.shape[:-2], len(chosen), seeds))
     chosen = np.broadcast_to(chosen, found.shape)
     replicates = combine(np.take_along_axis(found, chosen, axis=-1), axis=-1)
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -277,15 +284,16 @@ def named_intervals(estimates: Iterable[Estimate]) -> str:
 def _resamples(seeds: int, robots: tuple[int, ...]) -> tuple[IntArray, list[Array]]:
     """Seeds of every resample, and how often it has each robot of every cell; always the same."""
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    chosen = rng.integers(0, seeds, (RESAMPLES, seeds))
-    return chosen, [_drawn_counts(rng, number) for number in robots]
+    resamples = min(RESAMPLES, MOST_DRAWS // max(robots, default=1))
+    chosen = rng.integers(0, seeds, (resamples, seeds))
+    return chosen, [_drawn_counts(rng, resamples, number) for number in robots]
 
 
-def _drawn_counts(rng: np.random.Generator, number: int) -> Array:
-    """How often each of some units is drawn in as many draws, (RESAMPLES, number)."""
+def _drawn_counts(rng: np.random.Generator, resamples: int, number: int) -> Array:
+    """How often each of some units is drawn in as many draws, (resamples, number)."""
     if number == 1:
-        return np.ones((RESAMPLES, 1))
-    drawn = rng.integers(0, number, (RESAMPLES, number))
-    drawn += number * np.arange(RESAMPLES)[:, None]
-    counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * number)
-    return counts.reshape(RESAMPLES, number).astype(np.float64)
+        return np.ones((resamples, 1))
+    drawn = rng.integers(0, number, (resamples, number))
+    drawn += number * np.arange(resamples)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=resamples * number)
+    return counts.reshape(resamples, number).astype(np.float64)

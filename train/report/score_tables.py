@@ -5,13 +5,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from train.evaluate.changes import percent_interval
+from train.evaluate.changes import of_units, percent_interval
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
-from train.evaluate.table import EpisodeTable, score
+from train.evaluate.table import EpisodeTable, by_episode, score
 from train.figures.chart import quantiles
 from train.report.table_formats import Head, Row, Table, number_interval, print_table
 from train.runs.escaping import write_records
@@ -24,10 +24,12 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
         for scenario in table.scenarios:
             for policy in table.policies:
                 for cell in table.cells_of(policy, reference, scenario):
-                    own = table.of(policy, cell)
                     condition = table.conditions[policy, cell]
                     values = condition.swept_values(table.swept)
-                    scores = {column: score(own, column) for column in columns}
+                    own = table.of(policy, cell)
+                    own = by_episode(own) if condition.member is None else own
+                    units = ([own["robot"].nunique()], [condition.draws_robots])
+                    scores = {column: of_units(score(own, column), *units) for column in columns}
                     figures = [number_interval(found, column) for column, found in scores.items()]
                     over = next((found.over for found in scores.values() if found.over), "-")
                     rows.append([reference, scenario, policy, *values, *figures, over])
@@ -73,26 +75,25 @@ def print_robots(found: Sequence[RobotScores], console: Console) -> None:
     if not found:
         return
     columns = list(dict.fromkeys(row.column for row in found))
-    heads = [Head(column.title, column.unit, leaves=1) for column in columns]
+    heads = [
+        Head(column.title, column.unit, second=figure, leaves=turn)
+        for column in columns
+        for figure, turn in (("mean", 3), ("middle half", 1), ("worst tenth", 2))
+    ]
     heads = [Head("policy", is_number=False), *heads, Head(found[0].failure)]
     rows = []
     for names, cell in group_by(found, lambda row: (row.reference, row.scope)).items():
         rows.append(Row((", ".join(names),), kind="heading"))
         for policy, own in group_by(cell, lambda row: row.policy).items():
-            figures = {row.column: _three(row) for row in own}
+            figures = {row.column: row.scores for row in own}
             failed = f"{own[0].failed}/{own[0].episodes}"
-            cells = (figures[column] for column in columns)
+            cells = (
+                number_interval(score, column) for column in columns for score in figures[column]
+            )
             rows.append(Row((policy, *cells, failed)))
-    figures = "mean / interquartile mean / mean of the worst tenth"
     number = max(row.mean.robots for row in found)
-    title = f"over up to {number} drawn robots, those that did not fail: {figures}"
+    title = f"means over up to {number} drawn robots, those that did not fail [95 % interval]"
     print_table(Table(tuple(heads), tuple(rows), title=title), console, "robots.csv")
-
-
-def _three(row: RobotScores) -> str:
-    """Mean, interquartile mean and worst tenth in the unit in which they are shown."""
-    values = [Estimate(score.value) for score in row.scores]
-    return " / ".join(number_interval(value, row.column) for value in values)
 
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""The summary of a comparison: medians over the episodes of every cell.
+"""The summary of a comparison: medians over the episodes of every cell, with 95 % intervals.
 
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
@@ -12,10 +12,21 @@ from rich.console import Console
 
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
-from train.evaluate.episodes import Evaluation
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.statistics import Estimate, mean_of_part, middle
+from train.evaluate.table import over_cells
 from train.report.page import bullets
 from train.report.report_text import capital
-from train.report.table_formats import Head, Row, Table, column_notes, print_table, to_markdown
+from train.report.table_formats import (
+    Head,
+    Row,
+    Table,
+    column_notes,
+    has_room,
+    number_interval,
+    print_table,
+    to_markdown,
+)
 from train.runs.escaping import write_records
 
 
@@ -23,13 +34,19 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     """Print the summary with as many columns as the terminal has room for."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
-    print_table(summary_table(evaluations, columns), console, "summary.md")
+    table = summary_table(evaluations, columns)
+    if not has_room(table, console):
+        table = summary_table(evaluations, columns, intervals=False)
+    print_table(table, console, "summary.md")
     for note in failure_notes(evaluations):
         console.print(note, markup=False)
 
 
 def summary_table(
-    evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False
+    evaluations: Sequence[Evaluation],
+    columns: Sequence[Column],
+    worst: bool = False,
+    intervals: bool = True,
 ) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
 
@@ -38,6 +55,7 @@ def summary_table(
         columns: Metrics to show.
         worst: Whether the episode that is farthest from zero stands in brackets, where there are
             several.
+        intervals: Whether several episodes show the 95 % interval of their median.
     """
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
@@ -54,22 +72,41 @@ def summary_table(
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
         values = condition.swept_values(swept)
-        figures = [_median(e, column, worst) for column in columns]
+        figures = [_figure(e, column, worst, intervals) for column in columns]
         failed = f"{e.num_failed}/{len(e.episodes)}"
         rows.append(Row((*names, *values, *figures, failed)))
     title = f"{known.subject}, median over episodes"
+    title += _interval(evaluations) if intervals else ""
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=known.note)
 
 
-def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
-    """Median of a metric over the episodes that did not fail, - where there are none."""
+def _interval(evaluations: Sequence[Evaluation]) -> str:
+    return " [95 % interval]" if any(len(own.episodes) > 1 for own in evaluations) else ""
+
+
+def _figure(evaluation: Evaluation, column: Column, worst: bool, interval: bool) -> str:
+    """Median of a metric with its interval, and the episode that is farthest from zero."""
+    median = _median(evaluation, column.metric)
+    found = number_interval(median if interval else Estimate(median.value), column)
     values = column.scale * evaluation.values(column.metric)
-    if not len(values):
-        return "-"
-    found = f"{np.median(values):.{column.decimals}f}"
     if not worst or len(values) < 2:
         return found
     return f"{found} ({values[np.argmax(np.abs(values))]:.{column.decimals}f})"
+
+
+def _median(evaluation: Evaluation, metric: str) -> Estimate:
+    """Median over the episodes that did not fail; of a residual its middle over training seeds.
+
+    The interval is over seeds and episodes; there is none where all episodes are the same.
+    """
+    condition = evaluation.condition
+    same = condition.environment.is_deterministic(condition.scenario, condition.reference)
+    seeds = group_by(evaluation.episodes, lambda own: own.get("training_seed"))
+    values = [
+        [None if own["termination"] else own.get(metric) for own in episodes[: 1 if same else None]]
+        for episodes in seeds.values()
+    ]
+    return over_cells([np.array(values, dtype=np.float64)], mean_of_part(middle))
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
@@ -107,8 +144,8 @@ def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
 def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     """The parts of a summary of one environment."""
     known = evaluations[0].condition.environment
-    several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
-    worst = " (the worst of them in brackets)" if several else ""
+    interval = _interval(evaluations)
+    worst = f"{interval} (the worst of them)" if interval else ""
     statistic = f"Median over the episodes that did not fail{worst}"
     legend = [*column_notes(known.columns), *filter(None, [known.note])]
     parts = [
