@@ -28,7 +28,7 @@ from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.core.signals import Signal
 from elastic_env.hardware.arm_settings import ArmSettings, ServoPlace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
-from elastic_env.world.scenario import RANGES_BEYOND, TRAINING_RANGES, scenario_names
+from elastic_env.world.scenario import DISTRIBUTIONS, RANGES_BEYOND, TRAINING_RANGES, scenario_names
 from train.commands.bench import BenchCase, BenchConfig
 from train.commands.cli import COMMANDS, main
 from train.commands.compare import CompareConfig
@@ -58,6 +58,12 @@ def _signals(signals: Iterable[Signal]) -> str:
     return table(["column", "name", "unit", "meaning"], rows)
 
 
+def known_scenarios(name: str) -> list[str]:
+    """Scenarios of an environment by its short name; any robot has no IMU on a link."""
+    names = [*scenario_names(walks=name == "walker"), *DISTRIBUTIONS]
+    return [scenario for scenario in names if name != "robot" or scenario != "imu"]
+
+
 def environments_page() -> str:
     """Every simulated environment: id, observation, action, metrics, from the declarations in
     the code.
@@ -71,9 +77,7 @@ def environments_page() -> str:
             continue
         env = gymnasium.make(known, disable_env_checker=True).unwrapped
         task = env.task
-        scenarios = ", ".join(
-            f"`{scenario}`" for scenario in scenario_names(walks=name == "walker")
-        )
+        scenarios = ", ".join(f"`{scenario}`" for scenario in known_scenarios(name))
         metrics = ", ".join(f"`{metric.name}`" for metric in task.metrics)
         parts += [
             f"## `{known}`",

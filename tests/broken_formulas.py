@@ -99,10 +99,10 @@ BROKEN = (
         "return theta + _solve(gravity, theta",
         COMPENSATION,
     ),
-    BrokenFormula(_COMPENSATORS, "- 0.5 * dt * theta_dot", "", COMPENSATION),
+    BrokenFormula(_COMPENSATORS, "- 0.5 * period_s * theta_dot", "", COMPENSATION),
     BrokenFormula(
         _COMPENSATORS,
-        "drive.rotor_inertia * rate_dot[world, i] + torque[world, i]",
+        "drive.rotor_inertia * theta_ddot + torque[world, i]",
         "torque[world, i]",
         COMPENSATION,
     ),

@@ -249,6 +249,7 @@ def test_it_needs_no_heap_and_nothing_but_mathematics(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.slow
 def test_two_robots_fit_in_one_program_that_checks_them(compiler: str, tmp_path: Path) -> None:
     """Catches a name without the prefix, and a test vector that is not of the compensator."""
     names = {"left": tree, "right_2": seven}

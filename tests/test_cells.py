@@ -14,10 +14,11 @@ import pytest
 from rich.console import Console
 
 from train.cells.key import cell_key
-from train.cells.play import run_conditions
+from train.cells.play import CellsFailedError, in_batches, run_conditions
 from train.cells.store import Store, UnfitCellError, _digest
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
+from train.workers.executors import Executors
 
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 CONDITION, OTHER = (
@@ -220,6 +221,27 @@ def test_a_file_that_does_not_fit_is_said_once_and_played_again(
     kept = Store(file.parent).get(CONDITION)
     assert kept is not None
     assert kept.episodes == played[0].episodes
+
+
+@pytest.mark.slow
+def test_a_robot_that_does_not_stand_ends_its_own_cell_alone() -> None:
+    """Catches cells that fail since they share worlds with a robot of another cell."""
+    conditions = [
+        Condition(
+            env="walker",
+            policy=PolicySpec(name="uncompensated"),
+            reference={"step_period": 1.1, "num_steps": 1},
+            swept={"scenario.slope_rad": slope},
+        )
+        for slope in (0.0, 0.12, 0.01)
+    ]
+    assert in_batches(conditions * 2, cores=1) == [[0, 1, 2], [3, 4, 5]]
+    place = Executors(jobs=1)
+    with pytest.raises(CellsFailedError, match=r"slope_rad=0\.12: .*does not stand") as failure:
+        run_conditions(conditions * 2, Console(quiet=True), place)
+    finished = [evaluation.condition for evaluation in failure.value.finished]
+    assert finished == [conditions[0], conditions[2]] * 2
+    assert str(failure.value).count("does not stand") == 1
 
 
 @pytest.mark.parametrize("label", ["marked.inner:f", "marked.py:f", "broken.py:f", "broken:f"])

@@ -104,6 +104,7 @@ def unreadable(report: Callable[[int], None]) -> Unreadable:
     return Unreadable()
 
 
+@pytest.mark.slow
 def test_an_outcome_that_cannot_be_read_fails_alone_and_ends_its_process(tmp_path: Path) -> None:
     """Catches a call that waits for ever for the end of a process that lives."""
     before = processes_of(os.getpid())

@@ -41,6 +41,8 @@ KERNELS = (
     "baselines.walking.foot_tare",
     "baselines.walking.foothold",
     "baselines.walking.posture",
+    "baselines.walking.standing_estimate",
+    "baselines.walking.zmp_offset",
     "baselines.walking.zmp_shift",
     "baselines.estimation.bending",
     "baselines.residual.network",

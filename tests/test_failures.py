@@ -232,6 +232,7 @@ def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
     assert ",input,"[1:] in (tmp_path / "runs" / "cells" / "episodes.csv").read_text()
 
 
+@pytest.mark.slow
 def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path) -> None:
     """Catches a comparison whose folder goes with the process that the system killed."""
     (tmp_path / "mine.py").write_text(POLICIES + KILLED)

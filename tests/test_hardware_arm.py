@@ -71,7 +71,7 @@ OPTIONS = Compensate(robot=ROBOT, joints=JOINTS, mounting=MOUNTING, port="virtua
 class Plain:
     """No compensation."""
 
-    def command(self, q_desired: Any, q_dot: Any = None) -> Array:
+    def command(self, q_desired: Any, q_dot: Any = None, q_ddot: Any = None) -> Array:
         return np.array(q_desired)
 
     def link_angle(self, theta: Any) -> Array:

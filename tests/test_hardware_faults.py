@@ -152,7 +152,11 @@ def test_no_fault_of_the_bus_is_silent(emulator: RunningEmulator, case: Case) ->
             assert after.count("goal_position") <= ("overload" in case.faults)
 
 
-@pytest.mark.parametrize("case", IMU, ids=named)
+@pytest.mark.parametrize(
+    "case",
+    [IMU[0], *(pytest.param(case, marks=pytest.mark.slow) for case in IMU[1:])],
+    ids=named,
+)
 def test_no_fault_of_the_imu_is_silent(
     emulator: RunningEmulator, case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -103,6 +103,7 @@ def test_what_a_control_loop_starts_runs_as_all_others_do() -> None:
 
 
 @pytest.mark.usefixtures("in_realtime")
+@pytest.mark.slow
 def test_goals_are_kept_as_urgently_as_the_loop_commands_them() -> None:
     """Catches a thread of the loop that a busy computer takes for a hang."""
     with RunningEmulator() as emulator, SupervisedBus({emulator.port: [1]}) as bus:

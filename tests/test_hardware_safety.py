@@ -496,3 +496,18 @@ def test_no_port_says_what_there_is() -> None:
         DynamixelBus("/dev/ttyNOTHING").open()
     with pytest.raises(PortError, match="57600"):
         DynamixelBus("/dev/ttyNOTHING", baudrate=123).open()
+
+
+@pytest.mark.parametrize(("begin", "is_taken"), [(0.304, True), (0.306, False)])
+def test_a_motion_may_begin_where_weight_presses_a_servo_on_its_stop(
+    begin: float, is_taken: bool
+) -> None:
+    """Catches an arm that hangs on its stop and is refused, and a first goal beyond the stop."""
+    ends = np.array([[-0.3, 0.3]])
+    arguments = (SafetyLimits(), np.array([begin]), ["it"])
+    if not is_taken:
+        with pytest.raises(FaultError, match="must begin between"):
+            Guard(*arguments, ranges=ends)
+        return
+    goals, _ = Guard(*arguments, ranges=ends).command(np.array([begin]), 0.02)
+    assert goals[0] <= 0.3

@@ -88,6 +88,7 @@ def play(env: Any, policy: Any) -> tuple[list[Any], dict[str, Any], float]:
             return seen, info, reward
 
 
+@pytest.mark.slow
 def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(
     emulator: RunningEmulator,
 ) -> None:
@@ -197,6 +198,7 @@ def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(
             make_hardware(emulator, **wrong)
 
 
+@pytest.mark.slow
 def test_a_stalled_imu_ends_the_episode_with_torque_off(emulator: RunningEmulator) -> None:
     """Catches an old attitude that is used as a new one."""
     env = make_hardware(emulator, imu_port=emulator.imu_port)
@@ -391,6 +393,7 @@ def command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         pytest.fail(capsys.readouterr().err)
 
 
+@pytest.mark.slow
 def test_commands_run_on_hardware(
     emulator: RunningEmulator,
     tmp_path: Path,
@@ -560,6 +563,7 @@ def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) ->
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_links_deflection_is_that_of_the_emulated_spring() -> None:
     """Catches counts, signs or angles that are off anywhere between the emulated joint and what a
     policy is told.

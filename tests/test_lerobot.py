@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -114,10 +115,67 @@ def test_every_robot_has_its_own_names_and_default_units() -> None:
         "so101_follower": {"degrees", "percent"},
         "koch_follower": {"range", "percent"},
         "openarm_follower": {"degrees"},
+        "bi_so_follower": {"degrees", "percent"},
+        "bi_openarm_follower": {"degrees"},
     }
     assert [motor.name for motor in motors_of("so101_follower")] == list(RANGES)
     assert motors_of("so101_follower", use_degrees=False)[0].units == "range"
     assert motors_of("koch_follower", use_degrees=True)[0].units == "degrees"
+
+
+def openarm(*sides: str) -> str:
+    """Arms with the joints of OpenArm's description, side by side; other masses."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    for i, side in enumerate(sides):
+        body = spec.worldbody
+        for number in range(1, 8):
+            place = [0.0, 0.4 * i, 0.0] if number == 1 else [0.0, 0.0, -0.1]
+            body = body.add_body(pos=place)
+            axis = [[0, 1, 0], [1, 0, 0], [0, 0, 1]][number % 3]
+            body.add_joint(name=f"openarm_{side}joint{number}", axis=axis, range=[-2.0, 2.0])
+            body.add_geom(size=[0.02, 0.0, 0.0], pos=[0.0, 0.0, -0.05], mass=0.5)
+    spec.compile()
+    return spec.to_xml()
+
+
+ARM = tuple(f"joint_{number}" for number in range(1, 8))
+
+
+@pytest.mark.parametrize(
+    ("robot", "side", "sides", "key"),
+    [
+        ("openarm_follower", None, ("",), ""),
+        ("openarm_follower", "right", ("left_", "right_"), ""),
+        ("bi_openarm_follower", "left", ("left_", "right_"), "left_"),
+        ("bi_openarm_follower", "right", ("left_", "right_"), "right_"),
+    ],
+)
+def test_openarm_moves_the_joints_of_its_description(
+    robot: str, side: Any, sides: tuple[str, ...], key: str
+) -> None:
+    """Names, degrees, signs and zeros as LeRobot's openarm_kinematics.py has them: a joint's angle
+    is its value in rad. Catches the other arm's joints, and values of it that change."""
+    model = openarm(*sides)
+    arm = LeRobotArm(
+        settings(robot=robot, side=side, model=model, joints={"*": 300.0}, calibration={})
+    )
+    assert arm.motors == tuple(f"{key}{name}" for name in ARM)
+    values = 10.0 * np.arange(1, 8)
+    names = ("left_", "right_") if key else ("",)
+    action = {
+        f"{arm_key}{name}.pos": value
+        for arm_key in names
+        for name, value in zip((*ARM, "gripper"), [*values, -30.0], strict=True)
+    }
+    found = arm.command(action)
+    joints = [f"openarm_{f'{side}_' if side else ''}joint{number}" for number in range(1, 8)]
+    compensator = PositionCompensator.from_model(model, {"*": 300.0}, joints=joints)
+    moved = [f"{key}{name}.pos" for name in ARM]
+    expected = np.rad2deg(compensator.command(np.deg2rad(values)))
+    np.testing.assert_allclose([found[name] for name in moved], expected)
+    assert np.abs(expected - values).max() > 0.1
+    assert {name for name in found if found[name] != action[name]} <= set(moved)
 
 
 @pytest.mark.parametrize("use_degrees", [True, False])
@@ -210,6 +268,11 @@ def test_a_reset_begins_the_ramp_anew() -> None:
     [
         ({"robot": "so10_follower"}, "Did you mean 'so10"),
         ({"robot": "openarm_follower", "use_degrees": False}, "in degrees always"),
+        ({"robot": "bi_so_follower"}, "has two arms; say side: left or right"),
+        (
+            {"robot": "openarm_follower", "model": openarm("left_", "right_")},
+            "no joint 'openarm_joint1' .* say side where the model has two arms",
+        ),
         ({"calibration": {}}, "lacks the motor 'shoulder_pan'"),
         ({"calibration": "nowhere.json"}, "no calibration at nowhere.json"),
         ({"places": {"elbow": None}}, "unknown motor 'elbow'"),
@@ -268,10 +331,19 @@ def test_a_value_that_is_none_is_refused_and_changes_nothing(
     assert arm.command(goals()) == LeRobotArm(settings(ramp_s=1.0)).command(goals())
 
 
-def test_units_that_are_exchanged_are_said_once() -> None:
-    """Degrees to a robot in −100 to 100, of an elbow that cannot be at 140."""
-    arm = LeRobotArm(settings(use_degrees=False))
-    with pytest.warns(UserWarning, match=r"does use_degrees say"):
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("use_degrees", "ends"), [(False, "-100 to 100"), (True, "-96.7 to 96.7")])
+def test_units_that_are_exchanged_are_refused_before_anything_moves(
+    use_degrees: bool, ends: str
+) -> None:
+    """Degrees to a robot in −100 to 100, of an elbow that cannot be at 140; one sentence, and no
+    warning beside it. Later values may leave the range, as those of a leader do."""
+    arm = LeRobotArm(settings(use_degrees=use_degrees, places={"wrist_roll": None}))
+    for what in (arm.command, arm.link_angles):
+        with pytest.raises(ActionError, match=rf"is 140, and .* is {ends}: say use_degrees"):
+            what(goals(140.0))
+    arm.command(goals())
+    with pytest.warns(UserWarning, match="beyond its range"):
         arm.command(goals(140.0))
 
 

@@ -123,6 +123,7 @@ def test_columns_are_known_by_their_names(names: Any, tmp_path: Path) -> None:
         ("so_follower", "so101_follower"),
         ("so100", "so100_follower"),
         ("koch", "koch_follower"),
+        ("bi_openarm_follower", "bi_openarm_follower"),
     ],
 )
 def test_the_robot_is_that_of_the_data_set(said: str, robot: str, tmp_path: Path) -> None:

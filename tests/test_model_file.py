@@ -16,10 +16,11 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environment
 from baselines import PositionCompensator
-from elastic_env import ElasticJoint, make_elastic
+from elastic_env import ElasticJoint, Servo, make_elastic
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.model_file import compiled_model, read_model
 from elastic_env.joint.supported_models import coupled_fingers
+from elastic_env.robots.robot.model import read_robot
 from train.commands.robot import Robot, robot_arguments, write_robot
 
 INERTIAL = (
@@ -149,6 +150,63 @@ def test_what_no_joint_of_a_model_can_cure_is_said_first(
     with pytest.raises(ConfigurationError, match=message) as other:
         PositionCompensator.from_model(model, joints)
     assert str(one.value) == str(other.value)
+
+
+ELASTIC = ElasticJoint(stiffness=400.0, damping=2.0, rotor_inertia=0.05)
+
+
+@pytest.mark.parametrize("model", [SLIDES, SLIDES.replace('name="j1" type="slide"', "")])
+def test_a_model_without_a_named_hinge_is_refused_by_all_three(model: str) -> None:
+    """Catches an elastic model without elastic joints."""
+    (refused,) = set(refusals(model))
+    with pytest.raises(ConfigurationError) as error:
+        make_elastic(model, {})
+    assert str(error.value) == refused
+
+
+@pytest.mark.parametrize("flag", ["spring", "damper"])
+def test_a_flag_that_turns_elastic_joints_off_is_refused_by_all_three(flag: str) -> None:
+    """Catches links that hang on no spring, or swing for ever, without a word."""
+    model = mjcf(head=f'<option><flag {flag}="disable"/></option>')
+    (refused,) = set(refusals(model))
+    assert f'<flag {flag}="disable"/> in <option>' in refused
+    with pytest.raises(ConfigurationError) as error:
+        make_elastic(model, {"j2": ELASTIC})
+    assert str(error.value) == refused
+
+
+@pytest.mark.parametrize("flag", ["frictionloss", "constraint"])
+def test_a_flag_that_turns_friction_off_is_refused_where_joints_have_some(flag: str) -> None:
+    """Catches a friction of the joints that is nowhere in the simulation, and a loop that does not
+    act and is a reason to refuse."""
+    model = mjcf(head=f'<option><flag {flag}="disable"/></option>')
+    message = f'<flag {flag}="disable"/> in <option>'
+    rubbing = ELASTIC.replace(coulomb_friction=0.5)
+    with pytest.raises(ConfigurationError, match=message):
+        make_elastic(model, {"j2": rubbing})
+    with pytest.raises(ConfigurationError, match=message):
+        robot(model, {"*": {"stiffness": 400.0, "coulomb_friction": 0.5}})
+    make_elastic(model, {"j2": ELASTIC})
+    np.testing.assert_allclose(torque(model), TORQUE, rtol=1e-6)
+    if flag == "constraint":
+        looped = mjcf(HAND, LOOP, head=f'<option><flag {flag}="disable"/></option>')
+        PositionCompensator.from_model(looped, 400.0)
+
+
+def test_a_servo_needs_actuation() -> None:
+    """Catches a servo that is added to a model whose actuators are off."""
+    model = mjcf(head='<option><flag actuation="disable"/></option>')
+    make_elastic(model, {"j2": ELASTIC})
+    servo = Servo(position_gain=500.0, torque_limit=50.0, speed_limit=5.0)
+    with pytest.raises(ConfigurationError, match='<flag actuation="disable"/>'):
+        make_elastic(model, {"j2": ELASTIC.replace(servo=servo)})
+
+
+def test_an_arm_whose_bodies_have_no_name_is_played() -> None:
+    """Catches an end effector that is only found by name."""
+    nameless = mjcf().replace('body name="a"', "body").replace('body name="b"', "body")
+    assert [body.name for body in read_robot(nameless).bodies] == ["world", "body_1", "body_2"]
+    robot(nameless).close()
 
 
 LOOPED = mjcf(HAND, LOOP)
@@ -487,6 +545,32 @@ def test_fingers_that_mimic_one_another_are_held_unless_they_are_named() -> None
             read()
     couple = '<equality><joint joint1="j1" joint2="j2"/></equality>'
     assert coupled_fingers(mujoco.MjModel.from_xml_string(mjcf(HAND, couple))) == []
+
+
+SIDE = (
+    '<body name="d{0}" pos="{1} 0 0.3"><joint name="g{0}" axis="0 1 0"/>{2}<body name="f{0}"'
+    ' pos="0 0 0.04"><joint name="t{0}" axis="0 1 0"/>{2}</body></body><body name="k{0}"'
+    ' pos="{3} 0 0.3"><joint name="k{0}" axis="0 1 0"/>{2}</body>'
+)
+PAD = '<geom type="box" size="0.01 0.01 0.02" pos="0 0 0.02" mass="0.02"/>'
+LINKAGE = SIDE.format("l", 0.03, PAD, 0.01) + SIDE.format("r", -0.03, PAD, -0.01)
+CLOSED = "".join(
+    f'<connect body1="f{side}" body2="k{side}" anchor="0 0 0.02"/>' for side in ("l", "r")
+)
+
+
+def test_a_gripper_whose_linkage_closes_loops_is_held() -> None:
+    """Catches an arm that is refused for its gripper: fingers of four bars, left and right coupled.
+    Without a coupling they may be a parallelogram that carries the load."""
+    model = mjcf(LINKAGE, f'<equality>{CLOSED}<joint joint1="gl" joint2="gr"/></equality>')
+    with pytest.warns(UserWarning, match="gl, tl, kl, gr, tr, kr are coupled in the model"):
+        env = robot(model)
+    assert list(env.unwrapped.task.config.joints) == ["j1", "j2"]
+    env.close()
+    with pytest.warns(UserWarning, match="gl, tl, kl, gr, tr, kr are coupled in the model"):
+        found = PositionCompensator.from_model(model, 400.0)
+    assert found.joints == ("j1", "j2")
+    assert "equality constraint of" in refusals(mjcf(LINKAGE, f"<equality>{CLOSED}</equality>"))[0]
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ policies: [input, {name: "residual:testbed/seed_0", label: residual}]
 """
 
 
+@pytest.mark.slow
 def test_a_residual_stands_beside_the_one_of_the_package_and_a_second_call_goes_on(
     tmp_path: Path,
 ) -> None:

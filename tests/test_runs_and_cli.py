@@ -863,6 +863,7 @@ def test_identify_writes_result_and_figure(
 SPEED = ["speed", "--steps", "3", "--rounds", "1", "--threads", "1"]
 
 
+@pytest.mark.slow
 def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a contender that is measured and not reported, and one that is compared with
     another's reference."""

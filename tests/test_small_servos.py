@@ -110,22 +110,20 @@ def test_an_emulated_servo_refuses_a_motor() -> None:
         Joints(config, num_joints=1, start_s=0.0)
 
 
-def test_the_back_emf_is_part_of_the_damping_that_is_assumed() -> None:
-    """Catches a servo that is damped twice, by its motor and by an assumed velocity gain."""
+def test_a_servo_with_a_motor_is_braked_by_its_back_emf_alone() -> None:
+    """Catches an assumed velocity gain that no such servo has, and no compensator knows."""
     motor = SMALL_SERVOS["STS3215"].motor
     text = """<mujoco><worldbody><body name="link"><joint name="q" axis="0 -1 0"/>
       <inertial mass="1" pos="0 0 -0.1" diaginertia="0.001 0.001 0.001"/></body></worldbody>
     </mujoco>"""
-    braking = []
-    for servo in ({"position_gain": 20.0}, {"position_gain": 20.0, "motor": motor}):
-        own = {"stiffness": 400.0, "rotor_inertia": 0.02, "servo": {"torque_limit": 3.0, **servo}}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            config = configure_robot(text, {"q": own})
-        made = config.joints["q"].servo
-        assert made is not None
-        braking.append(made.braking)
-    assert braking[1] == pytest.approx(max(braking[0], motor.damping))
+    servo = {"position_gain": 20.0, "torque_limit": 3.0, "motor": motor}
+    own = {"stiffness": 400.0, "rotor_inertia": 0.02, "servo": servo}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        config = configure_robot(text, {"q": own})
+    made = config.joints["q"].servo
+    assert made is not None
+    assert made.braking == motor.damping
 
 
 SWUNG = Pendulum(gravity_torque=1.0, mass=1.0, gyration_radius=0.03)

@@ -345,7 +345,7 @@ def test_tables_say_median_worst_and_falls() -> None:
         for line in text.splitlines()
         if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
     )
-    assert first.count("3.00 [2.00, 4.00] (4.00)") == 5  # roll, pitch and IMU
+    assert first.count("3.00 [2.00, 4.00] (4.00)") == 6  # pelvis, roll, pitch and IMU
     assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
     assert third.count("(4.00)") == 2  # pelvis error of both blocks of steps
     for line in (first, second, third):

@@ -325,22 +325,22 @@ class DynamicCompensator(Compensator):
 
         The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
         """
-        dt = self._dt
-        before = memory.deflection
         torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
         torque = torque + self._viscous * motion.q_dot
         friction = memory.friction
         if self._rubs:
-            friction = self._friction.follow(motion.q_dot * dt, friction)
+            friction = self._friction.follow(motion.q_dot * self._dt, friction)
             torque = self._friction.passed(torque, motion.q_dot, friction)
-        target = elasticity.static_deflection(torque, self._stiffness, self._backlash)
-        deflection = settle(before, target, self._stiffness, self._drives, dt)
-        rate = (deflection - before) / dt
-        theta_dot = motion.q_dot + rate
-        theta_ddot = motion.q_ddot + (rate - memory.rate) / dt
-        motor = (theta_dot, theta_ddot)
-        error, windup = servo_error(*motor, torque, memory.windup, self._drives, dt)
-        offset = deflection + error - 0.5 * dt * theta_dot  # it is held too early
+        offset, deflection, rate, windup = lead_motors(
+            torque=torque,
+            target=elasticity.static_deflection(torque, self._stiffness, self._backlash),
+            q_dot=np.ascontiguousarray(motion.q_dot),
+            q_ddot=np.ascontiguousarray(motion.q_ddot),
+            before=(memory.deflection, memory.rate, memory.windup),
+            stiffness=self._stiffness,
+            drives=self._drives,
+            period_s=self._dt,
+        )
         return offset, DriveMemory(deflection, rate, windup, friction)
 
     @override
@@ -374,59 +374,56 @@ DRIVE = record_type(
 
 
 @compiled
-def settle(
-    deflection: Array, target: Array, stiffness: Array, drives: Any, period_s: float
+def lead_motors(
+    torque: Array,
+    target: Array,
+    q_dot: Array,
+    q_ddot: Array,
+    before: tuple[Array, Array, Array],
+    stiffness: Array,
+    drives: Any,
+    period_s: float,
 ) -> Array:
-    """Deflections after a control period in which the dampers let them settle, (worlds, n) [rad].
+    """Offsets by which motors lead along a motion, and what `DriveMemory` keeps of it.
 
     Args:
-        deflection: Before, (worlds, n) [rad].
-        target: At rest under the joint torque, (worlds, n) [rad].
+        torque: Joint torques τ_J, (worlds, n) [N·m].
+        target: Deflections at rest under them, (worlds, n) [rad].
+        q_dot: Rates of the links, (worlds, n) [rad/s].
+        q_ddot: Their accelerations, (worlds, n) [rad/s²].
+        before: Deflection, its rate and the integral of the servo error, (worlds, n) each.
         stiffness: K of the worlds, (worlds, n), or of all, (1, n) [N·m/rad].
         drives: Rows of `DRIVE`, one per joint, (n,).
         period_s: Control period [s].
+
+    Returns:
+        Offset, and the three of `before` after the control period, (4, worlds, n).
     """
-    settled = np.empty(target.shape)
-    for world in range(len(target)):
+    deflection, rate, windup = before
+    found = np.zeros((4, *torque.shape))
+    for world in range(len(torque)):
         K = stiffness[min(world, len(stiffness) - 1)]
         for i in range(len(drives)):
-            lag_s = drives[i].damping / K[i]
-            before = deflection[world, i]
-            settled[world, i] = follow_lag(before, target[world, i], lag_s, period_s)
-    return settled
-
-
-@compiled
-def servo_error(
-    rate: Array, rate_dot: Array, torque: Array, windup: Array, drives: Any, dt: float
-) -> tuple[Array, Array]:
-    """Errors that servos need to move rotors under loads [rad], and their integrals [rad·s].
-
-    The integrals are those after a control period.
-
-    Args:
-        rate: Of the motor sides, θ̇, (worlds, n) [rad/s].
-        rate_dot: Their acceleration, θ̈ [rad/s²].
-        torque: Joint torques [N·m].
-        windup: Integrals of the errors before [rad·s].
-        drives: Rows of `DRIVE`, one per joint, (n,).
-        dt: Control period [s].
-    """
-    errors = np.empty(torque.shape)
-    integrals = np.zeros(torque.shape)
-    for world in range(len(torque)):
-        for i in range(len(drives)):
             drive = drives[i]
-            effort = drive.rotor_inertia * rate_dot[world, i] + torque[world, i]
-            effort += drive.braking * rate[world, i]
+            last = deflection[world, i]
+            bent = follow_lag(last, target[world, i], drive.damping / K[i], period_s)
+            bending = (bent - last) / period_s
+            theta_dot = q_dot[world, i] + bending
+            theta_ddot = q_ddot[world, i] + (bending - rate[world, i]) / period_s
+            effort = drive.rotor_inertia * theta_ddot + torque[world, i]
+            effort += drive.braking * theta_dot
             k_i = drive.integral_gain
+            integral = 0.0
             if k_i > 0.0:  # k_p e + k_i ∫e = effort
                 lag_s = drive.position_gain / k_i
-                before = windup[world, i]
-                integrals[world, i] = follow_lag(before, effort / k_i, lag_s, dt)
-            effort -= k_i * integrals[world, i]
-            errors[world, i] = effort / drive.position_gain
-    return errors, integrals
+                integral = follow_lag(windup[world, i], effort / k_i, lag_s, period_s)
+            error = (effort - k_i * integral) / drive.position_gain
+            # it is held too early
+            found[0, world, i] = bent + error - 0.5 * period_s * theta_dot
+            found[1, world, i] = bent
+            found[2, world, i] = bending
+            found[3, world, i] = integral
+    return found
 
 
 @compiled

@@ -112,6 +112,7 @@ class CompensatorConstants:
         friction: What is known of dry friction; None where it is not compensated.
         viscous: Viscous friction, used with dry friction alone, (n,) [N·m·s/rad].
         lag_s: Lag of the servos, likewise, (n,) [s].
+        rotor_s2: Lag behind an acceleration, B/k_p, likewise, (n,) [s²].
     """
 
     model: mujoco.MjModel
@@ -127,6 +128,7 @@ class CompensatorConstants:
     friction: FrictionCompensation | None
     viscous: Array
     lag_s: Array
+    rotor_s2: Array
 
 
 class PositionCompensator:
@@ -143,8 +145,8 @@ class PositionCompensator:
         stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number,
             `rigid`, `held`, or a mapping as `elastic_env.joint.joint_settings` reads it. Of such a
             mapping K and the servo's k_p and k_i are used; with `friction` also dry and viscous
-            friction, and by how much k_v and the back-EMF let the servo lag. Otherwise these act on
-            the way to rest alone, as damping and rotor inertia do. Backlash is refused.
+            friction, and by how much k_v, the back-EMF and the rotor let the servo lag. Otherwise
+            these act on the way to rest alone, as damping does. Backlash is refused.
         joints: Hinges that are commanded, in the order of the arrays; None for all that are not
             held, in the order of the model. The other joints are held where the model's first
             keyframe has them, or at its reference.
@@ -202,6 +204,7 @@ class PositionCompensator:
         self._friction = _friction(settings, friction)
         self._viscous = np.array([one.viscous_friction or 0.0 for one in settings.values()])
         self._lag_s = np.array([one.servo.braking for one in settings.values()]) / gains
+        self._rotor_s2 = np.array([one.rotor_inertia or 0.0 for one in settings.values()]) / gains
         self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[at].max())
         self.reset()
@@ -250,6 +253,7 @@ class PositionCompensator:
             friction=self._friction,
             viscous=self._viscous,
             lag_s=self._lag_s,
+            rotor_s2=self._rotor_s2,
         )
 
     def reset(self) -> None:
@@ -394,14 +398,17 @@ class PositionCompensator:
         torque = self._torque(*motion)
         if self._friction is None:
             return self._of_command * torque
-        q, q_dot, _ = motion
+        q, q_dot, q_ddot = motion
         displacement = np.zeros_like(q) if self._asked is None else q - self._asked[0]
         slack = self._rubbed.slack
         self._rubbed = self._friction.follow(displacement, self._rubbed)
         if q_dot is None:  # without what trembles
             q_dot = (displacement + slack - self._rubbed.slack) / self._period_s
         passed = self._friction.passed(torque + self._viscous * q_dot, q_dot, self._rubbed)
-        return self._of_command * passed + self._lag_s * q_dot
+        lag = self._lag_s * q_dot
+        if q_ddot is not None:
+            lag = lag + self._rotor_s2 * q_ddot
+        return self._of_command * passed + lag
 
     def _passed_along(self, motion: _Motion) -> Array:
         """Torque that is passed to links at a motion, by the side of the last commands, (n,)."""

@@ -22,7 +22,7 @@ _FAR_RAD = 0.35
 _TURN_RAD = 6.0
 """Width from which a calibrated range is a whole turn, and not that of the joint."""
 _BEYOND = 1.3
-"""Share of LeRobot's range beyond which a value has another unit."""
+"""Share of LeRobot's range beyond which the first value has another unit."""
 
 
 class LeRobotArm:
@@ -34,7 +34,7 @@ class LeRobotArm:
     Attributes:
         settings: With the content of the files of joints and calibration in place of their names.
         compensator: In rad, for the joints of `motors`.
-        motors: Names of the motors that are compensated, (n,).
+        motors: Names of the motors that are compensated, as in actions, (n,).
         units: LeRobot's values and angles of these.
 
     Args:
@@ -55,7 +55,7 @@ class LeRobotArm:
         self.settings = settings.replace(calibration=calibration, joints=_without_infinity(content))
         model = compiled_model(settings.model)
         moved = _moved(settings, hinges_of(model), content)
-        self.motors = tuple(motor.name for motor, _ in moved)
+        self.motors = tuple(f"{settings.prefix}{motor.name}" for motor, _ in moved)
         places = [place for _, place in moved]
         self.units = units_of([motor for motor, _ in moved], places, calibration)
         self.compensator = PositionCompensator(
@@ -69,7 +69,7 @@ class LeRobotArm:
             friction=settings.friction,
         )
         self._keys = [f"{name}.pos" for name in self.motors]
-        self._has_said_range = False
+        self._is_checked = False
         self._warn_of_zeros(places)
 
     def reset(self) -> None:
@@ -86,7 +86,8 @@ class LeRobotArm:
             The same with compensated values, within LeRobot's ranges.
 
         Raises:
-            ActionError: A value is missing, or no finite number; nothing changes.
+            ActionError: A value is missing, or no finite number, or the first one has another unit;
+                nothing changes.
         """
         wanted = self._values("action", action)
         found = self.units.value(self.compensator.command(self.units.angle(wanted)))
@@ -120,21 +121,21 @@ class LeRobotArm:
                 f"the {what} must hold numbers at {', '.join(self._keys)}, got"
                 f" {quote([given[key] for key in self._keys])}"
             ) from None
-        if not self._has_said_range:
-            self._warn_of_range(values)
+        if not self._is_checked:
+            self._require_units(values)
+            self._is_checked = bool(np.isfinite(values).all())
         return values
 
-    def _warn_of_range(self, values: Array) -> None:
-        """Say once that a value is so far beyond LeRobot's range that it has another unit."""
+    def _require_units(self, values: Array) -> None:
+        """Refuse values that are so far beyond LeRobot's range that they have another unit."""
         middle = self.units.centre
-        beyond = np.abs(values - middle) > _BEYOND * (self.units.highest - middle)
-        if beyond.any():
-            self._has_said_range = True
-            worst = int(np.argmax(beyond))
-            ends = f"{self.units.lowest[worst]:.4g} to {self.units.highest[worst]:.4g}"
-            _warn(
-                f"{self._keys[worst]} is {values[worst]:.4g}, and LeRobot's range is {ends}: does"
-                " use_degrees say what the robot's configuration says?"
+        beyond = np.abs(values - middle) / (self.units.highest - middle)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > _BEYOND:
+            raise ActionError(
+                f"{self._keys[worst]} is {values[worst]:.4g}, and LeRobot's range is"
+                f" {self.units.lowest[worst]:.4g} to {self.units.highest[worst]:.4g}: say"
+                " use_degrees as the robot's configuration does"
             )
 
     def _warn_of_zeros(self, places: Sequence[JointPlace]) -> None:
@@ -142,9 +143,9 @@ class LeRobotArm:
         lower, upper = self.units.ends
         known = self.compensator.constants
         middle = 0.5 * (known.lowest + known.highest)
-        off = 0.5 * (lower + upper) - middle
-        is_turn = ~(upper - lower < _TURN_RAD)
-        for joint in np.flatnonzero(np.isfinite(off) & ~is_turn & (np.abs(off) > _FAR_RAD)):
+        off = np.abs(self.units.offset - middle)
+        has_range = np.isfinite(off) & (upper - lower < _TURN_RAD)
+        for joint in np.flatnonzero(has_range & (off > _FAR_RAD)):
             place = places[int(joint)]
             _warn(
                 f"LeRobot's zero of {self.motors[joint]} is the middle of the calibrated range, and"
@@ -164,11 +165,14 @@ def _moved(
         if place is None:
             continue
         joint = place.joint or motor.name
+        if place.joint is None and motor.joint is not None and joint not in hinges:
+            joint = motor.joint.replace("*", f"{settings.side}_" if settings.side else "")
         if joint not in hinges:
             raise ConfigurationError(
                 f"the model has no joint {joint!r} for the motor {motor.name!r}; name it by"
-                f" places={{{motor.name!r}: {{'joint': NAME}}}}, or give None for a motor that"
-                f" keeps its goal; {choices_listed(joint, hinges)}"
+                f" places={{{motor.name!r}: {{'joint': NAME}}}}, give None for a motor that keeps"
+                f" its goal, or say side where the model has two arms;"
+                f" {choices_listed(joint, hinges)}"
             )
         if not _is_held(content, joint):
             found.append((motor, place.replace(joint=joint)))

@@ -19,6 +19,8 @@ Units = Literal["degrees", "range", "percent"]
 """Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
 GRIPPER = "gripper"
 """Motor that keeps its goal, unless a place says which joint it moves."""
+_TWO_ARMS = "bi_"
+"""Begin of the type of a robot with two arms."""
 _COUNTS = 2**31
 _MOST_BYTES = 1_000_000
 
@@ -30,6 +32,8 @@ class Motor(Model):
     units: Units
     counts_per_turn: int | None = None
     """None for a motor that is read in degrees [1]."""
+    joint: Title | None = None
+    """Joint of the maker's model, with * for the side; default the motor's name."""
 
 
 class MotorCalibration(Model):
@@ -73,6 +77,8 @@ class ArmSettings(Model):
 
     robot: Title = "so101_follower"
     """Type of the robot, as LeRobot names it."""
+    side: Literal["left", "right"] | None = None
+    """Which arm, where the robot or the model has two; each needs a step of its own."""
     model: str
     """Model of the arm: a file of MJCF or URDF, or the text of one."""
     joints: str | float | dict[str, Any]
@@ -99,9 +105,16 @@ class ArmSettings(Model):
     """Whether dry friction is compensated; default where any of it grows with the load."""
 
     @model_validator(mode="after")
-    def _places_are_of_its_motors(self) -> Self:
+    def _motors_are_its_own(self) -> Self:
         require_known("motor", self.places, [motor.name for motor in self.motors])
+        if self.side is None and self.robot.startswith(_TWO_ARMS):
+            raise ValueError(f"{self.robot} has two arms; say side: left or right")
         return self
+
+    @property
+    def prefix(self) -> str:
+        """Before the names of motors in actions and observations of a robot with two arms."""
+        return f"{self.side}_" if self.robot.startswith(_TWO_ARMS) else ""
 
     @property
     def motors(self) -> tuple[Motor, ...]:
@@ -127,6 +140,7 @@ def _known_motors() -> dict[str, tuple[Motor, ...]]:
             name=row["motor"],
             units=_units(row["units"]),
             counts_per_turn=int(counts) if counts else None,
+            joint=row["joint"] or None,
         )
         found[row["robot"]] = (*found.get(row["robot"], ()), motor)
     return found

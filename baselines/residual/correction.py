@@ -181,7 +181,7 @@ class Channels:
             residual: Within [−1, 1], (num_worlds, k).
             share: 1 for all of the way.
         """
-        return values + share * (self.bounds * residual[:, self.source] - values)
+        return values + share * (self.bounds * residual.take(self.source, axis=1) - values)
 
     def parts(self, values: Array) -> dict[str, Array]:
         """Values by input, (..., width) to (..., columns of the input)."""

@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from elastic_env.core.compiled import compiled
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray, Signal
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
@@ -88,14 +89,7 @@ class StandingEstimate(PolicyAround):
         steps = round(STAND_S / model.control_period_s) - self._samples
         waiting = np.zeros(self._samples)
         self._ramp = np.concatenate([waiting, minimum_jerk(np.arange(steps + 1) / steps)])
-        per_mean = np.array(
-            [
-                [gains.zmp_x, 0.0],
-                [0.0, gains.zmp_y],
-                [0.0, gains.roll_m_rad],
-                [gains.pitch_m_rad, 0.0],
-            ]
-        )
+        per_mean = np.array([[gains.zmp_x, gains.pitch_m_rad], [gains.zmp_y, gains.roll_m_rad]])
         self._per_total = per_mean / self._samples
         self._constant = np.array([gains.constant_m, 0.0])
         self._limit = gains.limit_m
@@ -129,9 +123,30 @@ class StandingEstimate(PolicyAround):
             total = total + rests[:, None] * shown
             vertical = force[:, 0, 2] + force[:, 1, 2]
             load = load + rests * (vertical / self._weight - 1.0)
-        error = total @ self._per_total + self._constant
-        shift = np.minimum(np.maximum(-error, -self._limit), self._limit)
-        shift *= self._ramp.take(steps, mode="clip")[:, None]
-        zmp = shift if inputs.zmp is None else inputs.zmp + shift
+        zmp = np.zeros((len(rows), 2)) if inputs.zmp is None else inputs.zmp.copy()
+        gains = (self._per_total, self._constant, self._limit)
+        shift_for_walk(gains, self._ramp, steps, total, zmp)
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, StandingMemory(steps, total, load, inner)
+
+
+@compiled
+def shift_for_walk(gains: Any, ramp: Array, steps: IntArray, total: Array, zmp: Array) -> None:
+    """Add the shift of the planned ZMP by what the robots showed at rest.
+
+    Args:
+        gains: Error of the walk per sum of ZMP errors and of tilts, forward and to the left, (2, 2)
+            [1], [m/rad]; its constant part, (2,) [m]; largest shift [m].
+        ramp: Share of the shift after 0, 1, ... control steps, up to the last one [1].
+        steps: Control steps since the start of the episode, (n,).
+        total: Sums of `StandingMemory`, (n, 4).
+        zmp: To be added to, (n, 2) [m].
+    """
+    per_total, constant, limit = gains
+    for world in range(len(zmp)):
+        share = ramp[min(steps[world], len(ramp) - 1)]
+        for axis in range(2):
+            tilt = total[world, 3 - axis]  # pitch forward, roll to the left
+            error = total[world, axis] * per_total[axis, 0] + tilt * per_total[axis, 1]
+            error += constant[axis]
+            zmp[world, axis] += share * min(max(-error, -limit), limit)

@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
 from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from elastic_env.core.compiled import compiled
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalGroup
 from elastic_env.world.robot_model import WalkerModel
@@ -78,9 +79,28 @@ class ZmpOffset(PolicyAround):
     @override
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> Step:
         """Its shift adds to the input `zmp`."""
-        error = self._feet.zmp_error(rows)
-        shift = memory.shift - self._rate * np.where(np.isnan(error), 0.0, error)
-        shift = np.minimum(np.maximum(shift, -self._limit), self._limit)
-        zmp = shift if inputs.zmp is None else inputs.zmp + shift
+        shift = memory.shift.copy()
+        zmp = np.zeros_like(shift) if inputs.zmp is None else inputs.zmp.copy()
+        integrate(self._feet.zmp_error(rows), self._rate, self._limit, shift, zmp)
         action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
         return action, ZmpOffsetMemory(shift, inner)
+
+
+@compiled
+def integrate(error: Array, rate: float, limit: float, shift: Array, zmp: Array) -> None:
+    """Integrate ZMP errors into the shifts, in place, and add these to the planned ZMP.
+
+    Args:
+        error: Measured less planned ZMP, (n, 2) [m]; nan where the feet carry too little.
+        rate: Share of the error that is taken off in a control period [1].
+        limit: Largest shift forward and sideways [m].
+        shift: Of `ZmpOffsetMemory`, (n, 2) [m].
+        zmp: To be added to, (n, 2) [m].
+    """
+    for world in range(len(shift)):
+        for axis in range(2):
+            missed = error[world, axis]
+            if not np.isnan(missed):
+                moved = shift[world, axis] - rate * missed
+                shift[world, axis] = min(max(moved, -limit), limit)
+            zmp[world, axis] += shift[world, axis]

@@ -47,7 +47,9 @@ class ServoSettings(Model):
     position_gain: float | None = quantity("N·m/rad", None, ge=SOFTEST)
     """k_p; default that of the model's position actuator, else 50 K [N·m/rad]."""
     velocity_gain: float | None = quantity("N·m·s/rad", None, ge=0)
-    """k_v; default what damps the model's actuator, else critical damping [N·m·s/rad]."""
+    """k_v; default what damps the model's actuator; else 0 beside a position gain and a motor,
+    whose back-EMF brakes; else critical damping [N·m·s/rad].
+    """
     integral_gain: float | None = quantity("N·m/(rad·s)", None, ge=0)
     """k_i; default 0 beside a position gain, else that of the model's actuator, else 5 k_p per
     second [N·m/(rad·s)].

@@ -27,7 +27,7 @@ from elastic_env.joint.joint_names import friction_name, motor_name, servo_name,
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.motor import Motor
-from elastic_env.joint.supported_models import require_few
+from elastic_env.joint.supported_models import require_few, require_flags, require_hinge
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 from elastic_env.joint.varying_friction import add_terms, varies
 
@@ -68,9 +68,10 @@ def make_elastic(
     MuJoCo simulates whatever acts on the joints. So this function takes models that `Robot-v0` and
     `PositionCompensator` refuse, since they have to know every torque in advance: floating bases
     and ball joints; loops and other equality constraints; tendons that pull; drives by a tendon, a
-    site or a slider-crank; springs that are not linear; deformable bodies, plugins and wind; and
-    flags that turn gravity, springs or actuators off. What they refuse it for is in one place,
-    `elastic_env.joint.supported_models`. Models that contradict themselves nobody takes.
+    site or a slider-crank; springs that are not linear; deformable bodies, plugins and wind; and a
+    flag that turns gravity off. What they refuse it for is in one place,
+    `elastic_env.joint.supported_models`. Nobody takes models that contradict themselves, that have
+    no hinge, or whose flags turn springs, dampers, the servo or the friction of the joints off.
 
     Args:
         spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see
@@ -85,16 +86,18 @@ def make_elastic(
 
     Raises:
         ConfigurationError: The model cannot be read or compiled; unknown form or hinge, a joint
-            that is no hinge, or a name that is already taken. Or `implicitfast` does not follow the
-            joints either at the physics step of the model; the message names the largest step at
-            which it does.
+            that is no hinge, or a name that is already taken; no hinge at all, or a flag that turns
+            off what a joint has. Or `implicitfast` does not follow the joints either at the physics
+            step of the model; the message names the largest step at which it does.
 
     Warns:
         UserWarning: The integrator was changed, a servo is left out because the hinge keeps its
             actuators, or friction changes with load or speed, which needs a call before every step.
     """
     require_few(joints)
-    elastic = transform_hinges(read_model(spec).spec, joints, form, actuators)
+    read = read_model(spec)
+    require_hinge(read.model)
+    elastic = transform_hinges(read.spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
     changing = [name for name, joint in joints.items() if varies(joint)]
@@ -120,12 +123,23 @@ def transform_hinges(
     """
     require_known("form", [form], get_args(Form))
     require_known("actuator rule", [actuators], get_args(ActuatorRule))
+    _require_flags(spec, joints)
     elastic = spec.copy()
     with carry_keyframes(elastic, list(joints)):
         _resolve_springdampers(elastic, list(joints))
         for name, joint in joints.items():
             _transform(elastic, _hinge(elastic, name), joint, form, actuators)
     return elastic
+
+
+def _require_flags(spec: MjSpec, joints: Mapping[str, ElasticJoint]) -> None:
+    """Refuse flags that turn off what the joints have."""
+    needed = ["spring", "damper"]
+    if any(joint.servo is not None for joint in joints.values()):
+        needed.append("actuation")
+    if any(joint.coulomb_friction > 0.0 or varies(joint) for joint in joints.values()):
+        needed += ["frictionloss", "constraint"]
+    require_flags(int(spec.option.disableflags), needed)
 
 
 def _choose_integrator(spec: MjSpec) -> None:

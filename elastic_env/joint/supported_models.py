@@ -28,12 +28,13 @@ _EQ_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _SITE = int(mujoco.mjtTrn.mjTRN_SITE)
 _SLIDERCRANK = int(mujoco.mjtTrn.mjTRN_SLIDERCRANK)
+_RESTING = ("gravity", "spring", "damper", "actuation")
+"""Flags of <option> that take away what bends a joint at rest, or what brings it there."""
 _FLAGS = {
-    int(mujoco.mjtDisableBit.mjDSBL_GRAVITY): "gravity",
-    int(mujoco.mjtDisableBit.mjDSBL_SPRING): "spring",
-    int(mujoco.mjtDisableBit.mjDSBL_ACTUATION): "actuation",
+    name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"))
+    for name in (*_RESTING, "frictionloss", "equality", "constraint")
 }
-"""Flags of <option> that take away what bends a joint, or what holds it."""
+"""Flags that say whether something acts on a joint, and their bits."""
 _POSES = (0.0, 0.37, -0.83)
 """Offsets from the home pose at which two joints about one axis would still have one axis [rad]."""
 _SINGULAR = 1e-10
@@ -97,17 +98,22 @@ def without_fingers(
 def coupled_fingers(model: mujoco.MjModel) -> list[str]:
     """Hinges of fingers that follow one another: coupled by equalities, side by side at the end.
 
-    Two fingers are on different branches, and carry no other joint. Coupled joints within the arm
-    are none.
+    Two fingers are on different branches, and carry no other joint. Loops may close within them.
+    Coupled joints within the arm are none, nor are loops without joints that are coupled, as of a
+    parallelogram.
     """
     groups: list[set[int]] = []
+    coupled: set[int] = set()
     for e in _active(model):
-        if model.eq_type[e] == _EQ_JOINT and model.eq_obj2id[e] >= 0:
-            pair = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}
-            joined = [group for group in groups if group & pair]
-            apart = [group for group in groups if not group & pair]
-            groups = [*apart, pair.union(*joined)]
-    fingers = [j for group in groups if _is_gripper(model, group) for j in group]
+        acts, _ = _equality(model, e)
+        if len(acts) > 1:
+            joined = [group for group in groups if group & acts]
+            apart = [group for group in groups if not group & acts]
+            groups = [*apart, acts.union(*joined)]
+        if len(acts) > 1 and model.eq_type[e] == _EQ_JOINT:
+            coupled |= acts
+    hands = [group for group in groups if group & coupled and _is_gripper(model, group)]
+    fingers = set().union(*hands)
     names = [model.joint(j).name for j in _hinges(model) if j in fingers]
     return [name for name in names if name]
 
@@ -132,6 +138,15 @@ def require_robot(model: mujoco.MjModel) -> None:
                 " slides are needed: the torque of a floating robot depends on its contacts."
                 " Without compensation elastic_env.make_elastic takes it"
             )
+    require_hinge(model)
+
+
+def require_hinge(model: mujoco.MjModel) -> None:
+    """Refuse a model of which no joint can be elastic.
+
+    Raises:
+        ConfigurationError: It has no hinge, or none with a name.
+    """
     if not _hinges(model):
         raise ConfigurationError(
             "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
@@ -152,6 +167,27 @@ def require_few(joints: Collection[str]) -> None:
         raise ConfigurationError(f"{problem}; {cure}")
 
 
+def require_flags(disabled: int, flags: Collection[str]) -> None:
+    """Refuse flags of a model that take away what its elastic joints need.
+
+    Args:
+        disabled: Its flags that are disabled, a bit each.
+        flags: Those that must not be.
+
+    Raises:
+        ConfigurationError: One of them is.
+    """
+    for flag in flags:
+        if disabled & _FLAGS[flag]:
+            cure = "take the flag out"
+            if flag == "gravity":
+                cure += "; for no gravity write gravity='0 0 0'"
+            raise ConfigurationError(
+                f'the model has <flag {flag}="disable"/> in <option>, with which its'
+                f" joints do not bend as they do on a robot; {cure}"
+            )
+
+
 def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     """Refuse a model in which something acts on the commanded joints that is not known in advance.
 
@@ -166,7 +202,8 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     """
     require_robot(model)
     ids = _ids_of(model, joints)
-    _require_flags(model)
+    require_flags(int(model.opt.disableflags), _RESTING)
+    _require_no_others(model)
     for e in _active(model):
         acts, ends = _equality(model, e)
         if acts & ids:
@@ -223,16 +260,8 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
     return {known[name] for name in joints}
 
 
-def _require_flags(model: mujoco.MjModel) -> None:
-    for bit, flag in _FLAGS.items():
-        if int(model.opt.disableflags) & bit:
-            cure = "take the flag out"
-            if flag == "gravity":
-                cure += "; for no gravity write gravity='0 0 0'"
-            raise ConfigurationError(
-                f'the model has <flag {flag}="disable"/> in <option>, with which its'
-                f" joints do not bend as they do on a robot; {cure}"
-            )
+def _require_no_others(model: mujoco.MjModel) -> None:
+    """Refuse what acts on all links."""
     unknown = "are not known in advance; take it out"
     if model.nflex:
         raise ConfigurationError(
@@ -251,7 +280,7 @@ def _require_flags(model: mujoco.MjModel) -> None:
 
 def _active(model: mujoco.MjModel) -> Iterator[int]:
     """Equality constraints that act from the start."""
-    if not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EQUALITY):
+    if not int(model.opt.disableflags) & (_FLAGS["equality"] | _FLAGS["constraint"]):
         yield from (e for e in range(model.neq) if model.eq_active0[e])
 
 

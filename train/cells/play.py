@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from elastic_env.core.errors import ElasticError
+from elastic_env.core.errors import ElasticError, SystemFailedError
 from train.cells.key import cell_key
 from train.cells.store import Store, UnfitCellError
 from train.evaluate import rollout
@@ -269,12 +269,15 @@ def _evaluate(
 ) -> list[Outcome]:
     """Evaluations, side by side, that report how many control steps they have played.
 
-    Where the policy fails beside others, each is played alone, to say which ones it fails in.
+    Where the policy fails beside others, or a robot does not stand, each is played alone, to say
+    which ones fail.
     """
     try:
         played = evaluate_together(conditions, _count(report), num_threads)
         return [Outcome(evaluation) for evaluation in played]
-    except rollout.PolicyFailedError as error:
+    except SystemFailedError:
+        raise
+    except ElasticError as error:
         if len(conditions) == 1:
             return [Outcome(error=error.with_traceback(None))]
     quiet = (lambda _: None, num_threads)

@@ -183,6 +183,8 @@ def configuration(path: Path, update: bool = False) -> Path:
     return _SHIPPED
 
 
+_UNITS = ("_m", "_rad", "_s", "_nm")
+"""Ends of the names of metrics."""
 _Figure = dict[str, Any]
 """A figure of a rollout: measured, accepted and largest value, and what is wrong in words.
 
@@ -194,6 +196,9 @@ several episodes, 95 %.
 def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Figure]:
     motion = found.condition.reference_name
     policy = f"{case.policy} {case.options}" if case.options else case.policy
+    known = [name for name in found.episodes[0] if name.endswith(_UNITS)]
+    if not found.num_failed:
+        require_known(f"metric of the {case.env}", case.figures, known)
     for metric, accepted in case.figures.items():
         score = _score(found, metric)
         measured = score and score.value
@@ -222,16 +227,10 @@ def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evalu
         who = f"{found.num_failed} of {len(found.episodes)} episodes"
         who = "the episode" if len(found.episodes) == 1 else who
         return f"{metric} has no value: {who} ended as {' and '.join(map(repr, ends))}"
-    episode = found.episodes[0]
-    if metric not in episode:
-        units = ("_m", "_rad", "_s", "_nm")
-        known = ", ".join(name for name in episode if name.endswith(units))
-        return f"{metric} is no metric of this episode; those are {known}"
     if measured is None:
         return f"{metric} of this episode is not a number"
     if bound is None:
-        accept = "elastic bench --update accepts it"
-        return f"{metric} is {measured:.4g}, and nothing was accepted yet; {accept}"
+        return f"{metric} is {measured:.4g}, and nothing was accepted yet; --update accepts it"
     if measured <= bound:
         return ""
     worse = f" ({_change(measured, accepted)})" if accepted else ""
@@ -268,6 +267,9 @@ def _table(figures: list[_Figure]) -> Table:
         for figure in own:
             _, metric, measured, interval, *bounds, problem = figure.values()
             verdict = "falls short" if problem else "kept"
+            if measured is not None and bounds[0] is not None:
+                is_better = measured < 2.0 * bounds[0] - bounds[1]
+                verdict = "better: --update keeps it" if is_better else verdict
             if figure["bound"] is None and figure["measured"] is not None:
                 verdict = "new"
             texts = ["-" if number is None else f"{number:.4g}" for number in (measured, *bounds)]

@@ -96,9 +96,9 @@ class Plain:
     def __init__(self, compensator: PositionCompensator) -> None:
         self.link_angle = compensator.link_angle
 
-    def command(self, q_desired: Any, q_dot: Any = None) -> Array:
+    def command(self, q_desired: Any, q_dot: Any = None, q_ddot: Any = None) -> Array:
         """The desired angles."""
-        del q_dot
+        del q_dot, q_ddot
         return np.array(q_desired, dtype=np.float64)
 
 

@@ -162,6 +162,12 @@ def run_arm_identification(
             "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
             " with columns time, goal and position by --log"
         )
+    for log in options.log:
+        if Path(log).is_file() and Path(log).stat().st_size == 0:
+            raise ConfigurationError(
+                f"the log {quote(log)[1:-1]} is empty; a log in time has the columns time, goal and"
+                " position, one of poses those of docs/identification.md"
+            )
     if options.robot is None:
         problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
         raise ConfigurationError(problem)

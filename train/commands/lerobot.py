@@ -1,7 +1,7 @@
 """`elastic lerobot`: recordings of LeRobot as logs of joints."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -32,6 +32,8 @@ class Lerobot(Model):
     """JSON file that LeRobot wrote for the arm; none for motors in degrees, such as OpenArm's."""
     robot: Title | None = None
     """Type of the robot, as LeRobot names it; default what the data set says."""
+    side: Literal["left", "right"] | None = None
+    """Which arm, where the robot or the model has two."""
     use_degrees: bool | None = None
     """As in LeRobot's configuration of the robot; default its own default."""
     places: Path | None = None
@@ -47,6 +49,7 @@ class Lerobot(Model):
         """Convert."""
         settings = ArmSettings(
             robot=self.robot or robot_of(self.dataset),
+            side=self.side,
             model=self.model,
             joints={"*": "rigid"},
             calibration=self.calibration or {},

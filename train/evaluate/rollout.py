@@ -1,5 +1,6 @@
 """The rollout of a policy: its environment, the policy, and one generator of control steps."""
 
+import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -14,12 +15,17 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.catalogue import Track
 from baselines.policies import is_saved, track
-from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
+from elastic_env.core.errors import (
+    ConfigurationError,
+    ElasticError,
+    SystemFailedError,
+    require_known,
+)
 from elastic_env.core.signals import BoolArray
 from elastic_env.world.scenario import make_scenario
 from train.evaluate.conditions import Condition, PolicySpec
 from train.runs.failures import is_full
-from train.runs.user_code import named_object
+from train.runs.user_code import line_of_user, named_object
 
 Watch = Callable[[int, Any, Any, Any], None]
 """Sees number, observation, info and memory of a control step, before the world moves."""
@@ -95,9 +101,13 @@ def control_steps(
     has_ended = np.zeros_like(begins)
     for number in count():
         with nullcontext() if condition is None else policy_errors(condition, number):
-            action, memory = policy.predict(
+            answer = policy.predict(
                 observation, state=memory, episode_start=begins, deterministic=True
             )
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                kind = type(answer).__name__
+                raise ConfigurationError(f"predict must return (action, state), got a {kind}")
+            action, memory = answer
             if watch is not None:
                 watch(number, observation, info, memory)
             after, _, terminated, truncated, info = env.step(action)
@@ -138,7 +148,7 @@ def policy_errors(condition: Condition, step: int | None = None) -> Iterator[Non
         when = "" if step is None else f", at control step {step}"
         raise PolicyFailedError(
             f"the policy {condition.policy.title!r} failed in scenario {condition.scenario!r}, "
-            f"{condition.reference_name}{when}: {kind}{error}"
+            f"{condition.reference_name}{when}{line_of_user(error)}: {kind}{error}"
         ) from error
 
 
@@ -164,13 +174,30 @@ def make_policy(spec: PolicySpec, env: Any, options: Any = None) -> Any:
     if not callable(function):
         kind = type(function).__name__
         raise _not_a_policy(spec, f"{attribute} is no function but of type {kind}")
+    _require_options(spec, function, options)
     try:
         return function(env, **options)
     except ElasticError:
         raise
     except Exception as error:
-        problem = f"{attribute}(env, ...) raised {type(error).__name__}: {error}"
+        place = line_of_user(error)
+        problem = f"{attribute}(env, ...) raised{place} {type(error).__name__}: {error}"
         raise _not_a_policy(spec, problem) from error
+
+
+def _require_options(spec: PolicySpec, function: Callable[..., Any], options: Any) -> None:
+    """Refuse options that a policy's function does not take.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    try:
+        _, *parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # one that does not say what it takes
+        return
+    if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+        names = [parameter.name for parameter in parameters]
+        require_known(f"option of the policy {spec.name!r}", options, names)
 
 
 def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:

@@ -230,8 +230,9 @@ def _mean_of_part(values: Array, counts: Array, part: Part) -> Array:
     above = own.cumsum(axis=1)
     low, high = part(above[:, -1:])
     counted = np.minimum(above, high) - np.maximum(above - own, low)
+    share = np.where(above[:, -1:] > 0.0, high - low, 0.0)
     total = np.maximum(counted, 0.0) @ known
-    return total / np.where(above[:, -1:] > 0.0, high - low, np.nan)[:, 0]
+    return total / np.where(share > 0.0, share, np.nan)[:, 0]
 
 
 def estimate(

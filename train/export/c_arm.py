@@ -150,6 +150,7 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
         "spring_rest": body.spring_rest,
         "viscous": constants.viscous,
         "lag_s": constants.lag_s,
+        "rotor_s2": constants.rotor_s2,
         "coulomb": friction.coulomb,
         "load_ratio": friction.load_ratio,
         "static": friction.static,

@@ -22,6 +22,7 @@ from train.report.table_formats import (
     Row,
     Table,
     column_notes,
+    has_room,
     number_interval,
     print_table,
     to_markdown,
@@ -33,23 +34,28 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     """Print the summary with as many columns as the terminal has room for."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
-    print_table(summary_table(evaluations, columns), console, "summary.md")
+    table = summary_table(evaluations, columns)
+    if not has_room(table, console):
+        table = summary_table(evaluations, columns, intervals=False)
+    print_table(table, console, "summary.md")
     for note in failure_notes(evaluations):
         console.print(note, markup=False)
 
 
 def summary_table(
-    evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False
+    evaluations: Sequence[Evaluation],
+    columns: Sequence[Column],
+    worst: bool = False,
+    intervals: bool = True,
 ) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
-
-    Several episodes have the 95 % interval of their median.
 
     Args:
         evaluations: The cells, of one environment.
         columns: Metrics to show.
         worst: Whether the episode that is farthest from zero stands in brackets, where there are
             several.
+        intervals: Whether several episodes show the 95 % interval of their median.
     """
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
@@ -66,10 +72,11 @@ def summary_table(
         condition = e.condition
         names = [condition.reference_name, condition.scenario, condition.policy.title]
         values = condition.swept_values(swept)
-        figures = [_figure(e, column, worst) for column in columns]
+        figures = [_figure(e, column, worst, intervals) for column in columns]
         failed = f"{e.num_failed}/{len(e.episodes)}"
         rows.append(Row((*names, *values, *figures, failed)))
-    title = f"{known.subject}, median over episodes{_interval(evaluations)}"
+    title = f"{known.subject}, median over episodes"
+    title += _interval(evaluations) if intervals else ""
     return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=known.note)
 
 
@@ -77,9 +84,10 @@ def _interval(evaluations: Sequence[Evaluation]) -> str:
     return " [95 % interval]" if any(len(own.episodes) > 1 for own in evaluations) else ""
 
 
-def _figure(evaluation: Evaluation, column: Column, worst: bool) -> str:
+def _figure(evaluation: Evaluation, column: Column, worst: bool, interval: bool) -> str:
     """Median of a metric with its interval, and the episode that is farthest from zero."""
-    found = number_interval(_median(evaluation, column.metric), column)
+    median = _median(evaluation, column.metric)
+    found = number_interval(median if interval else Estimate(median.value), column)
     values = column.scale * evaluation.values(column.metric)
     if not worst or len(values) < 2:
         return found

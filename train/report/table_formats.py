@@ -206,6 +206,11 @@ def print_table(table: Table, console: Console, file: str) -> None:
         console.print(f"{missing}: {cure}", style="dim", markup=False)
 
 
+def has_room(table: Table, console: Console) -> bool:
+    """True if a terminal has room for all columns of a table."""
+    return _fit(table, console) is not None
+
+
 def _fit(table: Table, console: Console) -> RichTable | None:
     """A table as it has room on a terminal; None where it has none."""
     options = console.options.update(max_width=_ANY_WIDTH)

@@ -10,6 +10,8 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import sysconfig
+import traceback
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from functools import partial
@@ -77,6 +79,9 @@ class CodeNamingModel(Model):
 
 _Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
+_ROOT = Path(__file__).parents[2]
+_OURS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
+_LIBRARY = Path(sysconfig.get_path("stdlib"))
 _Refuse = Callable[[str], None]
 _REFUSE: ContextVar[_Refuse] = ContextVar("refuse", default=lambda _: None)
 """Called with each name before its code runs."""
@@ -157,6 +162,17 @@ def named_object(name: str) -> Any:
         known = f"its functions are: {', '.join(own) or 'none'}"
         raise ConfigurationError(f"{shorten(place)} has no {attribute!r}; {known}")
     return getattr(module, attribute)
+
+
+def line_of_user(error: BaseException) -> str:
+    """The last line of a user's code that an error came through, as " (FILE:LINE)"; or nothing."""
+    lines = [
+        f" ({Path(frame.filename).name}:{frame.lineno})"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not Path(frame.filename).is_relative_to(_LIBRARY)
+        and not any(Path(frame.filename).is_relative_to(own) for own in _OURS)
+    ]
+    return lines[-1] if lines else ""
 
 
 def _require_unshadowed(module: ModuleType, attribute: str) -> None:

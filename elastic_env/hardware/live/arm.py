@@ -41,7 +41,12 @@ _MISFIT = 0.5
 class Compensator(Protocol):
     """What a `baselines.PositionCompensator` offers."""
 
-    def command(self, q_desired: npt.ArrayLike, q_dot: npt.ArrayLike | None = None) -> Array:
+    def command(
+        self,
+        q_desired: npt.ArrayLike,
+        q_dot: npt.ArrayLike | None = None,
+        q_ddot: npt.ArrayLike | None = None,
+    ) -> Array:
         """Servo command that brings the links to where they should be, (n,) [rad]."""
         ...
 
@@ -190,7 +195,8 @@ class Arm:
     def cycle(self, target: Array) -> ArmState:
         """One control cycle at the desired angles."""
         desired = self.follower
-        return self._exchange(target, self._compensator.command(desired.q, desired.q_dot))
+        command = self._compensator.command(desired.q, desired.q_dot, desired.q_ddot)
+        return self._exchange(target, command)
 
     def hold(self, limit_s: float = 60.0) -> None:
         """Stay for at most a time in which the program does something else [s]."""

@@ -335,12 +335,14 @@ class Follower:
         acceleration: Largest acceleration [rad/s²].
 
     Attributes:
-        q, q_dot: Desired angles and their rates, (n,) [rad], [rad/s].
+        q, q_dot, q_ddot: Desired angles, their rates and accelerations, (n,) [rad], [rad/s],
+            [rad/s²].
     """
 
     def __init__(self, start: Array, speed: float, acceleration: float) -> None:
         self.q = np.array(start, dtype=np.float64)
         self.q_dot = np.zeros_like(self.q)
+        self.q_ddot = np.zeros_like(self.q)
         self._speed = speed
         self._acceleration = acceleration
 
@@ -353,6 +355,7 @@ class Follower:
 
         Only the very last step brakes by up to twice the acceleration.
         """
+        before = self.q_dot.copy()
         error = target - self.q
         step = self._acceleration * period_s
         braking = np.sqrt(0.25 * step**2 + 2.0 * self._acceleration * np.abs(error)) - 0.5 * step
@@ -365,3 +368,4 @@ class Follower:
         arrives = is_last & is_slow
         self.q = np.where(arrives, target, self.q + move)
         self.q_dot = np.where(arrives, 0.0, self.q_dot)
+        self.q_ddot = (self.q_dot - before) / period_s

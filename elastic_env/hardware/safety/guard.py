@@ -15,6 +15,9 @@ from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.settings import SafetyLimits
 
+_START_SLACK_RAD = 0.005
+"""How far outside a motion may begin: weight presses a servo that rests on a stop beyond it. The
+first goal is within the limits [rad]."""
 _LONGEST_WITHOUT_TEMPERATURE = 2 * TEMPERATURE_CYCLES + 10
 """Cycles without a servo's temperature that stop the motion.
 
@@ -86,7 +89,8 @@ class Guard:
         self._without_temperature: IntArray = np.zeros(n, dtype=np.int64)
         self._strained: IntArray = np.zeros(n, dtype=np.int64)
         # the margin is for what is measured on the way; where a motion begins is its first goal
-        outside = is_outside(self.goals, self._lowest, self._highest)
+        slack = _START_SLACK_RAD
+        outside = is_outside(self.goals, self._lowest - slack, self._highest + slack)
         if outside.any():
             raise FaultError(
                 f"motion must begin between {self._ends(outside, ' and ')} rad in the servos' own"

@@ -273,8 +273,11 @@ class _Assumed:
         links = self.links
         kp = _first(known.position_gain, ratio * self.own.stiffness)
         kv = known.velocity_gain
-        back_emf = 0.0 if known.motor is None else known.motor.damping
-        if kv is None:
+        motor = known.motor
+        back_emf = 0.0 if motor is None else motor.damping
+        if kv is None and motor is not None and is_given:
+            kv = 0.0
+        elif kv is None:
             is_soft = kp < _FAR_STIFFER * self.own.stiffness
             carries_links = known.position_gain is not None and is_soft
             critical = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
@@ -285,7 +288,6 @@ class _Assumed:
                     " nothing in the model damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
-        motor = known.motor
         limit = known.torque_limit
         if limit is None:
             limit = force_limit(self.model, self.name)

@@ -16,7 +16,8 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     """The specification of a robot, which compiles, see `read_model`.
 
     Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot
-    read, is drawn by rods between the joints.
+    read, is drawn by rods between the joints. Bodies get numbers where none has a name, since the
+    end effector is one by name.
 
     Args:
         model: File, text or specification; it is not changed.
@@ -37,6 +38,10 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
             stacklevel=4,
         )
         add_simple_bodies(read.spec)
+    bodies = read.spec.bodies[1:]
+    if not any(body.name for body in bodies):
+        for number, body in enumerate(bodies, 1):
+            body.name = f"body_{number}"
     return read.spec
 
 
