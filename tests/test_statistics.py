@@ -16,6 +16,7 @@ from train.evaluate.statistics import (
     RESAMPLES,
     Counts,
     Estimate,
+    Part,
     estimate,
     interquartile_mean,
     mean_of_part,
@@ -152,6 +153,15 @@ def test_every_cell_draws_its_own_robots() -> None:
     width, single = (own.ends[1] - own.ends[0] for own in (found, alone))
     assert width == pytest.approx(single / np.sqrt(2.0), rel=0.05)
     assert found.over == "60 robots"
+
+
+@pytest.mark.parametrize("part", [middle, middle_half, worst_share])
+def test_a_resample_of_failures_alone_has_no_figure(part: Part) -> None:
+    """Catches an interval down to zero, because a resample drew none that has a figure."""
+    values = np.array([[2.0, np.nan, 4.0]])
+    found = mean_of_part(part)(values, np.array([[0.0, 3.0, 0.0], [3.0, 0.0, 0.0]]))
+    assert np.isnan(found[0, 0])
+    assert found[1, 0] == 2.0
 
 
 def test_many_episodes_are_resampled_less_often(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from pydantic import model_validator
 from rich.console import Console
@@ -181,9 +182,9 @@ def trials_table(trials: Sequence[Trial], condition: Condition) -> Table:
     head = ["trial", *(column.label for column in known.judged), known.failures]
     rows = []
     for trial in trials:
-        robots = pd.DataFrame(trial.metrics)[~trial.failed]
+        robots = pd.DataFrame(trial.metrics).loc[~trial.failed]
         scores = [
-            number_interval(over_cells([robots[[c.metric]].to_numpy().T]), c) for c in known.judged
+            number_interval(over_cells([np.array([robots[c.metric]])]), c) for c in known.judged
         ]
         failed = f"{int(trial.failed.sum())} of {len(trial.failed)}"
         rows.append([str(trial.number), *scores, failed])

@@ -28,7 +28,7 @@ def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
                     values = condition.swept_values(table.swept)
                     own = table.of(policy, cell)
                     own = by_episode(own) if condition.member is None else own
-                    units = ([own["robot"].nunique()], [condition.draws_robots])
+                    units = ([len(set(own["robot"]))], [condition.draws_robots])
                     scores = {column: of_units(score(own, column), *units) for column in columns}
                     figures = [number_interval(found, column) for column, found in scores.items()]
                     over = next((found.over for found in scores.values() if found.over), "-")
