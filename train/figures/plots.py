@@ -223,11 +223,15 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
     if any(evaluation.num_failed for evaluation in evaluations):
         cross = {"marker": "X", "s": 26, "color": FAILED, "label": known.failure}
         handles.append(axes[0].scatter([], [], **cross))
+    if any(len(evaluation.episodes) > 1 for evaluation in evaluations):
+        handles.append(axes[0].scatter([], [], label="episode (bar: median)", **_DOTS))
     ncols = columns_of(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
 
 
+_DOTS: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
+"""Looks of single episodes."""
 _WIDEST = 12.0
 """Width beyond which panels stand one above the other [in]."""
 _ROOMY = 7
@@ -252,8 +256,7 @@ def _draw_bars(
             height = np.median(values) if len(values) else 0.0
             axis.bar(x, height, width=0.9 * width, color=shade)
             if len(e.episodes) > 1:
-                dots = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
-                axis.scatter(np.full(len(values), x), values, **dots)
+                axis.scatter(np.full(len(values), x), values, **_DOTS)
             if e.num_failed:
                 cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5}
                 cross["color"] = FAILED if len(values) else shade
