@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
+from train.evaluate.conditions import PolicySpec
+from train.evaluate.rollout import control_steps, make_policy
 from train.runs.import_path import leave, look_last_in
 from train.runs.user_code import named_object
 
@@ -180,3 +183,39 @@ def test_a_module_that_stands_before_the_users_file_is_named(
         match=r"stands before your train\.py; name the file itself: train\.py:make",
     ):
         named_object("train:make")
+
+
+MINE = """import numpy as np
+def make(env, gain=1.0):
+    return np.linalg.inv(np.zeros((2, 2)))
+class Alone:
+    def predict(self, observation, **_):
+        return np.zeros(1, np.float32)
+"""
+
+
+def test_an_error_names_the_line_of_the_user_and_none_of_a_library(tmp_path: Path) -> None:
+    """Catches NumPy's line in the place of the user's, and a line of ours."""
+    (tmp_path / "mine.py").write_text(MINE)
+    spec = PolicySpec(name=f"{tmp_path}/mine.py:make", options={"gain": 2.0})
+    with pytest.raises(ConfigurationError, match=r"raised \(mine\.py:3\) LinAlgError"):
+        make_policy(spec, None)
+
+
+def test_an_option_that_a_policy_does_not_take_is_answered_by_those_that_it_takes(
+    tmp_path: Path,
+) -> None:
+    """Catches an answer that lists the baselines."""
+    (tmp_path / "mine.py").write_text(MINE)
+    spec = PolicySpec(name=f"{tmp_path}/mine.py:make", options={"gian": 2.0})
+    with pytest.raises(ConfigurationError, match=r"one of: gain\. Did you mean 'gain'"):
+        make_policy(spec, None)
+
+
+def test_a_policy_that_returns_no_state_is_told_what_to_return(tmp_path: Path) -> None:
+    """Catches the words of a failed unpacking."""
+    (tmp_path / "mine.py").write_text(MINE)
+    policy = named_object(f"{tmp_path}/mine.py:Alone")()
+    env = gymnasium.make("elastic_env/Testbed-v0", reference="sine")
+    with pytest.raises(ConfigurationError, match=r"must return \(action, state\), got ndarray"):
+        next(control_steps(env, policy, 0))

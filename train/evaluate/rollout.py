@@ -106,7 +106,7 @@ def control_steps(
             )
             if not isinstance(answer, tuple) or len(answer) != 2:
                 kind = type(answer).__name__
-                raise ConfigurationError(f"predict must return (action, state), got a {kind}")
+                raise ConfigurationError(f"predict must return (action, state), got {kind}")
             action, memory = answer
             if watch is not None:
                 watch(number, observation, info, memory)

@@ -10,7 +10,6 @@ import importlib
 import importlib.util
 import inspect
 import sys
-import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
@@ -81,7 +80,6 @@ _Config = TypeVar("_Config", bound=CodeNamingModel)
 _FILES = "elastic_user_file_"
 _ROOT = Path(__file__).parents[2]
 _OURS = tuple(_ROOT / name for name in ("elastic_env", "baselines", "train"))
-_LIBRARY = Path(sysconfig.get_path("stdlib"))
 _Refuse = Callable[[str], None]
 _REFUSE: ContextVar[_Refuse] = ContextVar("refuse", default=lambda _: None)
 """Called with each name before its code runs."""
@@ -165,12 +163,17 @@ def named_object(name: str) -> Any:
 
 
 def line_of_user(error: BaseException) -> str:
-    """The last line of a user's code that an error came through, as " (FILE:LINE)"; or nothing."""
+    """The last line of a user's code that an error came through, as " (FILE:LINE)"; or nothing.
+
+    The user's code begins where ours calls it. Libraries that it calls lie in other folders.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    paths = [Path(frame.filename) for frame in frames]
+    theirs = [path.parent for path in paths if not any(map(path.is_relative_to, _OURS))]
     lines = [
-        f" ({Path(frame.filename).name}:{frame.lineno})"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not Path(frame.filename).is_relative_to(_LIBRARY)
-        and not any(Path(frame.filename).is_relative_to(own) for own in _OURS)
+        f" ({path.name}:{frame.lineno})"
+        for frame, path in zip(frames, paths, strict=True)
+        if path.parent in theirs[:1]
     ]
     return lines[-1] if lines else ""
 
