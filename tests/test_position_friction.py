@@ -136,3 +136,14 @@ def test_a_payload_that_jumps_is_said_with_the_friction_of_its_load() -> None:
     with pytest.warns(UserWarning, match=rf"'servo' by {jump:.3g} mrad at once"):
         made.set_payload(0.05, at=(0.0, 0.0, -0.1))
     assert 1e3 * (along(made, np.array([1.0]))[0] - before) == pytest.approx(jump, rel=1e-6)
+
+
+def test_a_rotor_leads_by_its_torque_over_the_position_gain() -> None:
+    """Catches a lead of the wrong sign, or one with the inertia of the links: k_p e = B q̈."""
+    leads = []
+    for rotor_inertia in (0.002, 0.005):
+        settings = {"stiffness": K, "rotor_inertia": rotor_inertia, **FRICTION, "servo": SERVO}
+        given: dict[str, Any] = {"limit_rad": 0.6, "period_s": 0.01}
+        made = PositionCompensator.from_model(PENDULUM, {"servo": settings}, **given)
+        leads.append(made.command([0.2], [0.1], [3.0]))
+    np.testing.assert_allclose(leads[1] - leads[0], 0.003 * 3.0 / K_P, rtol=1e-9)
