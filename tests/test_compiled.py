@@ -256,7 +256,13 @@ def test_division_by_zero_is_as_in_numpy() -> None:
     assert np.isnan(compiled(lambda value: value / 0.0)(0.0))
 
 
-@pytest.mark.parametrize("scenario", ["nominal", "sensor", "spread", "imu"])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        "imu",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("nominal", "sensor", "spread")),
+    ],
+)
 def test_a_compiled_control_step_does_what_its_python_code_says(
     scenario: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,6 +57,7 @@ def test_the_place_of_a_pendulum_is_found_though_its_sensors_are_off() -> None:
     np.testing.assert_allclose(np.ptp(np.array(found)[late], axis=0), 2.0 * dcm, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_planned_zmp_is_shifted_against_it_up_to_the_limit() -> None:
     """Catches a wrong sign or axis, a shift that jumps, and one that replaces an input."""
     env = vector()

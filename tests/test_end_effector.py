@@ -113,6 +113,7 @@ def test_what_is_no_end_effector_says_why() -> None:
         EndEffector(fixed.compile(), list(ARM.joints), "table")
 
 
+@pytest.mark.slow
 def test_the_commands_judge_by_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches figures that stay in the environment; a compensated hand is nearer."""
     monkeypatch.chdir(tmp_path)

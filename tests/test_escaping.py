@@ -270,7 +270,7 @@ def test_a_chart_shows_a_label_as_it_is(label: str) -> None:
 
 
 @pytest.mark.parametrize("label", ["$\\foo{", "a $x^", "_mine", "__", "\x1b[31mred", *NASTY])
-@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("fails", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_picture_shows_a_label_as_it_is(label: str, fails: bool, tmp_path: Path) -> None:
     """Catches a label that Matplotlib takes for a formula, which ends the command with a
     traceback, and one that it leaves out of the legend."""

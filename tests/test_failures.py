@@ -254,6 +254,7 @@ def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
     assert "BrokenPipe" not in run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "code", "said"),
     [
@@ -333,6 +334,7 @@ def test_a_file_that_cannot_grow_is_one_sentence(tmp_path: Path) -> None:
         assert "Traceback" not in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("video", "said"),
     [
@@ -414,6 +416,7 @@ def test_an_extra_that_is_not_installed_is_one_sentence(tmp_path: Path) -> None:
         assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_help_comes_without_any_extra(tmp_path: Path) -> None:
     """Catches a command whose options import what only its work needs."""
     asked = [(None, [command, "--help"]) for command in COMMANDS.split()]

@@ -288,6 +288,7 @@ def test_what_poses_do_not_tell_keeps_its_prior_and_is_named(geometry: GeometryM
     assert abs(height.value) < 2e-3
 
 
+@pytest.mark.slow
 def test_masses_that_are_guessed_hardly_matter(geometry: GeometryModel) -> None:
     """Catches an identification whose held-out error hangs on assumed masses, as K may."""
     problem, _ = made_up(geometry, 4, count=60, noise_m=5e-4, geometry="dh")

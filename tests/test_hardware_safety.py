@@ -462,6 +462,7 @@ def _wait_until_free(port: str) -> None:
             time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
     """Catches arrays that mix up the servos of two buses, and one bus whose loss keeps torque on
     at the other."""

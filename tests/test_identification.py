@@ -165,6 +165,7 @@ def test_plain_line_is_biased_by_the_dead_band_by_the_derived_amount() -> None:
     assert result.pearson_r == REST(np.corrcoef(tau, points.theta - points.q)[0, 1], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_interval_covers_the_truth_as_often_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an interval that resamples visits, whose noise is shared within a position, or
     that is half as wide."""
@@ -414,6 +415,7 @@ def test_nominal_testbed_errs_like_the_papers_figure_6(runs: dict[str, Evaluatio
     assert range_at_rest(runs["nominal input"]) == (REST(-3.7, abs=1.5), REST(7.1, abs=1.5))
 
 
+@pytest.mark.slow
 def test_backlash_biases_the_line_and_not_our_fit(runs: dict[str, Evaluation]) -> None:
     """Catches a dead band that is ignored, by the plant or by the regression."""
     result = identified(runs["backlash"])

@@ -311,6 +311,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_what_was_learned_is_saved_and_played(run: Path) -> None:
     """Catches a table that plays shifted, scaled or around another base than it was learned
     with."""

@@ -170,6 +170,7 @@ def test_it_is_drawn() -> None:
     assert np.abs(later - first)[100:-60].max() > 50.0
 
 
+@pytest.mark.slow
 def test_the_commands_play_and_compare_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that knows two robots by name: the robot's file is all it needs, in
     workers too."""

@@ -13,6 +13,7 @@ from train.figures import plots
 PLAYED = {1.0: ["nominal", "payload"], 0.9: ["payload"], 0.8: ["soft"]}
 
 
+@pytest.mark.slow
 def test_panels_name_the_scenarios_that_their_bars_are_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,7 +37,9 @@ def settled(info: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=[pytest.mark.slow] * (how == "pickle")) for how in COPIES]
+)
 @pytest.mark.parametrize(
     ("robot", "worlds", "scenario"),
     [

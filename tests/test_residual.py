@@ -241,10 +241,10 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
 @pytest.mark.parametrize(
     ("robot", "base", "acts_on", "mode"),
     [  # each mode on both robots, and each space on the walker
-        (*BASES[1], AutoresetMode.SAME_STEP),
+        pytest.param(*BASES[1], AutoresetMode.SAME_STEP, marks=pytest.mark.slow),
         (*BASES[4], AutoresetMode.NEXT_STEP),
         (*BASES[6], AutoresetMode.SAME_STEP),
-        (*BASES[6], AutoresetMode.NEXT_STEP),
+        pytest.param(*BASES[6], AutoresetMode.NEXT_STEP, marks=pytest.mark.slow),
     ],
 )
 def test_a_vector_of_worlds_is_the_scalar_wrapper(

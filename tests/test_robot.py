@@ -346,6 +346,7 @@ def test_the_commands_play_a_robot_from_its_file(
         environment("no.yaml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "name"),
     [("arm.robot.yaml", "robot"), pytest.param("own.py:ARM", "arm", marks=pytest.mark.slow)],

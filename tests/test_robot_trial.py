@@ -62,6 +62,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder, (root / "printed.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_table_says_what_was_played(tried: tuple[Path, str]) -> None:
     """Catches columns that are mixed up, a unit that is not that of its title, and a comparison
     without effect."""

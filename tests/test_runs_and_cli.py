@@ -441,6 +441,7 @@ def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(
     assert "runs/evaluate-2/episodes.csv" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process")
 def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
     """Catches an option that is read and forgotten: a policy that believes in 2 K compensates
@@ -990,6 +991,7 @@ def test_play_films_a_time_shorter_than_a_control_step() -> None:
     assert Path("x.mp4").stat().st_size > 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process")
 def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -1067,6 +1069,7 @@ sys.meta_path.insert(0, Finder())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "import_s", "wait_s"),
     [(signal.SIGINT, 2.0, 1.0), pytest.param(signal.SIGKILL, 0.0, 2.0, marks=pytest.mark.slow)],

@@ -305,14 +305,14 @@ def assert_info_of_rows(
 @pytest.mark.parametrize(
     ("reference", "scenario", "mode"),
     [  # every pair of two of them
-        ("hold", "nominal", AutoresetMode.NEXT_STEP),
+        pytest.param("hold", "nominal", AutoresetMode.NEXT_STEP, marks=pytest.mark.slow),
         ("hold", "sensor", AutoresetMode.SAME_STEP),
-        ("sine", "nominal", AutoresetMode.SAME_STEP),
+        pytest.param("sine", "nominal", AutoresetMode.SAME_STEP, marks=pytest.mark.slow),
         ("sine", "sensor", AutoresetMode.NEXT_STEP),
-        ("multisine", "nominal", AutoresetMode.NEXT_STEP),
+        pytest.param("multisine", "nominal", AutoresetMode.NEXT_STEP, marks=pytest.mark.slow),
         ("multisine", "sensor", AutoresetMode.SAME_STEP),
         ("steps", "nominal", AutoresetMode.SAME_STEP),
-        ("steps", "sensor", AutoresetMode.NEXT_STEP),
+        pytest.param("steps", "sensor", AutoresetMode.NEXT_STEP, marks=pytest.mark.slow),
     ],
 )
 def test_vector_environment_is_the_scalar_one_row_by_row(

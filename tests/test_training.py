@@ -153,6 +153,7 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     ).read_bytes()
 
 
+@pytest.mark.slow
 def test_curves_say_how_much_better_than_the_base_a_policy_is(tmp_path: Path) -> None:
     """Catches a curve that falls while the error does, and one of another figure than
     progress.csv has."""
@@ -443,6 +444,7 @@ def test_the_last_environments_share_what_cores_are_left(
     assert threads_of_each(cores, environments) == threads
 
 
+@pytest.mark.slow
 def test_rewards_of_a_scenario_count_by_its_weight() -> None:
     """Catches weights that nothing reads, or of another scenario."""
     config = TrainConfig(**{**SMALL, "scenarios": ["nominal", "soft"], "worlds": 4})
@@ -486,6 +488,7 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
         baselines.make("oracle", MixedVectorEnv([one]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ["testbed", "walker"])
 def test_episodes_played_together_score_as_alone(env: str) -> None:
     """Catches scores of another world, episode, scenario or policy, and a fall that counts as a

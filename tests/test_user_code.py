@@ -112,6 +112,7 @@ PLUG_INS = ("pydantic", "gymnasium.envs", "torch.backends", "console_scripts")
 """Groups of entry points, which packages import when they are imported themselves."""
 
 
+@pytest.mark.slow
 def test_what_calls_itself_a_plug_in_in_the_working_folder_is_not_imported(tmp_path: Path) -> None:
     """Catches a folder that was unpacked beside the data, and whose "installed" package is
     imported by pydantic or gymnasium before any file is named."""

@@ -389,6 +389,7 @@ def test_the_table_fits_its_terminal(width: int) -> None:
 # Figures.
 
 
+@pytest.mark.slow
 def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
     """Catches empty pictures, and a fall that breaks the scale or the drawing."""
     upright = evaluate(
@@ -558,6 +559,7 @@ def test_what_a_reference_says_goes_before_the_options_of_all() -> None:
     assert walk(reference=3, env_options={"num_steps": 4}).arguments["num_steps"] == 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process")
 def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
