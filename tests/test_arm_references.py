@@ -143,6 +143,17 @@ def test_what_cannot_be_played_says_why(reference: Any, message: str) -> None:
         planned(reference)
 
 
+def test_slower_moves_are_no_advice_where_the_weight_alone_is_too_much() -> None:
+    """Catches advice that does not help: a move of a minute needs as much as one of two seconds."""
+    joints = {"*": 1000.0, "shoulder": {"stiffness": 1000.0, "servo": {"torque_limit": 20.0}}}
+    slow = {"kind": "poses", "move_s": 60.0}
+    with (
+        pytest.warns(UserWarning, match="assumed"),
+        pytest.raises(ConfigurationError, match="the weight alone is too much: raise its torque_l"),
+    ):
+        planned(slow, model=EXAMPLE, joints=joints, home={"shoulder": 1.3, "elbow": 0.2})
+
+
 def errors_at_poses(
     policy: str, model: str, positions: int, worlds: int, scenario: str
 ) -> dict[str, Array]:

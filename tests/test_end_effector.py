@@ -78,7 +78,7 @@ def test_the_outermost_body_is_one_that_a_joint_moves() -> None:
     mast = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body name="mast"/></worldbody></mujoco>'
     )
-    with pytest.raises(ConfigurationError, match="no body of the model"):
+    with pytest.raises(ConfigurationError, match="no body that the joints move"):
         outermost_body(mast)
 
 

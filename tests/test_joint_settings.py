@@ -330,6 +330,24 @@ def test_a_force_range_that_pushes_one_way_is_refused_by_name() -> None:
     assert given.joints["j1"].servo.torque_limit == 20.0
 
 
+DRIVES = """<actuator><dcmotor joint="j1" motorconst="1" resistance="1" input="pos vel"
+    controller="5 0 5"/><motor joint="j2" ctrlrange="-12 12" gear="5"/>
+    <damper joint="j2" kv="10" ctrlrange="0 1"/></actuator>"""
+"""A drive with two commands before others, and a damper, whose command is no force."""
+
+
+def test_a_limit_is_that_of_its_own_command() -> None:
+    """Catches commands that are counted as actuators, and a damper that is taken for a drive of
+    one direction."""
+    model = ARM.replace("</mujoco>", f"{DRIVES}</mujoco>")
+    servo = {"position_gain": 800, "velocity_gain": 9}
+    found = configure_robot(model, {"j1": {"stiffness": 400, "servo": servo}, "j2": 400})
+    assert found.joints["j2"].servo is not None
+    assert found.joints["j2"].servo.torque_limit == 60.0
+    with pytest.raises(ConfigurationError, match="joint 'j1' has a dcmotor"):
+        PositionCompensator.from_model(model, 400)
+
+
 # Assumptions.
 
 

@@ -94,11 +94,12 @@ def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
         gear = abs(float(model.actuator_gear[i, 0]))
         force = (model.actuator_forcelimited[i], model.actuator_forcerange[i])
         limits.append((gear, *force))
+        is_fixed = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         is_unbiased = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-        if is_unbiased and model.actuator_dyntype[i] == 0:
+        if is_fixed and is_unbiased and model.actuator_dyntype[i] == 0:
             gain = gear * abs(float(model.actuator_gainprm[i, 0]))
-            command = (model.actuator_ctrllimited[i], model.actuator_ctrlrange[i])
-            limits.append((gain, *command))
+            at = model.actuator_ctrladr[i]  # actuators before may have several commands
+            limits.append((gain, model.actuator_ctrllimited[at], model.actuator_ctrlrange[at]))
     found = [_bound(joint, *limit) for limit in limits]
     return min((value for value in found if value is not None), default=None)
 

@@ -218,7 +218,7 @@ def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
                 " inertia; the torque of tendons with stiffness is not compensated; take it out of"
                 f" the model{_or_hold(model, acts, ids)}"
             )
-    for a in range(model.nu):
+    for a in range(model.nactuator):
         if acts := _driven_beside_joints(model, a) & ids:
             raise ConfigurationError(
                 f"the model's actuator {model.actuator(a).name!r} drives {_names(model, acts)} by"

@@ -333,7 +333,7 @@ def _require_torque(
 
     `motion` has its angles, rates and accelerations.
     """
-    _, q_dot, q_ddot = motion
+    q, q_dot, q_ddot = motion
     torque = body.inverse_dynamics(*motion) + robot.rotor_inertia * q_ddot
     if config.reference.is_random:  # other draws have their largest torque at other speeds
         torque = np.abs(torque).max(axis=0)
@@ -343,10 +343,14 @@ def _require_torque(
         require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
         weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
+        resting, enough = robot.demand(body.gravity_torque(q), np.zeros_like(q))
+        cure = "make its moves slower"
+        if np.any((resting > enough)[:, weakest[-1]]):
+            cure = "the weight alone is too much: raise its torque_limit, or choose other poses"
         raise ConfigurationError(
             f"the reference {config.reference.kind!r} can need {needed[weakest]:.4g} N·m of the"
             f" servo of joint {robot.joint_names[weakest[-1]]!r}, which is limited to"
-            f" {limits[weakest]:.4g} N·m; make its moves slower"
+            f" {limits[weakest]:.4g} N·m; {cure}"
         )
 
 

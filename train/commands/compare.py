@@ -444,8 +444,9 @@ def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
     """
     seen = set[str]()
     for condition in conditions:
-        played = (condition.policy, condition.swept, condition.reference)
-        own = {repr((condition.env, condition.arguments)), repr(played)}
+        motion = (condition.env, condition.env_options, condition.reference)
+        played = (motion, condition.policy, condition.swept)
+        own = {repr((motion, condition.scenario_played)), repr(played)}
         if not own <= seen:
             seen |= own
             yield condition

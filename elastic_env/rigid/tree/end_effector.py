@@ -110,7 +110,7 @@ def outermost_body(model: MjModel) -> str:
     named = [body for body in np.flatnonzero(moves) if model.body(body).name]
     if not named:
         cure = "give one to the body that is the end effector"
-        raise ConfigurationError(f"no body of the model has a name; {cure}")
+        raise ConfigurationError(f"no body that the joints move has a name; {cure}")
     return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
 
 
