@@ -1,5 +1,6 @@
 """Files that a user names, read within bounds, and files that are written whole or not at all."""
 
+import csv
 import errno
 import os
 import stat
@@ -34,6 +35,12 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
     if len(content) > most_bytes:  # it grew, or its size is not what the system says
         raise _too_large(path, most_bytes, f"more than {most_bytes}")
     return content
+
+
+def read_rows(table: Path) -> list[dict[str, str]]:
+    """Rows of a table of this package, by columns; lines that begin with # are comments."""
+    lines = table.read_text(encoding="utf-8").splitlines()
+    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 def leads_out(path: Path, folder: Path) -> bool:

@@ -74,6 +74,12 @@ class ServoBus(ABC):
     """Status return level of a servo that answers every instruction."""
     status_bytes: ClassVar[int]
     """Length of a reply without data."""
+
+    word_bytes: ClassVar[int]
+    """Length of an address, and of a length, in an instruction."""
+
+    ping_bytes: ClassVar[int]
+    """Length of the data in the answer to a ping."""
     patience_s: ClassVar[float]
     """How long replies in motion may take beyond the time on the wire [s]."""
     slowest_trip_s: ClassVar[float]
@@ -129,21 +135,13 @@ class ServoBus(ABC):
             ReplyError: It does not answer.
         """
 
-    @abstractmethod
-    def knock(self, servo_id: int) -> None:
+    def knock(self, servo_id: int) -> bytes:
         """One request and its answer, as short as there are.
 
         Raises:
             ReplyError: It does not answer.
         """
-
-    @abstractmethod
-    def _place(self, address: int, length: int) -> bytes:
-        """Address and length of registers, as an instruction names them."""
-
-    @abstractmethod
-    def _place_to_write(self, address: int) -> bytes:
-        """Address of registers, as an instruction names them before their content."""
+        return self._request(servo_id, packets.PING, b"", length=self.ping_bytes)
 
     @abstractmethod
     def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
@@ -153,13 +151,9 @@ class ServoBus(ABC):
     def _receive(self) -> Status | None:
         """The next reply; None if none comes in time."""
 
-    @abstractmethod
-    def _is_unheard(self, error: int) -> bool:
-        """True if an error says that the instruction arrived damaged: worth another try."""
-
-    @abstractmethod
-    def _explain(self, error: int) -> str:
-        """Words for an error."""
+    def _place(self, *numbers: int) -> bytes:
+        """Address of registers, and their length, as an instruction names them."""
+        return b"".join(number.to_bytes(self.word_bytes, "little") for number in numbers)
 
     def attach(self, ids: Sequence[int]) -> None:
         """Take servos into the cycle; each is asked for its model, which decides on its registers.
@@ -215,7 +209,7 @@ class ServoBus(ABC):
             ReplyError: No answer in three tries, or a refusal, with the servo's reason.
         """
         register = self.models[servo_id].table[name]
-        data = self._place_to_write(register.address) + register.encode(value)
+        data = self._place(register.address) + register.encode(value)
         self._request(servo_id, packets.WRITE, data, length=0)
 
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
@@ -404,12 +398,12 @@ class ServoBus(ABC):
                     break
                 if reply.servo_id != servo_id:
                     continue
-                if self._is_unheard(reply.error):
-                    problem = f"says that {self._explain(reply.error)}"
-                    break
                 if reply.error:
-                    reason = self._explain(reply.error)
-                    raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
+                    reason = packets.explain_error(reply.error)
+                    if reply.error != packets.CRC_ERROR:
+                        raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
+                    problem = f"says that {reason}"
+                    break
                 if len(reply.data) == length:
                     return reply.data
             self._wait_for_silence()

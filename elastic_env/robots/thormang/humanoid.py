@@ -1,14 +1,16 @@
 """The walker as it is drawn: shapes on its links, solid, and translucent for the plan."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
 from elastic_env.rendering.picture import CAMERA, Rgba, set_stage
-from elastic_env.robots.thormang.model import SIDES, Thormang, read_rows, rigid_spec
+from elastic_env.robots.thormang.model import SIDES, Thormang, rigid_spec
 
 PLAN = "plan_"
 """Prefix of the names of the translucent robot."""
@@ -83,7 +85,7 @@ def _dress(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
         spec.delete(site)
     if is_plan:
         spec.delete(spec.body("floor"))
-    for row in read_rows("shapes.csv"):
+    for row in read_rows(Path(__file__).with_name("shapes.csv")):
         size = [float(number) for number in row["size_m"].split()]
         if row["link"] == "pelvis" and row["kind"] == "block":
             size[1] = robot.hip_half_spacing + _BESIDE_HIP_M

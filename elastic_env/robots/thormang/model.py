@@ -1,5 +1,8 @@
 """The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from `legs.csv`.
 
+That table has links, parents before children, in the link frame and SI units. The column `joint` is
+"fixed", "floating" or the name of a hinge.
+
 All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between
 the hip axes. x forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs.
 Sources (public GitHub repositories):
@@ -13,7 +16,6 @@ Sources (public GitHub repositories):
 * joint limits: THORMANG3, assumed for this robot.
 """
 
-import csv
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +25,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.config import Model, quantity
+from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
@@ -78,16 +81,6 @@ def biped(robot: Thormang) -> Biped:
     return Biped(rigid, LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
 
 
-def read_rows(table: str) -> list[dict[str, str]]:
-    """Rows of a table beside this file.
-
-    `legs.csv` has links, parents before children, in the link frame and SI units. The column
-    `joint` is "fixed", "floating" or the name of a hinge.
-    """
-    text = Path(__file__).with_name(table).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
-
-
 def _numbers(row: dict[str, str], *columns: str) -> Array:
     return np.array([float(row[column]) for column in columns])
 
@@ -108,7 +101,7 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     spec.option.impratio = 10.0
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
-    for row in read_rows("legs.csv"):
+    for row in read_rows(Path(__file__).with_name("legs.csv")):
         joint = row["joint"]
         position = _numbers(row, "x_m", "y_m", "z_m")
         if joint.endswith("hip_yaw"):
