@@ -22,8 +22,9 @@ from mujoco import MjsActuator, MjsBody, MjsJoint, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
+from elastic_env.joint import joint_names
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.motor import Motor
@@ -181,12 +182,12 @@ def _resolve_springdampers(spec: MjSpec, joints: list[str]) -> None:
 
 
 def _hinge(spec: MjSpec, name: str) -> MjsJoint:
-    hinges = [joint.name for joint in spec.joints if joint.type == _HINGE and joint.name]
-    require_known("hinge", [name], hinges)
+    hinges = [joint for joint in spec.joints if joint.type == _HINGE and joint.name]
+    require_known("hinge", [name], [hinge.name for hinge in hinges])
     taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
     taken |= {motor_name(name)} & {body.name for body in spec.bodies}
     taken |= {number.name for number in spec.numerics}
-    for derived in (motor_name(name), spring_name(name), servo_name(name), friction_name(name)):
+    for derived in joint_names.all_names(name):
         if derived in taken:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"

@@ -31,6 +31,7 @@ MOST_ASSET_BYTES = 500_000_000
 
 FOLDERS = ("meshdir", "texturedir", "assetdir")
 """Attributes of <compiler> that name a folder of files."""
+Files = tuple[Path, ...]
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
@@ -109,7 +110,7 @@ class _Counts:
         for mesh in robot.iter("mesh"):
             self._add_asset(mesh.get("filename", "").removeprefix("file://"))
 
-    def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
+    def add(self, root: ET.Element, files: Files) -> None:
         """Count a document of MJCF; `files` are those in which it is included."""
         self._add_folders(root)
         self._walk(root, files, 1.0, in_world=False, depth=len(files))
@@ -121,7 +122,7 @@ class _Counts:
     def _walk(
         self,
         element: ET.Element,
-        files: tuple[Path, ...],
+        files: Files,
         copies: float,
         in_world: bool,
         depth: int,
@@ -162,25 +163,21 @@ class _Counts:
         for part in element:
             self._walk(part, files, copies, in_world, depth + 1)
 
-    def _include(
-        self, name: str, files: tuple[Path, ...], copies: float, in_world: bool, depth: int
-    ) -> None:
+    def _include(self, name: str, files: Files, copies: float, in_world: bool, depth: int) -> None:
         root, path = self._document(name, files)
         if root is not None:
             self._add_folders(root)
             for part in root:
                 self._walk(part, (*files, path), copies, in_world, depth + 1)
 
-    def _attachable(self, element: ET.Element, files: tuple[Path, ...]) -> None:
+    def _attachable(self, element: ET.Element, files: Files) -> None:
         name = element.get("file", "")
         root, path = self._document(name, files)
         if root is not None:
             self._attached[element.get("name") or Path(name).stem] = root
             self._walk(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
 
-    def _attach(
-        self, element: ET.Element, files: tuple[Path, ...], copies: float, depth: int
-    ) -> None:
+    def _attach(self, element: ET.Element, files: Files, copies: float, depth: int) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
             name = element.get("body")
@@ -188,7 +185,7 @@ class _Counts:
             for body in bodies or root.findall("worldbody"):
                 self._walk(body, files, copies, in_world=True, depth=depth + 1)
 
-    def _document(self, name: str, files: tuple[Path, ...]) -> tuple[ET.Element | None, Path]:
+    def _document(self, name: str, files: Files) -> tuple[ET.Element | None, Path]:
         """A further file of the model; None where MuJoCo will say that it is missing."""
         folders = [self.model.folder, *(file.parent for file in files[-1:])]
         paths = [folder / name for folder in folders if _exists(folder / name)]

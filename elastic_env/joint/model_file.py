@@ -340,7 +340,8 @@ def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
     for kind in _REFERRING.split():
         if len(getattr(copied, kind)) < len(getattr(spec, kind)):
             from_mujoco(spec.compile, name, "compile")  # which says what is wrong
-            raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")
+            problem = f"one of the {kind} of {name} cannot be copied by MuJoCo"
+            raise ConfigurationError(problem)
     return copied
 
 
@@ -348,11 +349,8 @@ def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     """Bodies that have their mass from a mesh."""
     rule = spec.compiler.inertiafromgeom
     from_geoms = rule == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    return [
-        body
-        for body in spec.bodies[1:]
-        if (from_geoms or not body.explicitinertial) and any(map(_is_of_mesh, body.geoms))
-    ]
+    bodies = [body for body in spec.bodies[1:] if from_geoms or not body.explicitinertial]
+    return [body for body in bodies if any(map(_is_of_mesh, body.geoms))]
 
 
 def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:

@@ -341,7 +341,8 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 
 def _pulls(model: mujoco.MjModel, tendon: int) -> bool:
-    return any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in _PULLING.split())
+    fields = [getattr(model, f"tendon_{name}") for name in _PULLING.split()]
+    return any(np.any(values[tendon]) for values in fields)
 
 
 def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:

@@ -72,7 +72,8 @@ class Gait(Model):
     @property
     def step_period_s(self) -> float:
         """Duration of a step [s]."""
-        return self.double_support_s + self.single_support_s + self.last_double_support_s
+        swing_s = self.double_support_s + self.single_support_s
+        return swing_s + self.last_double_support_s
 
     @property
     def duration_s(self) -> float:

@@ -126,7 +126,8 @@ class WalkPlan:
         com = turn(self.com - origin[:, :2], -self.heading)
         rows = np.arange(len(com))
         lever = com - ankles[rows, self.timing.support, :2]
-        turning = self.heading_dot[:, None] * np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+        across = np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+        turning = self.heading_dot[:, None] * across
         return LocalPlan(
             com=com,
             com_dot=turn(self.com_dot, -self.heading) - turning,
@@ -375,10 +376,11 @@ def _dynamics(biped: Biped, pelvis: Array, heading: Array, q: Array, period_s: f
 
     body = FloatingBody(biped.rigid, biped.joint_names)
     q_dot, q_ddot = derivatives(q, period_s)
-    moved = zip(derivatives(pelvis, period_s), derivatives(heading, period_s), strict=True)
+    moved = derivatives(pelvis, period_s)
+    turned = derivatives(heading, period_s)
     base_dot, base_ddot = (
         np.concatenate([turn(linear, -heading), angular[:, None]], axis=1)
-        for linear, angular in moved
+        for linear, angular in zip(moved, turned, strict=True)
     )
     wrench, torque = body.inverse_dynamics(q, base_dot, q_dot, base_ddot, q_ddot)
     force = turn(wrench[:, :3], heading)

@@ -86,7 +86,8 @@ class Scenario(RobotRanges):
     @property
     def places_loads(self) -> bool:
         """True if robots carry other loads than that of all of them on the shoulders."""
-        return self.shoulder_load_kg == 0.0 and max(own.load_kg[1] for own in self.parts) > 0.0
+        heaviest = max(own.load_kg[1] for own in self.parts)
+        return self.shoulder_load_kg == 0.0 and heaviest > 0.0
 
     @property
     def draws_robots(self) -> bool:
@@ -123,7 +124,7 @@ _LONGEST_JOINED = 1000
 DISTRIBUTIONS = ("drawn", "drawn_beyond")
 """Changes that draw every episode's robot from ranges: those to learn from, and for tests robots
 that have one quantity beyond these."""
-WALKER_ONLY = tuple(name for name, own in CHANGES.items() if own.keys() <= {*WALKER_FIELDS})
+WALKER_ONLY = [name for name, own in CHANGES.items() if own.keys() <= {*WALKER_FIELDS}]
 """Changes that set quantities of walkers alone."""
 
 RangeChanges = Mapping[str, Any] | Sequence[Mapping[str, Any]]
@@ -143,7 +144,7 @@ def _distribution(name: str, ranges: RangeChanges) -> dict[str, Any]:
 
 def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
     """Parameters of a change for a robot that does not walk."""
-    kept = {field: value for field, value in parameters.items() if field not in WALKER_FIELDS}
+    kept = {name: own for name, own in parameters.items() if name not in WALKER_FIELDS}
     if "mixture" in kept:
         kept["mixture"] = [own.on_fixed_base() for own in kept["mixture"]]
     return kept
@@ -152,28 +153,26 @@ def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
 def _require_ranges(ranges: Any, walks: bool) -> None:
     """Refuse what is no mapping or list of mappings, and intervals of walkers elsewhere."""
     each = [ranges] if isinstance(ranges, Mapping) else ranges
-    if not isinstance(each, list | tuple) or not all(isinstance(own, Mapping) for own in each):
-        raise ConfigurationError(
-            f"ranges must be a mapping of intervals, or a list of such, got {quote(ranges)}"
-        )
+    is_list = isinstance(each, list | tuple)
+    if not is_list or not all(isinstance(own, Mapping) for own in each):
+        needed = "a mapping of intervals, or a list of such"
+        raise ConfigurationError(f"ranges must be {needed}, got {quote(ranges)}")
     of_walkers = sorted({field for own in each for field in own} & {*WALKER_FIELDS})
     if of_walkers and not walks:
-        here = [field for field in RobotRanges.model_fields if field not in WALKER_FIELDS]
-        raise ConfigurationError(
-            f"ranges: only a walker has {', '.join(of_walkers)}; here choose from:"
-            f" {', '.join(here)}"
-        )
+        here = ", ".join(name for name in RobotRanges.model_fields if name not in WALKER_FIELDS)
+        problem = f"ranges: only a walker has {', '.join(of_walkers)}"
+        raise ConfigurationError(f"{problem}; here choose from: {here}")
 
 
 def _in_each_part(parameters: dict[str, Any], name: str) -> dict[str, Any]:
     """Parameters of a mixture whose ranges also hold the intervals that stand beside it."""
-    beside = {field: parameters[field] for field in parameters.keys() & RobotRanges.model_fields}
+    fields = parameters.keys() & RobotRanges.model_fields
+    beside = {field: parameters.pop(field) for field in fields}
     parts: list[RobotRanges] = parameters["mixture"]
-    twice = sorted({field for own in parts for field in own.changes} & beside.keys())
+    twice = sorted({field for own in parts for field in own.changes} & fields)
     if twice:
         raise ConfigurationError(f"scenario {name!r} sets {', '.join(twice)} a second time")
-    others = {field: value for field, value in parameters.items() if field not in beside}
-    return {**others, "mixture": [own.replace(**beside) for own in parts]}
+    return parameters | {"mixture": [own.replace(**beside) for own in parts]}
 
 
 def scenario_names(walks: bool = True) -> list[str]:
@@ -207,10 +206,9 @@ def make_scenario(
     parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
-            raise ConfigurationError(
-                f"scenario {name!r}: {change!r} is a ground and can only stand first"
-            )
-        if change not in CHANGES and change not in DISTRIBUTIONS:
+            problem = f"{change!r} is a ground and can only stand first"
+            raise ConfigurationError(f"scenario {name!r}: {problem}")
+        if change not in (*CHANGES, *DISTRIBUTIONS):
             choices = [*scenario_names(walks), *DISTRIBUTIONS]
             raise unknown_name("scenario", change, choices)
         added = CHANGES.get(change) or _distribution(change, ranges or {})
@@ -218,9 +216,8 @@ def make_scenario(
             added = _without_walking(added)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
-            raise ConfigurationError(
-                f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time"
-            )
+            problem = f"{change!r} sets {', '.join(twice)} a second time"
+            raise ConfigurationError(f"scenario {name!r}: {problem}")
         parameters |= added
     if "mixture" in parameters:
         parameters = _in_each_part(parameters, str(name))

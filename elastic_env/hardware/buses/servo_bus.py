@@ -271,7 +271,8 @@ class ServoBus(ABC):
         Nothing on models that have none.
         """
         if self.models[servo_id].has_watchdog:
-            self.write_register(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
+            counts = _WATCHDOG_COUNTS if is_on else 0
+            self.write_register(servo_id, "bus_watchdog", counts)
 
     def restore_effort(self) -> None:
         """Let the servos give all the torque that their settings allow; each confirms it.
@@ -336,8 +337,8 @@ class ServoBus(ABC):
         self._awaited.append(block)
         asked = self._place(block.start, len(block)) + bytes(self.ids)
         self._transmit(packets.BROADCAST, packets.SYNC_READ, asked)
-        wire_ms = self.port.tx_time_per_byte * len(self.ids) * (self.status_bytes + len(block))
-        longest_ms = wire_ms + 1e3 * timeout_s
+        length = len(self.ids) * (self.status_bytes + len(block))
+        longest_ms = self.port.tx_time_per_byte * length + 1e3 * timeout_s
         self.port.setPacketTimeoutMillis(longest_ms)
         replies: dict[int, bytes] = {}
         alerts: set[int] = set()
@@ -475,8 +476,9 @@ class BusGroup:
             time.sleep(_LOWER_S)
             share = max(1.0 - (time.monotonic() - begin) / duration_s, 0.0)
             # most of the torque is not needed to hold the arm: cubed, it is gone early
-            calls = [partial(_call, partial(bus.limit_effort, share**3)) for bus in self.buses]
-            if all(isinstance(answer, HardwareError) for answer in self._call_all(calls)):
+            limits = [partial(bus.limit_effort, share**3) for bus in self.buses]
+            answers = self._call_all([partial(_call, limit) for limit in limits])
+            if all(isinstance(answer, HardwareError) for answer in answers):
                 return
 
     def torque_off(self, when_sent: Any = None) -> HardwareError | None:

@@ -123,8 +123,8 @@ class EmulatorConfig(Model):
         for name in self.registers:
             _ = model.table[name]
         if self.arm is not None and len(self.arm.order) != len(self.ids):
-            count = f"{len(self.ids)} ids for {len(self.arm.order)} joints"
-            raise ValueError(f"an emulated arm needs one id for each of its joints, got {count}")
+            got = f"got {len(self.ids)} ids for {len(self.arm.order)} joints"
+            raise ValueError(f"an emulated arm needs one id for each of its joints, {got}")
         if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(
                 f"a pseudo-terminal has no rate of {self.rate} bit/s; it has {packets.RATES}"
@@ -168,8 +168,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         Monotonic time, id, register, value [count]; `present_position` is what a state that was
         asked for is to tell.
         """
-        events = self._request({"events": True})
-        return [(float(t), int(i), str(name), int(count)) for t, i, name, count in events]
+        return [tuple(event) for event in self._request({"events": True})]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""

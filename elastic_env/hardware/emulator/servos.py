@@ -277,12 +277,13 @@ class EmulatedBus:
             case packets.SYNC_READ:
                 place = self.wire.place(parameters)
                 asked = [self.servos[i] for i in parameters[begin:] if i in self.servos]
-                return [self.wire.status(each, *each.read_memory(*place)) for each in asked]
+                return [self.wire.status(one, *one.read_memory(*place)) for one in asked]
             case packets.SYNC_WRITE:
                 address, length = self.wire.place(parameters)
                 for at in range(begin, len(parameters) - length, length + 1):
                     if servo := self.servos.get(parameters[at]):
-                        servo.write_memory(address, parameters[at + 1 : at + 1 + length])
+                        data = parameters[at + 1 : at + 1 + length]
+                        servo.write_memory(address, data)
                 return []
         is_ping = packet.instruction == packets.PING
         is_to_all = is_ping and packet.servo_id == packets.BROADCAST
