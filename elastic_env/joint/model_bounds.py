@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.files import read_rows
 from elastic_env.joint.model_text import (
     DEEPEST,
     LARGEST_BYTES,
@@ -35,31 +36,11 @@ Files = tuple[Path, ...]
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
-_LARGEST = (
-    (("hfield",), ("nrow", "ncol"), 4_000_000),
-    (("texture",), ("width",), 4_096),
-    (("texture",), ("height",), 24_576),
-    (("numeric",), ("size",), 10_000),
-    (("camera",), ("resolution",), 16_000_000),
-    (("size",), ("nuserdata",), 1_000_000),
-    (("size",), ("nkey",), 10_000),
-    (("size",), ("nconmax",), 1_000_000),
-    (("size",), ("njmax",), 1_000_000),
-    (("size",), ("nstack",), 100_000_000),
-    (("global",), ("offwidth",), 16_384),
-    (("global",), ("offheight",), 16_384),
-    (("quality",), ("shadowsize",), 16_384),
-    (("quality",), ("offsamples",), 64),
-    (("quality",), ("numslices", "numstacks"), 10_000),
-    (("quality",), ("numquads",), 100),
-    (("lengthrange",), ("inttotal",), 100),
-    (("user",), ("dim",), 10_000),
-    (None, ("nsample",), 1_000),
-    (None, ("actdim",), 100),
-)
-"""Tags (None for all), attributes whose numbers are multiplied, and the largest product of their
-magnitudes.
-"""
+_LARGEST = [
+    (row["tag"], row["attributes"].split(), int(row["most"]))
+    for row in read_rows(Path(__file__).with_suffix(".csv"))
+]
+"""Attributes of elements, and the largest products of their magnitudes."""
 _PREFIXES = ("nuser_", "iterations", "_iterations", "_initpoints")
 _MOST_OF_OTHERS = 10_000
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
@@ -226,8 +207,8 @@ class _Counts:
     def _require_numbers(self, element: ET.Element) -> None:
         tag = element.tag
         values = element.attrib
-        for tags, names, most in _LARGEST:
-            if (tags is None or tag in tags) and any(name in values for name in names):
+        for of_tag, names, most in _LARGEST:
+            if of_tag in ("", tag) and any(name in values for name in names):
                 numbers = [n for name in names for n in _numbers(values.get(name, ""))]
                 what = f"{' times '.join(names)} of <{tag}>"
                 self._bound(what, _product(numbers), most)

@@ -9,6 +9,7 @@ of the offsets' rates, largest joint torque.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,6 +17,7 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import read_rows
 from elastic_env.core.robot_ranges import draw_robot, draw_robots
 from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
 from elastic_env.joint.elasticity import static_link_angle
@@ -34,7 +36,7 @@ from elastic_env.world.drawn_robot import (
 from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_signals import joint_groups
-from elastic_env.world.metrics import Metric, metrics_of
+from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
@@ -51,31 +53,17 @@ the scenario's IMU.
 _RIGID_NM_PER_RAD = 1e15
 """Stiffness of a joint without a spring beside servos that give way."""
 
-_OF_EVERY_STEP = (
-    *metrics_of("command_rate", "rad_s", "rms", "peak", over="all"),
-    *metrics_of("joint_torque", "nm", "peak", over="all"),
-    Metric("clipped_share", "clipped", "mean", over="all"),
-)
-METRICS_OF_ONE = (
-    *metrics_of("link_error", "rad", "rms", "peak", "min", "max"),
-    *metrics_of("link_error_imu", "rad", "rms", "min", "max"),
-    *metrics_of("deflection", "rad", "rms", "peak"),
-    *metrics_of("servo_error", "rad", "rms", "peak"),
-    *_OF_EVERY_STEP,
-)
-METRICS_OF_SEVERAL = (
-    Metric("link_error_rms_rad", "link_error", "rms"),
-    Metric("link_error_peak_rad", "link_error_largest", "peak"),
-    Metric("link_error_min_rad", "link_error_lowest", "min"),
-    Metric("link_error_max_rad", "link_error_highest", "max"),
-    *metrics_of("deflection", "rad", "rms"),
-    *metrics_of("servo_error", "rad", "rms"),
-    *_OF_EVERY_STEP,
-)
-METRICS_OF_TOOL = (
-    *metrics_of("end_effector_error", "m", "rms", "peak"),
-    *metrics_of("end_effector_tilt", "rad", "rms", "peak"),
-)
+_METRICS = read_rows(Path(__file__).with_name("joint_metrics.csv"))
+
+
+def _metrics_of(robots: str) -> tuple[Metric, ...]:
+    rows = [dict[str, Any](row) for row in _METRICS]
+    return tuple(Metric(**row) for row in rows if row.pop("robots") == robots)
+
+
+METRICS_OF_ONE = _metrics_of("one")
+METRICS_OF_SEVERAL = _metrics_of("several")
+METRICS_OF_TOOL = _metrics_of("end_effector")
 
 
 @dataclass(frozen=True)

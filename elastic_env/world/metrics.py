@@ -27,13 +27,6 @@ class Metric:
     over: str = "scored"
 
 
-def metrics_of(
-    signal: str, unit: str, *statistics: Statistic, over: str = "scored"
-) -> tuple[Metric, ...]:
-    """Statistics of a signal, each named `signal_statistic_unit`."""
-    return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
-
-
 _NEUTRAL: dict[Statistic, float] = {
     "rms": 0.0,
     "mean": 0.0,
