@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from elastic_env.core.config import Model, plain_numbers, quantity
 from elastic_env.core.errors import quote
@@ -117,8 +117,7 @@ class RobotRanges(Model):
     floor_friction: Interval = interval("1", 1.0, bounds=(1e-6, 10))
     """Factor on the friction of soles and floor [1]."""
 
-    @model_validator(mode="after")
-    def _intervals_are_in_order(self) -> Self:
+    def _check(self) -> None:
         for name, (low, high) in self.intervals():
             extra: Any = type(self).model_fields[name].json_schema_extra
             lowest, highest = extra["bounds"]
@@ -127,7 +126,6 @@ class RobotRanges(Model):
                     f"{name} must be a number or [lowest, highest] within {lowest:g} to"
                     f" {highest:g} [{extra['unit']}], got [{low:g}, {high:g}]"
                 )
-        return self
 
     def on_fixed_base(self) -> Self:
         """The same without `WALKER_FIELDS`."""

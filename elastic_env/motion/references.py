@@ -6,10 +6,10 @@ and moves by quintic (minimum-jerk) polynomials, which start and end without acc
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from typing_extensions import override
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
@@ -116,22 +116,16 @@ class Hold(_JointReference):
     overrun: float = quantity("rad", 0.08, gt=0)
     """How far the sweep starts and turns outside the positions [rad]."""
 
-    @model_validator(mode="after")
-    def _range_is_ordered(self) -> Self:
+    def _check(self) -> None:
         if self.upper <= self.lower:
             given = f"lower {self.lower} and upper {self.upper}"
             raise ValueError(f"upper must exceed lower, got {given}")
-        return self
-
-    @model_validator(mode="after")
-    def _ends_in_time(self) -> Self:
         angles = self.angles
         way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
         quickest_s = (2 * self.positions + 1) * self.shortest_move_s
         moves_s = max(QUINTIC_PEAK_RATE * way / self.rate, quickest_s)
         rest_s = self.settle_s + self.measure_s
         _require_short(STAND_S + moves_s + 2 * self.positions * rest_s)
-        return self
 
     @property
     def angles(self) -> Array:
@@ -263,21 +257,15 @@ class Multisine(_Oscillation):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the phases; None draws new ones per episode [1]."""
 
-    @model_validator(mode="after")
-    def _frequencies_are_ordered(self) -> Self:
+    def _check(self) -> None:
         if self.highest_hz <= self.lowest_hz:
             given = f"{self.lowest_hz} to {self.highest_hz} Hz"
             raise ValueError(f"highest_hz must exceed lowest_hz, got {given}")
-        return self
-
-    @model_validator(mode="after")
-    def _is_summed_in_time(self) -> Self:
         if self.components * self.duration_s > _LONGEST_SUM_S:
             raise ValueError(
                 f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got"
                 f" {self.components} x {self.duration_s:g} s; take fewer sines or less time"
             )
-        return self
 
     @property
     def _omega(self) -> Array:
@@ -320,10 +308,8 @@ class Steps(_JointReference):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the levels; None draws new ones per episode [1]."""
 
-    @model_validator(mode="after")
-    def _ends_in_time(self) -> Self:
+    def _check(self) -> None:
         _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
-        return self
 
     @override
     def extent(self) -> Extent:

@@ -174,6 +174,8 @@ class JointTask(Task):
                 f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has"
                 f" {len(joints)}; choose link_encoder to observe the links of several"
             )
+        groups = joint_groups(dict.fromkeys(joints)).values()
+        standard = [signal for group in groups for signal in group.signals]
         scenario = config.scenario
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
@@ -188,7 +190,7 @@ class JointTask(Task):
             model=plant.model,
             assumed=plant.assumed,
             motion=plant.motion,
-            table=_observed(joints, observe_imu),
+            table=[*standard, LINK_IMU] if observe_imu else standard,
             sensors=[name for name in config.sensors if name != LINK_IMU_SENSOR],
             joints=dict.fromkeys(joints),
             scenarios=[scenario] * num_worlds,
@@ -220,7 +222,8 @@ class JointTask(Task):
         self._springs = spring_ids(self.model, joints, config.form)
         self._joints_differ = joints_differ(scenario)
         is_one = scenario.has_one_robot
-        self._robot = draw_robots(scenario.parts, 1, len(joints), [0])[0] if is_one else None
+        same = draw_robots(scenario.parts, int(is_one), len(joints), [0])
+        self._robot = same[0] if is_one else None
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes, also for the watch over windows at rest."""
@@ -261,7 +264,8 @@ class JointTask(Task):
         parts = self.config.scenario.parts
         robot = self._robot or draw_robot(parts, n, random.fork())
         self._take_robot(world, robot)
-        generator.random(n + 1)  # not used: noise follows what has always been drawn here
+        # not used: noise follows what has always been drawn here
+        generator.random(n + 1)
         self._noise.restart(world, random.noise())
         self._imu_bias[world] = robot.mounting_rad[0]
         if self._imu is not None:
@@ -376,13 +380,6 @@ class JointTask(Task):
         }
 
 
-def _observed(joints: Sequence[str], observe_imu: bool) -> list[Signal]:
-    """The standard columns."""
-    groups = joint_groups(dict.fromkeys(joints)).values()
-    standard = [signal for group in groups for signal in group.signals]
-    return [*standard, LINK_IMU] if observe_imu else standard
-
-
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
     """Records of `SCHEDULE`, one per step."""
     rows = np.zeros(reference.num_steps + 1, records.SCHEDULE)
@@ -413,5 +410,5 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
             " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    period_s = config.control_period_s
-    return PendulumImu(scenario.inertial, plant.imu_arm_m, gravity, period_s, num_worlds)
+    place = (plant.imu_arm_m, gravity, config.control_period_s)
+    return PendulumImu(scenario.inertial, *place, num_worlds)

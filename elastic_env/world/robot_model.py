@@ -147,16 +147,17 @@ class RobotModel:
         servos = {name: joint.servo for name, joint in self.joints.items()}
         without = ", ".join(name for name, servo in servos.items() if servo is None)
         if without:
-            problem = f"a servo is needed on every joint, but there is none on: {without}"
-            raise ConfigurationError(problem)
+            needed = "a servo is needed on every joint"
+            raise ConfigurationError(f"{needed}, but there is none on: {without}")
         return tuple(servo for servo in servos.values() if servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
         """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p, 0 with an integrator."""
         servos = [joint.servo for joint in self.joints.values()]
-        sags = [servo if servo and servo.integral_gain == 0.0 else None for servo in servos]
-        return np.array([1.0 / servo.position_gain if servo else 0.0 for servo in sags])
+        sags = [bool(s and s.integral_gain == 0.0) for s in servos]
+        gains = [s.position_gain if s else 1.0 for s in servos]
+        return np.where(sags, 1.0 / np.array(gains), 0.0)
 
     @property
     def servo_lag(self) -> Array:
@@ -227,7 +228,8 @@ def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, A
     """
     at = [model.joint(name).id for name in joints]
     limits = model.jnt_range[at]
-    limited = model.jnt_limited[at, None].astype(bool) & (np.abs(limits) < _UNLIMITED_RAD)
+    is_near = np.abs(limits) < _UNLIMITED_RAD
+    limited = model.jnt_limited[at, None].astype(bool) & is_near
     lowest, highest = np.where(limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
@@ -249,7 +251,7 @@ def read_stiffness(value: Stiffness) -> "float | Array":
     given = value
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
-        if not any(isinstance(item, bool) or not isinstance(item, int | float) for item in value):
+        if all(type(item) in (int, float) for item in value):
             return np.asarray(value, dtype=np.float64)
         raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(given)}")
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):

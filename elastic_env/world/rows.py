@@ -35,7 +35,8 @@ def reals(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]
 
 _JOINT_TRUTH = record_type(
     *reals("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
-    *reals("offset command command_rate"),  # a, θ_cmd = q_ref + a [rad]; change of a [rad/s]
+    # a, θ_cmd = q_ref + a [rad]; change of a [rad/s]
+    *reals("offset command command_rate"),
     *reals("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
     *reals("backlash homing"),  # dead band, and what the encoder shows beyond θ [rad]
 )

@@ -13,9 +13,9 @@ Sensors 19(24), 5521.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from elastic_env.core.config import Title, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
@@ -59,14 +59,13 @@ class Scenario(RobotRanges):
     mixture: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
     """Ranges in place of the scenario's own, each of an equal share of the robots."""
 
-    @model_validator(mode="after")
-    def _mixture_says_all_that_differs(self) -> Self:
+    def _check(self) -> None:
+        super()._check()
         if self.mixture and self.changes:
             raise ValueError(
                 f"mixture says in what robots differ; leave out {', '.join(self.changes)}, or give"
                 " it to the ranges of the mixture"
             )
-        return self
 
     @property
     def parts(self) -> tuple[RobotRanges, ...]:

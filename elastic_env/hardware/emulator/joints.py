@@ -1,11 +1,10 @@
 """The joints behind emulated servos, in real time: pendulums of the testbed, or an arm."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -146,13 +145,11 @@ class EmulatedArm(Model):
     home: dict[str, float] = {}
     """Where the arm lies until torque goes on for the first time, by joint [rad]."""
 
-    @model_validator(mode="after")
-    def _lists_agree(self) -> Self:
+    def _check(self) -> None:
         lengths = {len(self.order), len(self.direction), len(self.zero_rad)}
         if len(lengths) > 1:
             lists = "order, direction and zero_rad"
             raise ValueError(f"{lists} must be equally long, got {lengths}")
-        return self
 
 
 class ArmJoints(ServoJoints):

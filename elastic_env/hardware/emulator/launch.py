@@ -4,10 +4,9 @@ import json
 import subprocess
 import termios
 from contextlib import AbstractContextManager
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses import packets
@@ -117,8 +116,7 @@ class EmulatorConfig(Model):
     seed: int = quantity("1", 0, ge=0)
     """Seed of faults and noise [1]."""
 
-    @model_validator(mode="after")
-    def _servos_exist(self) -> Self:
+    def _check(self) -> None:
         model = servo_model(self.model_number)
         for name in self.registers:
             _ = model.table[name]
@@ -130,7 +128,6 @@ class EmulatorConfig(Model):
                 f"a pseudo-terminal has no rate of {self.rate} bit/s; it has {packets.RATES}"
             )
         packets.require_ids(self.ids)
-        return self
 
     @property
     def rate(self) -> int:

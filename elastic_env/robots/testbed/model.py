@@ -7,11 +7,10 @@ which 60 N·m leave room; a steel bob of 10 kg, 0.61 m from the axis, with a rad
 0.1 m, is our choice.
 """
 
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -35,14 +34,12 @@ class Pendulum(Model):
     gyration_radius: float = quantity("m", 0.1, gt=0)
     """Radius of gyration about its center of mass [m]."""
 
-    @model_validator(mode="after")
-    def _can_be_built(self) -> Self:
+    def _check(self) -> None:
         for name, most in _MOST.items():
             extra: Any = type(self).model_fields[name].json_schema_extra
             bounds = f"from {_LEAST:g} to {most:g} [{extra['unit']}]"
             if not _LEAST <= (value := getattr(self, name)) <= most:
                 raise ValueError(f"{name} must be {bounds}, got {value:g}")
-        return self
 
     @property
     def com_distance(self) -> float:
@@ -87,7 +84,8 @@ def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> mujoco.MjSp
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # a NaN must end the episode, not restart the world behind the task's back
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    link = spec.worldbody.add_body(name="link", mass=pendulum.mass, explicitinertial=True)
+    link = spec.worldbody.add_body(name="link", mass=pendulum.mass)
+    link.explicitinertial = True
     link.ipos = [0.0, 0.0, -pendulum.com_distance]
     link.inertia = [pendulum.mass * pendulum.gyration_radius**2] * 3
     # the axis points to −y, so that positive q carries the pendulum towards +x

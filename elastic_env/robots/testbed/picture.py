@@ -29,8 +29,9 @@ class TestbedPicture(Picture):
         spec = _display_spec(pendulum)
         _add_light(spec)
         set_stage(spec, deviations.WIDTH, deviations.HEIGHT)
-        legend = [(word, tuple(spec.geom(name).rgba)) for word, name in _OF_LEGEND.items()]
-        super().__init__(spec, [*legend, ("reference", deviations.REFERENCE_WORD_RGBA)])
+        colours = {word: spec.geom(name).rgba for word, name in _OF_LEGEND.items()}
+        colours["reference"] = deviations.REFERENCE_WORD_RGBA
+        super().__init__(spec, [*colours.items()])
         self._pendulum = pendulum
 
     def alone(self) -> Alone:

@@ -2,11 +2,9 @@
 
 import copy
 from functools import lru_cache, partial
-from typing import Self
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
@@ -77,48 +75,35 @@ class WalkConfig(TaskConfig):
     spare_bodies: int = quantity("1", 0, ge=0)
     """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
 
-    @model_validator(mode="after")
-    def _joints_are_plain(self) -> Self:
+    def _check(self) -> None:
         if any(varies(one) or (one.servo and one.servo.motor) for one in self.joints):
             raise ValueError(
                 "joints of the walker must have neither load_friction nor static_friction nor a"
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _walks_can_be_shorter(self) -> Self:
-        fewest = self.fewest_steps
-        if fewest is None:
-            return self
-        if not self.gait.is_in_place:
-            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         most = self.gait.num_steps
+        fewest = self.fewest_steps or most
+        if self.fewest_steps and not self.gait.is_in_place:
+            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         if fewest > most or (most - fewest) % 2:
             raise ValueError(
                 f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
                 f" {fewest}"
             )
-        return self
+        frictions = {own.friction_scale: own.name for own in self.scenarios}
+        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
+        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
+        for name, values in known.items():
+            if len(values) > 1:
+                given = " and ".join(f"{one:g} of {own!r}" for one, own in values.items())
+                needed = f"the scenarios of all worlds must have the same {name}"
+                raise ValueError(f"{needed}, got {given}")
 
     @property
     def numbers_of_steps(self) -> range:
         """Numbers of steps that a walk can have."""
         most = self.gait.num_steps
-        return range(most if self.fewest_steps is None else self.fewest_steps, most + 1, 2)
-
-    @model_validator(mode="after")
-    def _worlds_know_the_same(self) -> Self:
-        frictions = {own.friction_scale: own.name for own in self.scenarios}
-        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
-        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
-        for name, values in known.items():
-            given = " and ".join(f"{value:g} of {own!r}" for value, own in values.items())
-            if len(values) > 1:
-                raise ValueError(
-                    f"the scenarios of all worlds must have the same {name}, got {given}"
-                )
-        return self
+        return range(self.fewest_steps or most, most + 1, 2)
 
     def of_each_scenario(self) -> "list[WalkConfig]":
         """Configurations of the scenarios, in the order in which these first occur."""
@@ -154,8 +139,8 @@ class WalkConfig(TaskConfig):
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
-        joints = self.true_joints
-        spec = thormang.elastic_spec(self.true_robot, joints, self.form, self.timestep_s)
+        own = (self.true_joints, self.form, self.timestep_s)
+        spec = thormang.elastic_spec(self.true_robot, *own)
         if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):

@@ -143,7 +143,8 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
     """A disc on the floor, higher than the soles, so that one sees it under a foot."""
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
-    disc = spec.worldbody.add_body(name=name, mocap=True).add_geom(name=name, material=name)
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    disc = body.add_geom(name=name, material=name)
     disc.type = mujoco.mjtGeom.mjGEOM_CYLINDER
     disc.size = [radius, height / 2, 0]
     disc.pos = [0, 0, height / 2]

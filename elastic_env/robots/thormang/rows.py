@@ -93,7 +93,8 @@ CONSTANTS = record_type(
     ("noise", NOISE),  # standard deviations
     *reals("imu_bias_rad imu_sine_error_rad"),
     *reals("lowest_pelvis_m highest_tilt_rad"),  # beyond them the robot has fallen
-    *reals("loaded_n zmp_n"),  # vertical force of a loaded foot, and least one for a ZMP
+    # vertical force of a loaded foot, and least one for a ZMP
+    *reals("loaded_n zmp_n"),
     # control step from which a shorter walk goes on further behind
     ("skips_at", WHOLE),
     ("weights", SCORES),

@@ -14,8 +14,9 @@ from elastic_env.world.joint_signals import joint_groups
 from elastic_env.world.metrics import Metric
 from elastic_env.world.scenario import Scenario
 
+_SIDEWAYS = ("_yaw", "_roll")
 JOINTS: Mapping[str, Mirrored] = {
-    name: "opposite" if name.endswith(("_yaw", "_roll")) else "same" for name in LEG_JOINTS
+    name: "opposite" if name.endswith(_SIDEWAYS) else "same" for name in LEG_JOINTS
 }
 """The joints in order, and what an angle of theirs is in the mirror."""
 
