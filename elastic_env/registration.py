@@ -122,10 +122,8 @@ def as_model(name: str, given: ModelT | dict[str, Any] | None, default: ModelT) 
         ConfigurationError: It is none of these.
     """
     if not isinstance(given, dict | type(default) | None):
-        raise ConfigurationError(
-            f"{name} must be a {type(default).__name__} or a mapping of its parameters, got"
-            f" {quote(given)}"
-        )
+        needed = f"a {type(default).__name__} or a mapping of its parameters"
+        raise ConfigurationError(f"{name} must be {needed}, got {quote(given)}")
     return default.replace(**(given or {})) if isinstance(given, dict | None) else given
 
 

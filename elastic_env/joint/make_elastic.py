@@ -317,7 +317,7 @@ def _drive(spec: MjSpec, name: str, driven: str, servo: Servo | None, rule: Actu
     existing = [actuator for actuator in on_joints if actuator.target == name]
     for actuator in existing:
         if rule == "replace":
-            _redirect_sensors(spec, actuator.name, name, servo)
+            _redirect_sensors(spec, actuator.name, name, servo is not None)
             spec.delete(actuator)
         else:
             actuator.target = driven
@@ -340,12 +340,12 @@ def _follow_actuators(spec: MjSpec, name: str, driven: str) -> None:
             sensor.objname = driven
 
 
-def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
+def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, has_servo: bool) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
     sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
-    if sensors and servo is None:
+    if sensors and not has_servo:
         raise ConfigurationError(
             f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"
             f" give the joint {joint!r} a servo, or delete the sensor"

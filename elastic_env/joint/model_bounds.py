@@ -194,9 +194,8 @@ class _Counts:
             if stat.S_ISDIR(facts.st_mode):
                 continue
             if not stat.S_ISREG(facts.st_mode):
-                raise ConfigurationError(
-                    f"{self.model.name} names {name_of(path)}, which is no regular file"
-                )
+                problem = f"names {name_of(path)}, which is no regular file"
+                raise ConfigurationError(f"{self.model.name} {problem}")
             self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
             self.asset_bytes += facts.st_size
             what = "bytes of meshes and pictures"
@@ -233,10 +232,9 @@ class _Counts:
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
-                raise ConfigurationError(
-                    f"timestep of <lengthrange> in {self.model.name} must be at least"
-                    f" {_SHORTEST_STEP_S:g} s, got {step:g}"
-                )
+                needed = f"must be at least {_SHORTEST_STEP_S:g} s, got {step:g}"
+                name = self.model.name
+                raise ConfigurationError(f"timestep of <lengthrange> in {name} {needed}")
 
     def _bound(self, what: str, value: float, most: float) -> None:
         if not value <= most:

@@ -123,9 +123,8 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
     """
     try:
         if path.exists() and not path.is_file():
-            raise ConfigurationError(
-                f"no {what} at {name_of(path)}: it is no regular file; {_FILE}"
-            )
+            problem = f"no {what} at {name_of(path)}: it is no regular file"
+            raise ConfigurationError(f"{problem}; {_FILE}")
         return read_bounded(path, LARGEST_BYTES)
     except ConfigurationError:
         raise

@@ -295,8 +295,8 @@ class _Feet:
         return _Feet(self.ankles[:1], self.yaw[:1], self.heading[:1])
 
 
-def _foot_paths(gait: Gait, timing: Timing, footholds: Footholds, biped: Biped) -> _Feet:
-    positions, yaw = footholds.swinging(timing)
+def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> _Feet:
+    positions, yaw = holds.swinging(timing)
     ankles = np.empty((len(timing.time), 2, 3))
     ankles[..., :2] = positions
     ankles[..., 2] = biped.ankle_height
@@ -315,12 +315,12 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, feet: _Feet) -> tuple[Array,
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, time: Array) -> Array:
+def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, t: Array) -> Array:
     """Pelvis of one height that puts the center of mass where it belongs."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        q = _angles(biped, pelvis, feet, time)
+        q = _angles(biped, pelvis, feet, t)
         from_pelvis = turn(biped.chains.center_of_mass(q)[:, :2], feet.heading)
         error = pelvis[:, :2] + from_pelvis - com
         pelvis[:, :2] -= error

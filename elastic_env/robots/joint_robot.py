@@ -276,7 +276,7 @@ class JointPicture(Picture):
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         joints = self._task.sample().joints["truth"][world]
         q_ref = joints["q_ref"]
-        drawn = q_ref + deviations.ENLARGEMENT * (joints["q"] - q_ref)
+        drawn = deviations.enlarge_deviation(joints["q"], q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference

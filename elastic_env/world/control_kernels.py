@@ -596,7 +596,7 @@ def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool
 
 
 @compiled
-def settle_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
+def settle_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
     if inertial is None:
         return
@@ -616,7 +616,7 @@ def settle_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any
 
 
 @compiled
-def advance_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
+def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Advance an inertial IMU by a control period.
 
     Its gyroscope measures the mean rate, and its filter turns the vertical.
@@ -766,8 +766,8 @@ def complementary_filter(up: Array, turned: Array, force: Array, gain: float) ->
 
 
 @compiled
-def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: float) -> None:
-    """The vertical where the filter rests: into `up`, (3,).
+def settled_vertical(up: Array, force: Array, gyro: Array, delay_s: float) -> None:
+    """The vertical where a filter with a time constant `delay_s` rests: into `up`, (3,).
 
     The force is constant, and the bias of the gyroscope is small.
     """
@@ -776,9 +776,9 @@ def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: floa
     y = force[1] / size
     z = force[2] / size
     p, q, r = cross(x, y, z, gyro)
-    x = x + time_constant_s * p
-    y = y + time_constant_s * q
-    z = z + time_constant_s * r
+    x = x + delay_s * p
+    y = y + delay_s * q
+    z = z + delay_s * r
     size = math.sqrt(x * x + y * y + z * z)
     up[0] = x / size
     up[1] = y / size
@@ -808,12 +808,12 @@ def shown_angle(
 
 
 @compiled
-def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray) -> bool:
+def end(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
     """Say what ends the episode of a world, if anything does; what has diverged has not fallen."""
     is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
-    has_fallen = is_down and not has_diverged
-    is_terminated = has_diverged or has_fallen
-    ends[0] = has_diverged
+    has_fallen = is_down and not diverged
+    is_terminated = diverged or has_fallen
+    ends[0] = diverged
     ends[1] = has_fallen
     ends[2] = is_terminated
     ends[3] = is_last and not is_terminated
@@ -821,7 +821,7 @@ def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray
 
 
 @compiled
-def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any) -> float:
+def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
     """Weighted terms of the reward, and their sum."""
     x = row.zmp[0] - planned.zmp[0]
     y = row.zmp[1] - planned.zmp[1]
@@ -832,7 +832,7 @@ def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any)
     terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
     terms.effort = weights.effort * -row.servo_torque
     terms.smoothness = weights.smoothness * -row.command_rate
-    terms.fall = weights.fall * (-1.0 if is_terminated else 0.0)
+    terms.fall = weights.fall * (-1.0 if is_failed else 0.0)
     terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
     drift = math.hypot(drift_x, drift_y)
     terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)

@@ -265,9 +265,9 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         """Free the renderer, let hardware go."""
         self._let_go()
 
-    def _begin(self, worlds: BoolArray, robots: Sequence[int | None] | None = None) -> None:
-        robots = robots or [None] * self.num_envs
-        self.task.restart(worlds, _episodes(self._generators, robots))
+    def _begin(self, worlds: BoolArray, robots: list[int | None] | None = None) -> None:
+        seeds = robots or [None] * self.num_envs
+        self.task.restart(worlds, _episodes(self._generators, seeds))
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:

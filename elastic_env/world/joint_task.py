@@ -247,13 +247,11 @@ class JointTask(Task):
     def truth(self) -> JointTruth:
         """State without noise, and the true parameters."""
         state = self._joints[self._row]["truth"]
+        names = ("theta", "theta_dot", "q_dot", "stiffness")
         return JointTruth(
             **vars(self._sensor_inputs()),
-            theta=state["theta"].copy(),
-            theta_dot=state["theta_dot"].copy(),
-            q_dot=state["q_dot"].copy(),
+            **{name: state[name].copy() for name in names},
             deflection=state["theta"] - state["q"],
-            stiffness=state["stiffness"].copy(),
             model=self._true_model,
         )
 

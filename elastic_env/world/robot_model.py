@@ -265,10 +265,8 @@ def read_stiffness(value: Stiffness) -> "float | Array":
     try:
         content = read_bounded(path, LARGEST_JSON)
     except (OSError, ValueError):
-        raise ConfigurationError(
-            "stiffness must be a number [N·m/rad] or an identification file, found no file"
-            f" {shorten(path)}"
-        ) from None
+        needed = "stiffness must be a number [N·m/rad] or an identification file"
+        raise ConfigurationError(f"{needed}, found no file {shorten(path)}") from None
     try:
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
     except (KeyError, TypeError, ValueError):

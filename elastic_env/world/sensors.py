@@ -9,6 +9,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
@@ -181,7 +182,7 @@ class NoiseStream:
         self._most_used = 0
         self._generators = [np.random.default_rng(0) for _ in range(num_worlds)]
 
-    def restart(self, world: int, generator: np.random.Generator) -> None:
+    def restart(self, world: int, generator: Generator) -> None:
         """Begin a new stream for one world."""
         self._generators[world] = generator
         self._refill(world)
@@ -257,7 +258,7 @@ class PendulumImu:
         self._bias = np.zeros((num_worlds, 3))
         self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
 
-    def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
+    def draw(self, world: int, generator: Generator, noise: Generator) -> float:
         """Draw the errors of an episode; the caller adds the returned offset [rad]."""
         sensor = self._sensor
         gyro, x, z, offset = generator.standard_normal(4)

@@ -71,10 +71,9 @@ def for_warp(model: MjModel) -> MjModel:
     servos = np.flatnonzero(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_PID)
     integral_limit, slew_limit = model.actuator_dynprm[servos, :2].T
     if slew_limit.any():
-        raise ConfigurationError(
-            'the backend "warp" needs PID actuators with slewmax = 0, got'
-            f' {slew_limit.max():g} rad/s; choose the backend "mujoco"'
-        )
+        needed = 'the backend "warp" needs PID actuators with slewmax = 0'
+        got = f'got {slew_limit.max():g} rad/s; choose the backend "mujoco"'
+        raise ConfigurationError(f"{needed}, {got}")
     _, position_gain, velocity_gain = -model.actuator_biasprm[servos, :3].T
     integral_gain = model.actuator_gainprm[servos, 0]
     plant.actuator_dyntype[servos] = mujoco.mjtDyn.mjDYN_DCMOTOR

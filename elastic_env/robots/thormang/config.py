@@ -3,8 +3,8 @@
 import copy
 from functools import lru_cache, partial
 
-import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
@@ -137,7 +137,7 @@ class WalkConfig(TaskConfig):
         load_kg = self.robot.torso_load_kg + self.scenario.shoulder_load_kg
         return self.robot.replace(torso_load_kg=load_kg)
 
-    def true_model(self) -> mujoco.MjModel:
+    def true_model(self) -> MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
         own = (self.true_joints, self.form, self.timestep_s)
         spec = thormang.elastic_spec(self.true_robot, *own)
@@ -164,7 +164,7 @@ def require_stable_walker(config: WalkConfig) -> None:
 
 
 @lru_cache(maxsize=_SETTLED)
-def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel, Equilibrium]:
+def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[MjModel, Equilibrium]:
     """The plant of a robot of the bank, and where it rests under zero offset; found once.
 
     Raises:
@@ -178,12 +178,11 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel,
     except ElasticError as error:
         if config.scenario.has_one_robot:
             raise
-        raise ConfigurationError(
-            f"the drawn robot {robot} cannot walk: {error}; narrow the ranges"
-        ) from None
+        problem = f"the drawn robot {robot} cannot walk: {error}"
+        raise ConfigurationError(f"{problem}; narrow the ranges") from None
 
 
-def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
+def drawn_model(config: WalkConfig, robot: DrawnRobot) -> MjModel:
     """The plant of a robot of the bank."""
     undrawn = undrawn_model(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     springs = spring_ids(undrawn, LEG_JOINTS, config.form)
@@ -200,7 +199,7 @@ def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
 
 
 @lru_cache(maxsize=64)
-def undrawn_model(config: WalkConfig) -> mujoco.MjModel:
+def undrawn_model(config: WalkConfig) -> MjModel:
     """The plant, what is drawn aside, compiled once."""
     return config.true_model()
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjsGeom, MjSpec
 
 from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
@@ -46,7 +47,7 @@ follows it.
 """
 
 
-def display_spec(robot: Thormang) -> mujoco.MjSpec:
+def display_spec(robot: Thormang) -> MjSpec:
     """A model for drawing only: robot, plan with the prefix `PLAN`, floor, markers."""
     spec = _dress(robot, is_plan=False)
     set_stage(spec, _SIZE, _SIZE)
@@ -62,14 +63,14 @@ def display_spec(robot: Thormang) -> mujoco.MjSpec:
     return spec
 
 
-def solid_spec(robot: Thormang) -> mujoco.MjSpec:
+def solid_spec(robot: Thormang) -> MjSpec:
     """The robot alone, without floor and light."""
     spec = _dress(robot, is_plan=False)
     spec.delete(spec.body("floor"))
     return spec
 
 
-def set_floor_and_light(spec: mujoco.MjSpec) -> None:
+def set_floor_and_light(spec: MjSpec) -> None:
     """Add to a scene what lies under the robot and above it."""
     spec.worldbody.add_body(name="floor").add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05]
@@ -78,7 +79,7 @@ def set_floor_and_light(spec: mujoco.MjSpec) -> None:
     _add_light(spec)
 
 
-def _dress(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
+def _dress(robot: Thormang, is_plan: bool) -> MjSpec:
     """The robot's links with the shapes of `shapes.csv`; the solid one brings the floor."""
     spec = rigid_spec(robot)
     for site in list(spec.sites):
@@ -105,7 +106,7 @@ def _inset(lengths: Any, is_plan: bool) -> list[float]:
     return [max(length - _PLAN_INSET_M, length / 2) for length in lengths]
 
 
-def _add_shape(spec: mujoco.MjSpec, row: Mapping[str, str], size: list[float]) -> mujoco.MjsGeom:
+def _add_shape(spec: MjSpec, row: Mapping[str, str], size: list[float]) -> MjsGeom:
     """A sphere, cylinder, capsule, box, or block, whose edges are the rounder, 0 to 1."""
     kind = row["kind"]
     place: dict[str, Any] = {"pos": [float(x) for x in row["place_m"].split()]}
@@ -125,7 +126,7 @@ def _add_shape(spec: mujoco.MjSpec, row: Mapping[str, str], size: list[float]) -
     return spec.body(row["link"]).add_geom(type=shape, mass=0.0, **place)
 
 
-def _add_floor(spec: mujoco.MjSpec) -> None:
+def _add_floor(spec: MjSpec) -> None:
     """A light floor with a grid."""
     texture = spec.add_texture(name="grid", width=128, height=128)
     texture.type = mujoco.mjtTexture.mjTEXTURE_2D
@@ -140,7 +141,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     spec.geom("floor").material = "floor"
 
 
-def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
+def _add_marker(spec: MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
     """A disc on the floor, higher than the soles, so that one sees it under a foot."""
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
     body = spec.worldbody.add_body(name=name, mocap=True)
@@ -150,7 +151,7 @@ def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rg
     disc.pos = [0, 0, height / 2]
 
 
-def _add_light(spec: mujoco.MjSpec) -> None:
+def _add_light(spec: MjSpec) -> None:
     """Light from above with a shadow, which shows where the feet leave the floor."""
     spec.stat.extent = 1.6
     spec.stat.center = _TARGET

@@ -23,6 +23,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjsBody, MjSpec
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.files import read_rows
@@ -85,14 +86,14 @@ def _numbers(row: dict[str, str], *columns: str) -> Array:
     return np.array([float(row[column]) for column in columns])
 
 
-def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
+def rigid_spec(robot: Thormang, floating: bool = True) -> MjSpec:
     """The robot with rigid joints and no actuator, all inertias explicit, standing over a floor.
 
     Args:
         robot: Options.
         floating: Whether the pelvis is free; False fixes it in the air, for checks of the legs.
     """
-    spec = mujoco.MjSpec()
+    spec = MjSpec()
     spec.modelname = "thormang"
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -138,7 +139,7 @@ def elastic_spec(
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     timestep_s: float = 1e-3,
-) -> mujoco.MjSpec:
+) -> MjSpec:
     """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
 
     Args:
@@ -162,7 +163,7 @@ DRAWN_LOAD = "drawn_load"
 """Body of the load that a scenario draws."""
 
 
-def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoco.MjsBody:
+def add_load(spec: MjSpec, name: str, mass: float, place: Array) -> MjsBody:
     """Fix a load to the upper body; its body.
 
     Args:
@@ -179,7 +180,7 @@ def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoc
     return load
 
 
-def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
+def place_load(model: MjModel, mass: float, place: Array) -> None:
     """Change mass and place of the `DRAWN_LOAD` in a compiled model, as `add_load` has them."""
     load = model.body(DRAWN_LOAD)
     load.mass[:] = mass
@@ -188,7 +189,7 @@ def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
+def _add_sole(foot: MjsBody, side: str, friction: float) -> None:
     """Box sole and the site of the force-torque sensor at the ankle."""
     sole = foot.add_geom(name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, mass=0.0)
     sole.size = [*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS]

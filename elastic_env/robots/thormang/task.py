@@ -219,23 +219,15 @@ class WalkTask(Task):
         """State without noise, and the true parameters."""
         joints = self._joints[self._row]["truth"]
         body = self._worlds[self._row]["truth"]
+        of_joints = ("theta", "theta_dot", "q", "q_dot", "stiffness", "backlash")
+        of_body = ("pelvis", "ankles", "pelvis_rate", "wrench")
         return records.WalkTruth(
-            theta=joints["theta"].copy(),
-            theta_dot=joints["theta_dot"].copy(),
-            q=joints["q"].copy(),
-            q_dot=joints["q_dot"].copy(),
-            stiffness=joints["stiffness"].copy(),
-            backlash=joints["backlash"].copy(),
-            load=self._bias["load"].copy(),
-            slope=self._bias["slope"].copy(),
-            friction=self._bias["friction"].copy(),
+            **{name: joints[name].copy() for name in of_joints},
+            **{name: self._bias[name].copy() for name in ("load", "slope", "friction")},
+            **{name: body[name].copy() for name in of_body},
             mounting=self._bias["imu_attitude"].copy(),
-            pelvis=body["pelvis"].copy(),
-            ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
             attitude=np.column_stack([body["roll"], body["pitch"]]),
-            pelvis_rate=body["pelvis_rate"].copy(),
-            wrench=body["wrench"].copy(),
             models=self._true_models,
         )
 
@@ -349,19 +341,14 @@ class WalkTask(Task):
             "pelvis_pitch": truth["pitch"].copy(),
             "pelvis_error": truth["tilt"].copy(),
             "pelvis_height": truth["pelvis"][:, 2].copy(),
-            "zmp_x": truth["zmp"][:, 0].copy(),
-            "zmp_y": truth["zmp"][:, 1].copy(),
-            "zmp_reference_x": zmp_ref[:, 0],
-            "zmp_reference_y": zmp_ref[:, 1],
+            **_parts("zmp", truth["zmp"].copy()),
+            **_parts("zmp_reference", zmp_ref),
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
-            "zmp_deviation_x": deviation[:, 0],
-            "zmp_deviation_y": deviation[:, 1],
+            **_parts("zmp_deviation", deviation),
             "zmp_in_feet": np.hypot(in_feet[:, 0], in_feet[:, 1]),
-            "zmp_in_feet_x": in_feet[:, 0],
-            "zmp_in_feet_y": in_feet[:, 1],
+            **_parts("zmp_in_feet", in_feet),
             "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
-            "foot_drift_x": drift[:, 0].copy(),
-            "foot_drift_y": drift[:, 1].copy(),
+            **_parts("foot_drift", drift.copy()),
             "link_error": rms(error),
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
@@ -497,6 +484,11 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
         row["time_constant_s"] = kind.config.scenario.inertial.time_constant_s
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
+
+
+def _parts(name: str, vectors: Array) -> Signals:
+    """Components of vectors in the plane, (rows, 2)."""
+    return {f"{name}_x": vectors[:, 0], f"{name}_y": vectors[:, 1]}
 
 
 def heading_error(quaternion: Array, planned: Array) -> Array:
