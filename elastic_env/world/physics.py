@@ -148,7 +148,8 @@ class Worlds(Simulation):
         if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
         is_bad = np.asarray(counts[:, _BAD].any(axis=1))
-        others = counts[~is_bad].any(axis=0)  # what explodes has every fault
+        # what explodes has every fault
+        others = np.asarray(counts[~is_bad].any(axis=0))
         for kind, meaning in _OTHERS.items():
             number = int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
             if others[number] and kind not in self._said:
@@ -168,7 +169,7 @@ class SingleWorld(Worlds):
     num_worlds = 1
 
     def __init__(self, model: MjModel, data: MjData | None = None) -> None:
-        data = data or MjData(model)
+        data = MjData(model) if data is None else data
         self.model = model
         self._data = data
         self._said = set()

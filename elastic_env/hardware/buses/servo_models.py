@@ -301,4 +301,5 @@ def _read(kind: type[Row], file: str) -> list[Row]:
     """Rows of a table beside this file as what they describe; empty cells are not given."""
     rows = read_rows(Path(__file__).with_name(file))
     given = [{column: cell for column, cell in row.items() if cell} for row in rows]
-    return TypeAdapter(list[kind]).validate_python(given)
+    read = TypeAdapter(kind).validate_python
+    return [read(row) for row in given]
