@@ -168,8 +168,8 @@ class SingleWorld(Worlds):
 
     num_worlds = 1
 
-    def __init__(self, model: MjModel, data: MjData | None = None) -> None:
-        data = MjData(model) if data is None else data
+    def __init__(self, model: MjModel, given: MjData | None = None) -> None:
+        data: MjData = given or MjData(model)
         self.model = model
         self._data = data
         self._said = set()
