@@ -219,7 +219,7 @@ def _ranges() -> str:
 
 
 def _range(value: float | tuple[float, float]) -> str:
-    low, high = value if isinstance(value, tuple) else (value, value)
+    low, high = value if isinstance(value, tuple | list) else (value, value)
     return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 

@@ -78,7 +78,5 @@ IDS: dict[str, str] = {}
 for _home in _ENVIRONMENTS:
     _room = import_module(_home)
     IDS[_room.NAME] = _room.ID
-    _made = f"{_home}.environment"
-    gymnasium.register(
-        id=_room.ID, entry_point=f"{_made}:make", vector_entry_point=f"{_made}:make_vector"
-    )
+    _made = f"{_home}.environment:make"
+    gymnasium.register(_room.ID, _made, vector_entry_point=f"{_made}_vector")

@@ -72,12 +72,13 @@ class Robot:
             ConfigurationError: A number of worlds or threads that cannot be, worlds beyond the
                 memory, or a backend or device that is not there.
         """
-        bounds = ("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")
+        all_threads = ", 0 for all"
+        bounds = [("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, all_threads)]
         for name, number, least, note in bounds:
-            if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
-                raise ConfigurationError(
-                    f"{name} must be a whole number >= {least}{note}, got {quote(number)}"
-                )
+            is_whole = isinstance(number, Integral) and not isinstance(number, bool)
+            if not is_whole or number < least:
+                needed = f"must be a whole number >= {least}{note}"
+                raise ConfigurationError(f"{name} {needed}, got {quote(number)}")
         require_memory("num_envs", num_envs, _LEAST_WORLD_BYTES)
         require_known("backend", [backend], BACKENDS)
         if device is not None and backend != "warp":
@@ -121,10 +122,8 @@ def as_model(name: str, given: ModelT | dict[str, Any] | None, default: ModelT) 
         ConfigurationError: It is none of these.
     """
     if not isinstance(given, dict | type(default) | None):
-        raise ConfigurationError(
-            f"{name} must be a {type(default).__name__} or a mapping of its parameters, got"
-            f" {quote(given)}"
-        )
+        needed = f"a {type(default).__name__} or a mapping of its parameters"
+        raise ConfigurationError(f"{name} must be {needed}, got {quote(given)}")
     return default.replace(**(given or {})) if isinstance(given, dict | None) else given
 
 

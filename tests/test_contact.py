@@ -15,7 +15,8 @@ from elastic_env.core.signals import Array
 from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.robots.thormang.standing import settle
-from elastic_env.world.ground_contact import FootSensors, zero_moment_point
+from elastic_env.world.foot_sensors import FootSensors
+from tests.ground_contact import ground_wrench, zero_moment_point
 from tests.test_standing import forces_on_the_feet
 
 ROBOT = Thormang()
@@ -167,7 +168,7 @@ def stance(slope: float = 0.0, side_gravity: float = 0.0, shift: float = 0.0) ->
     foot_R = data.xmat[feet].reshape(2, 3, 3).copy()
     ankle = data.xpos[feet].copy()
     feet_sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
-    force, moment = feet_sensors.ground_wrench(-sensors, foot_R)
+    force, moment = ground_wrench(feet_sensors, -sensors, foot_R)
     return Stance(
         data, contact_force, contact_moment, force, moment, ankle, foot_R, model.opt.gravity.copy()
     )
@@ -242,7 +243,7 @@ def test_sensors_in_tilted_feet_give_the_force_that_acts_on_them() -> None:
         total = np.cross(contact[row, foot], ground[row, foot]) + np.cross(R @ com[foot], weight)
         force[row, foot] = R.T @ (ground[row, foot] + weight)
         moment[row, foot] = R.T @ total
-    f, n = FootSensors(mass, com, gravity).ground_wrench(np.stack([force, moment], axis=2), foot_R)
+    f, n = ground_wrench(FootSensors(mass, com, gravity), np.stack([force, moment], axis=2), foot_R)
     np.testing.assert_allclose(f, ground, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(n, np.cross(contact, ground), rtol=0.0, atol=1e-11)
 

@@ -29,7 +29,7 @@ from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG_JOINTS, SIDES, Thormang, biped
 from elastic_env.robots.thormang.picture import Posture, WalkerPicture, enlarge_posture
 from elastic_env.robots.thormang.task import WalkTask, heading_error
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.scenario import make_scenario
 from tests.played import play_to_the_end

@@ -12,7 +12,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel, GroundMemory
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import zero_moment_point
+from tests.ground_contact import zero_moment_point
 
 PERIOD_S = 0.1
 

@@ -17,7 +17,8 @@ from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import LEG_JOINTS
 from elastic_env.robots.thormang.tables import BLOCK_STEPS
-from elastic_env.world.ground_contact import FootSensors, foot_drift, zero_moment_point
+from elastic_env.world.foot_sensors import FootSensors
+from tests.ground_contact import foot_drift, ground_wrench, zero_moment_point
 
 FAST: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2]}
 STANDING = 250
@@ -94,7 +95,7 @@ def test_the_zmp_in_the_feet_is_that_of_feet_where_they_are_planned() -> None:
         ankles = task.truth().ankles
         ankles[..., :2] = task.plan.ankles[step, :, :2]
         shown = -task.simulation.bind("sensordata")[:, :12].reshape(1, 2, 2, 3)
-        force, moment = sensors.ground_wrench(shown, R)
+        force, moment = ground_wrench(sensors, shown, R)
         zmp = zero_moment_point(force, moment, ankles, 1.0)[0] - task.plan.zmp[step]
         np.testing.assert_allclose(vector(info, "zmp_in_feet"), zmp, rtol=0, atol=1e-12)
         parts = vector(info, "zmp_in_feet") + vector(info, "foot_drift")

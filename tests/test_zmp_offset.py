@@ -12,7 +12,7 @@ from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import RobotModel
 
 OFFSET_M = np.array([0.011, -0.004])

@@ -11,7 +11,7 @@ import numpy as np
 from baselines.compensation.policy import WalkView
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
 LEAST_LOAD = 0.05

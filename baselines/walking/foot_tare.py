@@ -17,7 +17,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.walk_plan import derivatives
 from elastic_env.rigid.leg_kinematics import turn
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
 

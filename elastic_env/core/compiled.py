@@ -26,15 +26,10 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 _LOG = logging.getLogger(__name__)
-_KEPT = (
-    "compiling, once after an installation or an update: the first use takes some seconds longer"
-)
-_NOT_KEPT = (
-    "compiling, for some seconds in every program: there is no folder to keep it that can be"
-    " written"
-)
+_ONCE = "once after an installation or an update: the first use takes some seconds longer"
+_EVER = "for some seconds in every program: there is no folder to keep it that can be written"
 _said_of: dict[Any, str] = {}
-"""Message to log for a function, by its Python code."""
+"""When a function is compiled, by its Python code."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -42,11 +37,11 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     # as in NumPy, what is divided by zero is infinite or nan; nobody calls it from C, which saves
     # some compiling
     options: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-    _said_of[function] = _KEPT
+    _said_of[function] = _ONCE
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder can be written: every program compiles its own
-        _said_of[function] = _NOT_KEPT
+        _said_of[function] = _EVER
         return numba.njit(**options)(function)
 
 
@@ -58,7 +53,7 @@ class _Compilations(events.Listener):
         dispatcher = (event.data or {}).get("dispatcher")
         said = _said_of.get(getattr(dispatcher, "py_func", None))
         if said is not None:
-            _LOG.info(said)
+            _LOG.info("compiling, %s", said)
 
     def on_end(self, event: events.Event) -> None:
         """It ends."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
@@ -105,6 +105,14 @@ class Model(BaseModel):
         except ValidationError as error:
             problems = problems_of(type(self), error, values)
             raise ModelError(type(self).__name__, problems) from None
+
+    def _check(self) -> None:
+        """Refuse parameters that do not go together, by a ValueError."""
+
+    @model_validator(mode="after")
+    def _go_together(self) -> Self:
+        self._check()
+        return self
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

@@ -12,7 +12,8 @@ from pydantic.fields import FieldInfo
 from elastic_env.core.errors import ConfigurationError, choices_listed, quote, readable
 
 ParameterPath = tuple[str | int, ...]
-_Values = Mapping[str, Any]
+Spelling = Callable[[ParameterPath], str]
+"""How a parameter is written."""
 """Keys and numbers of entries that lead to a value."""
 
 
@@ -31,7 +32,7 @@ class Problem:
     form: Literal["must", "rule", "unknown", "missing"]
     text: str
 
-    def sentence(self, of_all: str, spelt: Callable[[ParameterPath], str]) -> str:
+    def sentence(self, of_all: str, spelt: Spelling) -> str:
         """The sentence.
 
         Args:
@@ -80,7 +81,7 @@ class ModelError(ConfigurationError):
         """What makes it anew in another process."""
         return type(self), (self.model, self.problems)
 
-    def describe(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = join_path) -> str:
+    def describe(self, of_all: str = "", spelt: Spelling = join_path) -> str:
         """All problems, one per line, for who wrote a file or options.
 
         Arguments as in `Problem.sentence`.
@@ -96,7 +97,9 @@ class ModelError(ConfigurationError):
         return "\n".join(said)
 
 
-def problems_of(model: type[BaseModel], error: ValidationError, values: _Values) -> list[Problem]:
+def problems_of(
+    model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]
+) -> list[Problem]:
     """Problems that a validation found, those of models within the model among them.
 
     Args:
@@ -109,7 +112,7 @@ def problems_of(model: type[BaseModel], error: ValidationError, values: _Values)
         path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
         cause = problem.get("ctx", {}).get("error")
         if isinstance(cause, ModelError):  # of a model within this one
-            found += [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
+            found += [replace(own, path=(*path, *own.path)) for own in cause.problems]
         else:
             found.append(_problem(model, path, problem))
     return found

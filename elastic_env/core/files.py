@@ -1,5 +1,6 @@
 """Files that a user names, read within bounds, and files that are written whole or not at all."""
 
+import csv
 import errno
 import os
 import stat
@@ -23,9 +24,8 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
         ConfigurationError: It is no plain file, is larger, or leads out of the folder.
     """
     if within is not None and leads_out(path, within):
-        raise ConfigurationError(
-            f"{_short_path(path)} is a link out of its folder; copy the file there"
-        )
+        problem = f"{_short_path(path)} is a link out of its folder"
+        raise ConfigurationError(f"{problem}; copy the file there")
     _require_plain(path, path.stat(), most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -34,6 +34,12 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
     if len(content) > most_bytes:  # it grew, or its size is not what the system says
         raise _too_large(path, most_bytes, f"more than {most_bytes}")
     return content
+
+
+def read_rows(table: Path) -> list[dict[str, str]]:
+    """Rows of a table of this package, by columns; lines that begin with # are comments."""
+    lines = table.read_text(encoding="utf-8").splitlines()
+    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 def leads_out(path: Path, folder: Path) -> bool:
@@ -45,17 +51,15 @@ def _require_plain(path: Path, found: os.stat_result, most_bytes: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise ConfigurationError(
-            f"{_short_path(path)} must be a plain file, it is a pipe, a socket or a device"
-        )
+        problem = "must be a plain file, it is a pipe, a socket or a device"
+        raise ConfigurationError(f"{_short_path(path)} {problem}")
     if found.st_size > most_bytes:
         raise _too_large(path, most_bytes, str(found.st_size))
 
 
 def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
-    return ConfigurationError(
-        f"{_short_path(path)} must have at most {most_bytes} bytes, it has {has}"
-    )
+    problem = f"must have at most {most_bytes} bytes, it has {has}"
+    return ConfigurationError(f"{_short_path(path)} {problem}")
 
 
 def _short_path(path: Path) -> str:

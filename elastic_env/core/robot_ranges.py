@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from elastic_env.core.config import Model, plain_numbers, quantity
 from elastic_env.core.errors import quote
@@ -46,7 +46,6 @@ CROSS_TALK_ENTRIES = 30
 """Of a foot's sensor: six axes on the five others."""
 LOAD_PLACE = ("load_x_m", "load_y_m", "load_z_m")
 """Place of the load from the torso's center of mass."""
-_LOAD = ("load_kg", *LOAD_PLACE)
 _OF_BOTH_FEET = dict.fromkeys(FOOT_ERRORS, 6) | {"cross_talk": 2 * CROSS_TALK_ENTRIES}
 
 
@@ -118,8 +117,7 @@ class RobotRanges(Model):
     floor_friction: Interval = interval("1", 1.0, bounds=(1e-6, 10))
     """Factor on the friction of soles and floor [1]."""
 
-    @model_validator(mode="after")
-    def _intervals_are_in_order(self) -> Self:
+    def _check(self) -> None:
         for name, (low, high) in self.intervals():
             extra: Any = type(self).model_fields[name].json_schema_extra
             lowest, highest = extra["bounds"]
@@ -128,7 +126,6 @@ class RobotRanges(Model):
                     f"{name} must be a number or [lowest, highest] within {lowest:g} to"
                     f" {highest:g} [{extra['unit']}], got [{low:g}, {high:g}]"
                 )
-        return self
 
     def on_fixed_base(self) -> Self:
         """The same without `WALKER_FIELDS`."""
@@ -160,11 +157,12 @@ class RobotRanges(Model):
     @property
     def is_one_robot(self) -> bool:
         """True if all robots are the same."""
-        # the floor may rise in any direction
-        return self.slope_rad[1] == 0.0 and not any(map(self.draws, RobotRanges.model_fields))
+        is_level = self.slope_rad[1] == 0.0  # a slope may rise in any direction
+        return is_level and not any(map(self.draws, RobotRanges.model_fields))
 
 
-WALKER_FIELDS = (*_LOAD, "slope_rad", "push_n", "push_share", *FOOT_ERRORS, "floor_friction")
+_PUSH = ("push_n", "push_share")
+WALKER_FIELDS = ("load_kg", *LOAD_PLACE, "slope_rad", *_PUSH, *FOOT_ERRORS, "floor_friction")
 """Quantities of `RobotRanges` that only a robot that walks has."""
 
 
@@ -277,7 +275,8 @@ def _draw(
     ranges: RobotRanges, number: int, joints: int, seed: Sequence[int]
 ) -> Iterator[DrawnRobot]:
     """Robots of one set of ranges."""
-    width = {"joint_stiffness": joints, "homing_rad": joints, "mounting_rad": 2, **_OF_BOTH_FEET}
+    width = dict.fromkeys(("joint_stiffness", "homing_rad"), joints)
+    width |= {"mounting_rad": 2, **_OF_BOTH_FEET}
     names = list(RobotRanges.model_fields)
     # in this order, so that the draws of the first stay as they were
     names.insert(names.index(FOOT_ERRORS[0]), _DIRECTION)
@@ -286,7 +285,8 @@ def _draw(
         shape = (number, width.get(name, 1))
         if low == high:
             return np.full(shape, low)
-        unit = latin_hypercube(*shape, np.random.default_rng([*seed, names.index(name)]))
+        generator = np.random.default_rng([*seed, names.index(name)])
+        unit = latin_hypercube(*shape, generator)
         # not low + u (high - low), which may end beyond high by rounding
         return np.clip(low + unit * (high - low), low, high)
 
@@ -300,7 +300,7 @@ def _draw(
     drawn["slope_direction_rad"] = 2.0 * np.pi * draw(_DIRECTION, high=turns)
     shares = {"is_delayed": has("delay_share"), "is_inertial": has("inertial_share")}
     for i in range(number):
-        values: dict[str, Any] = {name: bool(share[i]) for name, share in shares.items()}
+        values: dict[str, Any] = {name: bool(own[i]) for name, own in shares.items()}
         for name, of_robots in drawn.items():
             each = tuple(of_robots[i].tolist())
             values[name] = each if name in _OF_SEVERAL else each[0]

@@ -32,7 +32,5 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:
-        raise ConfigurationError(
-            f"{shorten(path)} cannot be read: it is missing, cut short or something else"
-            f" ({error}); copy it anew"
-        ) from None
+        problem = "cannot be read: it is missing, cut short or something else"
+        raise ConfigurationError(f"{shorten(path)} {problem} ({error}); copy it anew") from None

@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -61,8 +60,7 @@ class ArmSettings(Model):
     limits: SafetyLimits = ARM_LIMITS
     """What stops a motion or limits the goal; each joint also keeps to the range of the model."""
 
-    @model_validator(mode="after")
-    def _ids_differ(self) -> Self:
+    def _check(self) -> None:
         first: dict[int, str] = {}
         for name, place in self.joints.items():
             if place.id in first:
@@ -71,7 +69,6 @@ class ArmSettings(Model):
                     " needs an id of its own"
                 )
             first[place.id] = name
-        return self
 
     def servos(self, joints: Sequence[str]) -> "ServoMap":
         """The servos of some joints, in their order.

@@ -2,9 +2,7 @@
 
 import math
 import os
-from typing import Literal, Self
-
-from pydantic import model_validator
+from typing import Literal
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses.packets import LARGEST_ID, RANGE_OF_RATES
@@ -43,13 +41,11 @@ class SafetyLimits(Model):
     release_s: float = quantity("s", 0.0, ge=0, le=5)
     """Time in which torque falls before it is off, on servos that can limit it [s]."""
 
-    @model_validator(mode="after")
-    def _range_is_ordered(self) -> Self:
+    def _check(self) -> None:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
             needed = f"below highest_rad, by at least {_LEAST_RANGE_RAD} rad"
             given = f"{self.lowest_rad} and {self.highest_rad}"
             raise ValueError(f"lowest_rad must be {needed}, got {given}")
-        return self
 
 
 class HardwareSettings(Model):
@@ -92,8 +88,7 @@ class HardwareSettings(Model):
     limits: SafetyLimits = SafetyLimits()
     """What stops a motion, or limits the goal."""
 
-    @model_validator(mode="after")
-    def _wiring_is_possible(self) -> Self:
+    def _check(self) -> None:
         named = (self.port, self.imu_port)
         ports = [os.path.realpath(port) for port in named if port is not None]
         if len(set(ports)) < len(ports):
@@ -106,7 +101,6 @@ class HardwareSettings(Model):
                 f"lowest_rad {lowest:g} and highest_rad {highest:g} with zero_rad {self.zero_rad:g}"
                 f" are {low:.2f} to {high:.2f} rad of the servo, which has ±{_TURN:.2f}"
             )
-        return self
 
     def servo_angle(self, joint: float) -> float:
         """Angle in the servo's zero and sign [rad]."""

@@ -18,9 +18,6 @@ import math
 
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 
-BACKLASH_BOUND_RAD = 1.75e-3
-"""Upper bound of the maker for the backlash of the gear [rad]."""
-
 ENCODER_COUNTS_PER_TURN = 501_923
 """Counts of the motor encoder per turn of the output."""
 

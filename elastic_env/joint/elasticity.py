@@ -211,11 +211,11 @@ def static_link_angle(
     is_soft = is_soft | open_rows | is_far
     if not is_soft.any():
         return q
-    found = follow_load(
-        theta, 1.0 / K, torque, torque_gradient, tolerance=tolerance, rows=is_soft, unique=unique
-    )
+    own = {"tolerance": tolerance, "rows": is_soft, "unique": unique}
+    found = follow_load(theta, 1.0 / K, torque, torque_gradient, **own)
     if found.lost.any():
-        raise ElasticError(f"the link angle at rest is not clear, Eq. 10: {found.reason(1.0 / K)}")
+        problem = "the link angle at rest is not clear, Eq. 10"
+        raise ElasticError(f"{problem}: {found.reason(1.0 / K)}")
     is_same = ~open_rows & (np.abs(found.q - q).max(axis=-1, keepdims=True) < _SAME_RAD)
     return np.where(is_soft & ~is_same, found.q, q)
 

@@ -10,10 +10,7 @@ C. Canudas de Wit, "A survey of models, analysis tools and compensation methods 
 machines with friction", Automatica 30(7).
 """
 
-from typing import Self
-
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, Parameter
@@ -91,11 +88,9 @@ class FrictionTerms(Model):
     stribeck_speed: float = quantity("rad/s", 0.0, ge=0)
     """ω_s, speed by which that excess falls to 37 %; needed where there is one [rad/s]."""
 
-    @model_validator(mode="after")
-    def _static_friction_fades(self) -> Self:
+    def _check(self) -> None:
         if self.static_friction > 0.0 and self.stribeck_speed == 0.0:
             raise ValueError(
                 f"static_friction = {self.static_friction:g} N·m needs a stribeck_speed above 0"
                 " [rad/s], by which it falls to 37 %; 0.05 rad/s is usual for gears"
             )
-        return self

@@ -29,22 +29,15 @@ def hold_other_joints(spec: MjSpec, joints: Collection[str]) -> MjSpec:
     """
     model = compiled_spec(spec.copy(), "the model")
     require_known_torque(model, list(joints))
-    held = copy_without_keys(spec)
-    for element in [*held.sensors, *held.equalities, *held.tendons, *held.tuples]:
+    held = spec.copy()  # the vectors of keyframes would not fit
+    constraints = [*held.equalities, *held.tendons, *held.tuples]
+    for element in [*held.keys, *held.sensors, *constraints]:
         held.delete(element)
     for actuator in list(held.actuators):
         if actuator.trntype not in _ON_JOINT or actuator.target not in joints:
             held.delete(actuator)
     _put_bodies_in_place(held, model, joints, home_of(model))
     return held
-
-
-def copy_without_keys(spec: MjSpec) -> MjSpec:
-    """A copy without keyframes, whose vectors would not fit."""
-    copied = spec.copy()
-    for key in list(copied.keys):
-        copied.delete(key)
-    return copied
 
 
 def _put_bodies_in_place(

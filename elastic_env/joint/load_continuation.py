@@ -62,7 +62,8 @@ class LoadPath:
         if names is not None:
             name = names[joint]
         question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
-        others = [f"at {angle:.4g} rad" for angle in self.other[row] if not np.isnan(angle)]
+        known = self.other[row][~np.isnan(self.other[row])]
+        others = [f"at {angle:.4g} rad" for angle in known]
         if self.load[row] < 1.0:
             there = "which pose it comes to rest in is not known"
             if others:
@@ -209,11 +210,12 @@ class _Springs:
                 is_allowed = is_allowed.all(axis=-1, keepdims=True)
                 # NaN is apart from nothing
                 is_known = np.abs(found[..., i] - other[..., 0]) <= _OTHER_RAD
-                is_other = (is_new & is_stable & is_apart & is_allowed)[..., 0] & ~is_known
+                is_rest = (is_new & is_stable & is_apart & is_allowed)[..., 0]
+                is_other = is_rest & ~is_known
                 is_first = is_other & np.isnan(other[..., 0])
                 joint = np.where(is_first, i, joint)
-                other[..., 1] = np.where(is_other & ~is_first, found[..., i], other[..., 1])
-                other[..., 0] = np.where(is_first, found[..., i], other[..., 0])
+                for number, takes in enumerate((is_first, is_other & ~is_first)):
+                    other[takes, number] = found[takes, i]
         return joint, other
 
     def _crossings(self, q: Array, i: int) -> list[Array]:

@@ -22,8 +22,9 @@ from mujoco import MjsActuator, MjsBody, MjsJoint, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
+from elastic_env.joint import joint_names
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.joint_names import friction_name, motor_name, servo_name, spring_name
+from elastic_env.joint.joint_names import motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import carry_keyframes
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.motor import Motor
@@ -181,12 +182,12 @@ def _resolve_springdampers(spec: MjSpec, joints: list[str]) -> None:
 
 
 def _hinge(spec: MjSpec, name: str) -> MjsJoint:
-    hinges = [joint.name for joint in spec.joints if joint.type == _HINGE and joint.name]
-    require_known("hinge", [name], hinges)
+    hinges = [joint for joint in spec.joints if joint.type == _HINGE and joint.name]
+    require_known("hinge", [name], [hinge.name for hinge in hinges])
     taken = {part.name for part in [*spec.joints, *spec.tendons, *spec.actuators]}
     taken |= {motor_name(name)} & {body.name for body in spec.bodies}
     taken |= {number.name for number in spec.numerics}
-    for derived in (motor_name(name), spring_name(name), servo_name(name), friction_name(name)):
+    for derived in joint_names.all_names(name):
         if derived in taken:
             raise ConfigurationError(
                 f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?"
@@ -316,7 +317,7 @@ def _drive(spec: MjSpec, name: str, driven: str, servo: Servo | None, rule: Actu
     existing = [actuator for actuator in on_joints if actuator.target == name]
     for actuator in existing:
         if rule == "replace":
-            _redirect_sensors(spec, actuator.name, name, servo)
+            _redirect_sensors(spec, actuator.name, name, servo is not None)
             spec.delete(actuator)
         else:
             actuator.target = driven
@@ -339,12 +340,12 @@ def _follow_actuators(spec: MjSpec, name: str, driven: str) -> None:
             sensor.objname = driven
 
 
-def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
+def _redirect_sensors(spec: MjSpec, actuator: str, joint: str, has_servo: bool) -> None:
     """Sensors of an actuator that is replaced read the servo instead."""
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
     of_actuators = [sensor for sensor in spec.sensors if sensor.objtype == kind]
     sensors = [sensor for sensor in of_actuators if sensor.objname == actuator]
-    if sensors and servo is None:
+    if sensors and not has_servo:
         raise ConfigurationError(
             f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced;"
             f" give the joint {joint!r} a servo, or delete the sensor"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError, quote
+from elastic_env.core.files import read_rows
 from elastic_env.joint.model_text import (
     DEEPEST,
     LARGEST_BYTES,
@@ -31,34 +32,15 @@ MOST_ASSET_BYTES = 500_000_000
 
 FOLDERS = ("meshdir", "texturedir", "assetdir")
 """Attributes of <compiler> that name a folder of files."""
+Files = tuple[Path, ...]
 _JOINTS = ("joint", "freejoint")
 _WORLD = ("worldbody", "body")
 _SOFT = ("flexcomp", "composite", "flex")
-_LARGEST = (
-    (("hfield",), ("nrow", "ncol"), 4_000_000),
-    (("texture",), ("width",), 4_096),
-    (("texture",), ("height",), 24_576),
-    (("numeric",), ("size",), 10_000),
-    (("camera",), ("resolution",), 16_000_000),
-    (("size",), ("nuserdata",), 1_000_000),
-    (("size",), ("nkey",), 10_000),
-    (("size",), ("nconmax",), 1_000_000),
-    (("size",), ("njmax",), 1_000_000),
-    (("size",), ("nstack",), 100_000_000),
-    (("global",), ("offwidth",), 16_384),
-    (("global",), ("offheight",), 16_384),
-    (("quality",), ("shadowsize",), 16_384),
-    (("quality",), ("offsamples",), 64),
-    (("quality",), ("numslices", "numstacks"), 10_000),
-    (("quality",), ("numquads",), 100),
-    (("lengthrange",), ("inttotal",), 100),
-    (("user",), ("dim",), 10_000),
-    (None, ("nsample",), 1_000),
-    (None, ("actdim",), 100),
-)
-"""Tags (None for all), attributes whose numbers are multiplied, and the largest product of their
-magnitudes.
-"""
+_LARGEST = [
+    (row["tag"], row["attributes"].split(), int(row["most"]))
+    for row in read_rows(Path(__file__).with_suffix(".csv"))
+]
+"""Attributes of elements, and the largest products of their magnitudes."""
 _PREFIXES = ("nuser_", "iterations", "_iterations", "_initpoints")
 _MOST_OF_OTHERS = 10_000
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
@@ -109,7 +91,7 @@ class _Counts:
         for mesh in robot.iter("mesh"):
             self._add_asset(mesh.get("filename", "").removeprefix("file://"))
 
-    def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
+    def add(self, root: ET.Element, files: Files) -> None:
         """Count a document of MJCF; `files` are those in which it is included."""
         self._add_folders(root)
         self._walk(root, files, 1.0, in_world=False, depth=len(files))
@@ -121,7 +103,7 @@ class _Counts:
     def _walk(
         self,
         element: ET.Element,
-        files: tuple[Path, ...],
+        files: Files,
         copies: float,
         in_world: bool,
         depth: int,
@@ -162,25 +144,21 @@ class _Counts:
         for part in element:
             self._walk(part, files, copies, in_world, depth + 1)
 
-    def _include(
-        self, name: str, files: tuple[Path, ...], copies: float, in_world: bool, depth: int
-    ) -> None:
+    def _include(self, name: str, files: Files, copies: float, in_world: bool, depth: int) -> None:
         root, path = self._document(name, files)
         if root is not None:
             self._add_folders(root)
             for part in root:
                 self._walk(part, (*files, path), copies, in_world, depth + 1)
 
-    def _attachable(self, element: ET.Element, files: tuple[Path, ...]) -> None:
+    def _attachable(self, element: ET.Element, files: Files) -> None:
         name = element.get("file", "")
         root, path = self._document(name, files)
         if root is not None:
             self._attached[element.get("name") or Path(name).stem] = root
             self._walk(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
 
-    def _attach(
-        self, element: ET.Element, files: tuple[Path, ...], copies: float, depth: int
-    ) -> None:
+    def _attach(self, element: ET.Element, files: Files, copies: float, depth: int) -> None:
         root = self._attached.get(element.get("model", ""))
         if root is not None:
             name = element.get("body")
@@ -188,7 +166,7 @@ class _Counts:
             for body in bodies or root.findall("worldbody"):
                 self._walk(body, files, copies, in_world=True, depth=depth + 1)
 
-    def _document(self, name: str, files: tuple[Path, ...]) -> tuple[ET.Element | None, Path]:
+    def _document(self, name: str, files: Files) -> tuple[ET.Element | None, Path]:
         """A further file of the model; None where MuJoCo will say that it is missing."""
         folders = [self.model.folder, *(file.parent for file in files[-1:])]
         paths = [folder / name for folder in folders if _exists(folder / name)]
@@ -216,9 +194,8 @@ class _Counts:
             if stat.S_ISDIR(facts.st_mode):
                 continue
             if not stat.S_ISREG(facts.st_mode):
-                raise ConfigurationError(
-                    f"{self.model.name} names {name_of(path)}, which is no regular file"
-                )
+                problem = f"names {name_of(path)}, which is no regular file"
+                raise ConfigurationError(f"{self.model.name} {problem}")
             self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
             self.asset_bytes += facts.st_size
             what = "bytes of meshes and pictures"
@@ -229,8 +206,8 @@ class _Counts:
     def _require_numbers(self, element: ET.Element) -> None:
         tag = element.tag
         values = element.attrib
-        for tags, names, most in _LARGEST:
-            if (tags is None or tag in tags) and any(name in values for name in names):
+        for of_tag, names, most in _LARGEST:
+            if of_tag in ("", tag) and any(name in values for name in names):
                 numbers = [n for name in names for n in _numbers(values.get(name, ""))]
                 what = f"{' times '.join(names)} of <{tag}>"
                 self._bound(what, _product(numbers), most)
@@ -255,10 +232,9 @@ class _Counts:
         if tag == "lengthrange" and "timestep" in values:
             step = _number(values["timestep"])
             if not step >= _SHORTEST_STEP_S:
-                raise ConfigurationError(
-                    f"timestep of <lengthrange> in {self.model.name} must be at least"
-                    f" {_SHORTEST_STEP_S:g} s, got {step:g}"
-                )
+                needed = f"must be at least {_SHORTEST_STEP_S:g} s, got {step:g}"
+                name = self.model.name
+                raise ConfigurationError(f"timestep of <lengthrange> in {name} {needed}")
 
     def _bound(self, what: str, value: float, most: float) -> None:
         if not value <= most:

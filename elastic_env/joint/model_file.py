@@ -14,12 +14,13 @@ from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjSpec
 
 from elastic_env.core.errors import ConfigurationError, quote
 from elastic_env.joint.model_bounds import FOLDERS, require_bounds
-from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
+from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, is_file, read_model_text
 
-GivenModel = str | Path | mujoco.MjSpec | mujoco.MjModel
+GivenModel = str | Path | MjSpec | MjModel
 """A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or what MuJoCo
 compiled.
 """
@@ -65,13 +66,13 @@ class ReadModel:
         lost: Meshes that are not in it, since they are missing or MuJoCo cannot read them.
     """
 
-    spec: mujoco.MjSpec
-    model: mujoco.MjModel
+    spec: MjSpec
+    model: MjModel
     name: str
     lost: list[str]
 
 
-def compiled_model(model: GivenModel) -> mujoco.MjModel:
+def compiled_model(model: GivenModel) -> MjModel:
     """A compiled rigid model.
 
     Shapes of a URDF are left out, so that no mesh has to be there; links that are fixed to others
@@ -83,7 +84,7 @@ def compiled_model(model: GivenModel) -> mujoco.MjModel:
     Raises:
         ConfigurationError: There is no such file, or MuJoCo cannot read or compile it.
     """
-    if isinstance(model, mujoco.MjModel):
+    if isinstance(model, MjModel):
         require_sound(model, "the model")
         return model
     return read_model(model).model
@@ -103,11 +104,11 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes
             from a lost mesh.
     """
-    if isinstance(model, mujoco.MjSpec):
+    if isinstance(model, MjSpec):
         given: Any = model
         name = "the specification"
         return _without_lost_meshes(lambda: _whole_copy(given, name), name)
-    if isinstance(model, mujoco.MjModel):
+    if isinstance(model, MjModel):
         raise ConfigurationError(
             "a compiled model cannot be made elastic; give its file (.xml, .urdf) or its MjSpec"
         )
@@ -123,7 +124,7 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
     return _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
 
 
-def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+def compiled_spec(spec: MjSpec, name: str) -> MjModel:
     """A specification compiled; `name` is what errors call it.
 
     Raises:
@@ -134,7 +135,7 @@ def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     return model
 
 
-def require_sound(model: mujoco.MjModel, name: str) -> None:
+def require_sound(model: MjModel, name: str) -> None:
     """Refuse numbers that MuJoCo takes and that no robot has.
 
     Raises:
@@ -195,7 +196,7 @@ def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
     return lost
 
 
-def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
+def urdf_spec(robot: ET.Element, name: str) -> MjSpec:
     """The specification of a URDF.
 
     Links that are fixed to others keep their names; shapes weigh and touch nothing.
@@ -215,7 +216,7 @@ def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
             compiler.attrib.pop(key, None)
         compiler.attrib.update(_URDF_OPTIONS)
     text = ET.tostring(robot, encoding="unicode")
-    spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text), name, "read")
+    spec = from_mujoco(lambda: MjSpec.from_string(text), name, "read")
     for mesh in spec.meshes:
         # a mesh that is not closed has no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -265,10 +266,8 @@ def _require_tree(text: ModelText) -> None:
         ends = ["" if element is None else element.get("link", "") for element in found]
         for end, link in zip(_ENDS, ends, strict=True):
             if link not in links:
-                raise ConfigurationError(
-                    f"joint {name} of {text.name} needs a {end} that is a link of it, got"
-                    f" {quote(link)}"
-                )
+                needed = f"joint {name} of {text.name} needs a {end} that is a link of it"
+                raise ConfigurationError(f"{needed}, got {quote(link)}")
         if ends[1] in parents:
             raise ConfigurationError(
                 f"link {quote(ends[1])} of {text.name} is the child of two joints; cut the loop"
@@ -288,18 +287,18 @@ def _require_tree(text: ModelText) -> None:
 _ENDS = ("parent", "child")
 
 
-def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
+def _mjcf_spec(text: ModelText) -> MjSpec:
     """The specification of MJCF. A file that is not in UTF-8 goes to MuJoCo as a text."""
     if text.file is not None and text.is_utf8:
         file = str(text.file)
-        return from_mujoco(lambda: mujoco.MjSpec.from_file(file), text.name, "read")
-    spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text.text), text.name, "read")
+        return from_mujoco(lambda: MjSpec.from_file(file), text.name, "read")
+    spec = from_mujoco(lambda: MjSpec.from_string(text.text), text.name, "read")
     if text.file is not None:
         spec.modelfiledir = str(text.folder)
     return spec
 
 
-def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
+def _without_lost_meshes(read: Callable[[], MjSpec], name: str) -> ReadModel:
     """A specification that compiles, without its meshes and pictures where these prevent it.
 
     What is compiled is read for that alone: to compile a specification changes it.
@@ -314,7 +313,12 @@ def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadMo
     if not lost:
         raise problem
     heavy = _bodies_of_meshes(spec)
-    _take_meshes(spec)
+    for geom in [geom for geom in spec.geoms if _is_of_mesh(geom)]:
+        spec.delete(geom)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for element in [*spec.skins, *spec.meshes, *spec.textures]:
+        spec.delete(element)
     if heavy:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
         for body in heavy:  # of any mass: would it compile if the meshes were there?
@@ -330,7 +334,7 @@ def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadMo
     return ReadModel(spec, model, name, lost)
 
 
-def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
+def _whole_copy(spec: MjSpec, name: str) -> MjSpec:
     """A copy with all elements: MuJoCo's own leaves out those whose references are wrong.
 
     Raises:
@@ -340,33 +344,22 @@ def _whole_copy(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
     for kind in _REFERRING.split():
         if len(getattr(copied, kind)) < len(getattr(spec, kind)):
             from_mujoco(spec.compile, name, "compile")  # which says what is wrong
-            raise ConfigurationError(f"one of the {kind} of {name} cannot be copied by MuJoCo")
+            problem = f"one of the {kind} of {name} cannot be copied by MuJoCo"
+            raise ConfigurationError(problem)
     return copied
 
 
-def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
+def _bodies_of_meshes(spec: MjSpec) -> list[mujoco.MjsBody]:
     """Bodies that have their mass from a mesh."""
     rule = spec.compiler.inertiafromgeom
     from_geoms = rule == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    return [
-        body
-        for body in spec.bodies[1:]
-        if (from_geoms or not body.explicitinertial) and any(map(_is_of_mesh, body.geoms))
-    ]
+    bodies = [body for body in spec.bodies[1:] if from_geoms or not body.explicitinertial]
+    return [body for body in bodies if any(map(_is_of_mesh, body.geoms))]
 
 
 def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
     """True if a geom is a mesh, or a primitive that is fitted to one."""
     return geom.type == _MESH or bool(geom.meshname)
-
-
-def _take_meshes(spec: mujoco.MjSpec) -> None:
-    for geom in [geom for geom in spec.geoms if _is_of_mesh(geom)]:
-        spec.delete(geom)
-    for material in spec.materials:
-        material.textures = [""] * len(material.textures)
-    for element in [*spec.skins, *spec.meshes, *spec.textures]:
-        spec.delete(element)
 
 
 def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
@@ -424,14 +417,8 @@ def _mesh_file(name: str, folder: Path) -> Path | None:
     bases = [folder]
     if name.startswith(_PACKAGE):
         bases += folder.resolve().parents
-    return next((base / relative for base in bases if _is_mesh(base / relative)), None)
-
-
-def _is_mesh(path: Path) -> bool:
-    try:
-        return path.is_file() and path.stat().st_size <= LARGEST_BYTES
-    except (OSError, ValueError):
-        return False
+    files = [base / relative for base in bases if is_file(base / relative)]
+    return next((file for file in files if file.stat().st_size <= LARGEST_BYTES), None)
 
 
 def _with_cure(error: Exception) -> str:

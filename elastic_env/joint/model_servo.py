@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -25,7 +26,7 @@ class ModelServo:
     joint_damping: float
 
 
-def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
+def position_servo(model: MjModel, joint: str) -> ModelServo | None:
     """The model's position actuator of a joint, by its gear on the joint; None where there is none.
 
     A damper or a velocity actuator beside it, whose command is zero, is part of the velocity gain.
@@ -74,7 +75,7 @@ def position_servo(model: mujoco.MjModel, joint: str) -> ModelServo | None:
     return ModelServo(settings, joint_damping)
 
 
-def rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
+def rotor_inertia(model: MjModel, joint: str) -> float:
     """Armature of a joint and of the actuators on it, 0 where there is none [kg·m²]."""
     actuators = _actuators(model, joint)
     gears = model.actuator_gear[actuators, 0]
@@ -82,7 +83,7 @@ def rotor_inertia(model: mujoco.MjModel, joint: str) -> float:
     return float(model.joint(joint).armature[0] + sum(of_actuators))
 
 
-def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
+def force_limit(model: MjModel, joint: str) -> float | None:
     """Torque limit of a joint and its actuators [N·m]; None where the model has none.
 
     Raises:
@@ -104,7 +105,7 @@ def force_limit(model: mujoco.MjModel, joint: str) -> float | None:
     return min((value for value in found if value is not None), default=None)
 
 
-def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
+def _actuators(model: MjModel, joint: str) -> list[int]:
     """Actuators that act on a joint."""
     number = model.joint(joint).id
     is_on_joint = np.isin(model.actuator_trntype, _ON_JOINT)
@@ -112,7 +113,7 @@ def _actuators(model: mujoco.MjModel, joint: str) -> list[int]:
     return np.flatnonzero(is_on_it).tolist()
 
 
-def _braking(model: mujoco.MjModel, joint: str) -> float:
+def _braking(model: MjModel, joint: str) -> float:
     """Damping by a joint's actuators at zero command, without its position servo [N·m·s/rad]."""
     braking = 0.0
     for i in _actuators(model, joint):

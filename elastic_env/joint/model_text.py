@@ -123,9 +123,8 @@ def read_bytes(path: Path, what: str = "model") -> bytes:
     """
     try:
         if path.exists() and not path.is_file():
-            raise ConfigurationError(
-                f"no {what} at {name_of(path)}: it is no regular file; {_FILE}"
-            )
+            problem = f"no {what} at {name_of(path)}: it is no regular file"
+            raise ConfigurationError(f"{problem}; {_FILE}")
         return read_bounded(path, LARGEST_BYTES)
     except ConfigurationError:
         raise
@@ -221,13 +220,12 @@ def _require_model(found: ModelText) -> None:
     for element in root.iter():
         prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
         prefixed = [key for key in element.attrib if ":" in key]
-        of_xacro = next((key for key in prefixed if key.partition(":")[0] in aliases), None)
-        if prefix in aliases or of_xacro is not None:
+        found_keys = [key for key in prefixed if key.partition(":")[0] in aliases]
+        if prefix in aliases or found_keys:
             is_tag = prefix in aliases
-            what = f"<{element.tag}>" if is_tag else f"the attribute {of_xacro}"
-            raise ConfigurationError(
-                f"{name} is a file of xacro, it has {quote(what)[1:-1]}; {_EXPAND}"
-            )
+            what = f"<{element.tag}>" if is_tag else f"the attribute {found_keys[0]}"
+            problem = f"{name} is a file of xacro, it has {quote(what)[1:-1]}"
+            raise ConfigurationError(f"{problem}; {_EXPAND}")
     if root.tag not in _KINDS:
         raise ConfigurationError(
             f"the root of {name} must be <mujoco> or <robot>, got {quote(root.tag)}; {_FILE}"
@@ -242,7 +240,8 @@ def _require_model(found: ModelText) -> None:
                 )
         old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
         if old is not None:
-            raise ConfigurationError(f"{name} is a file of xacro, it has <{old}>; {_EXPAND}")
+            problem = f"{name} is a file of xacro, it has <{old}>"
+            raise ConfigurationError(f"{problem}; {_EXPAND}")
 
 
 def _parts(robot: ET.Element) -> Iterator[ET.Element]:

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.errors import ConfigurationError, quote, require_known
 from elastic_env.core.signals import Array
@@ -40,12 +41,12 @@ _POSES = (0.0, 0.37, -0.83)
 _SINGULAR = 1e-10
 
 
-def hinges_of(model: mujoco.MjModel) -> list[str]:
+def hinges_of(model: MjModel) -> list[str]:
     """Names of the hinges of a model that have one, in its order."""
     return [name for j in _hinges(model) if (name := model.joint(j).name)]
 
 
-def has_nameless_hinge(model: mujoco.MjModel) -> bool:
+def has_nameless_hinge(model: MjModel) -> bool:
     """True if a hinge has no name, by which its stiffness could be given."""
     return any(not model.joint(j).name for j in _hinges(model))
 
@@ -58,7 +59,7 @@ def nameless_hinge() -> ConfigurationError:
     )
 
 
-def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list[str]:
+def commanded_hinges(model: MjModel, named: Collection[str] = ()) -> list[str]:
     """Hinges that are commanded where nobody says which: all but fingers that the model couples.
 
     Args:
@@ -77,9 +78,7 @@ def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list
     return without_fingers(model, hinges_of(model), named)
 
 
-def without_fingers(
-    model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]
-) -> list[str]:
+def without_fingers(model: MjModel, joints: Iterable[str], named: Collection[str]) -> list[str]:
     """The joints without the fingers that the model couples and that nobody names.
 
     Arguments as in `commanded_hinges`.
@@ -95,7 +94,7 @@ def without_fingers(
     return [name for name in joints if name not in fingers]
 
 
-def coupled_fingers(model: mujoco.MjModel) -> list[str]:
+def coupled_fingers(model: MjModel) -> list[str]:
     """Hinges of fingers that follow one another: coupled by equalities, side by side at the end.
 
     Two fingers are on different branches, and carry no other joint. Loops may close within them.
@@ -118,12 +117,12 @@ def coupled_fingers(model: mujoco.MjModel) -> list[str]:
     return [name for name in names if name]
 
 
-def home_of(model: mujoco.MjModel) -> Array:
+def home_of(model: MjModel) -> Array:
     """Positions of the joints in the first keyframe, or the model's reference, (nq,) [rad], [m]."""
     return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
 
 
-def require_robot(model: mujoco.MjModel) -> None:
+def require_robot(model: MjModel) -> None:
     """Refuse a model of which no joint can be commanded, whatever is said of its joints.
 
     Raises:
@@ -141,7 +140,7 @@ def require_robot(model: mujoco.MjModel) -> None:
     require_hinge(model)
 
 
-def require_hinge(model: mujoco.MjModel) -> None:
+def require_hinge(model: MjModel) -> None:
     """Refuse a model of which no joint can be elastic.
 
     Raises:
@@ -188,7 +187,7 @@ def require_flags(disabled: int, flags: Collection[str]) -> None:
             )
 
 
-def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+def require_known_torque(model: MjModel, joints: Sequence[str]) -> None:
     """Refuse a model in which something acts on the commanded joints that is not known in advance.
 
     Args:
@@ -240,11 +239,11 @@ _PULLING = "stiffness stiffnesspoly damping frictionloss armature"
 _TRANSMISSIONS = {_TENDON: "a tendon", _SITE: "a site", _SLIDERCRANK: "a slider-crank"}
 
 
-def _hinges(model: mujoco.MjModel) -> list[int]:
+def _hinges(model: MjModel) -> list[int]:
     return [j for j in range(model.njnt) if model.jnt_type[j] == _HINGE]
 
 
-def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
+def _ids_of(model: MjModel, joints: Sequence[str]) -> set[int]:
     known = {name: j for j in range(model.njnt) if (name := model.joint(j).name)}
     require_known("joint", joints, known)
     if len(set(joints)) != len(joints) or not joints:
@@ -260,7 +259,7 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
     return {known[name] for name in joints}
 
 
-def _require_no_others(model: mujoco.MjModel) -> None:
+def _require_no_others(model: MjModel) -> None:
     """Refuse what acts on all links."""
     unknown = "are not known in advance; take it out"
     if model.nflex:
@@ -268,9 +267,8 @@ def _require_no_others(model: mujoco.MjModel) -> None:
             f"the model has a deformable body (flex), whose forces on the links {unknown}"
         )
     if (model.body_plugin >= 0).any() or (model.actuator_plugin >= 0).any():
-        raise ConfigurationError(
-            f"the model has a plugin of a body or an actuator, whose forces {unknown}"
-        )
+        problem = "the model has a plugin of a body or an actuator"
+        raise ConfigurationError(f"{problem}, whose forces {unknown}")
     is_fluid = model.opt.density > 0.0 or model.opt.viscosity > 0.0
     if model.opt.wind.any() and is_fluid:
         raise ConfigurationError(
@@ -278,13 +276,13 @@ def _require_no_others(model: mujoco.MjModel) -> None:
         )
 
 
-def _active(model: mujoco.MjModel) -> Iterator[int]:
+def _active(model: MjModel) -> Iterator[int]:
     """Equality constraints that act from the start."""
     if not int(model.opt.disableflags) & (_FLAGS["equality"] | _FLAGS["constraint"]):
         yield from (e for e in range(model.neq) if model.eq_active0[e])
 
 
-def _equality(model: mujoco.MjModel, equality: int) -> tuple[set[int], str]:
+def _equality(model: MjModel, equality: int) -> tuple[set[int], str]:
     """Joints that feel an equality constraint, and the names of what it couples."""
     kind = int(model.eq_type[equality])
     both = (model.eq_obj1id[equality], model.eq_obj2id[equality])
@@ -307,7 +305,7 @@ def _equality(model: mujoco.MjModel, equality: int) -> tuple[set[int], str]:
     return acts, " and ".join(names)
 
 
-def _chain(model: mujoco.MjModel, body: int) -> set[int]:
+def _chain(model: MjModel, body: int) -> set[int]:
     """Joints between a body and the world."""
     joints: set[int] = set()
     while body > 0:
@@ -317,13 +315,13 @@ def _chain(model: mujoco.MjModel, body: int) -> set[int]:
     return joints
 
 
-def _between(model: mujoco.MjModel, bodies: Sequence[int]) -> set[int]:
+def _between(model: MjModel, bodies: Sequence[int]) -> set[int]:
     """Joints that move bodies against one another."""
     chains = [_chain(model, body) for body in bodies]
     return set().union(*(chain ^ chains[0] for chain in chains))
 
 
-def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+def _joints_of_tendon(model: MjModel, tendon: int) -> set[int]:
     """Joints with which the length of a tendon changes."""
     joints: set[int] = set()
     bodies: list[int] = []
@@ -340,11 +338,12 @@ def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     return joints | _between(model, bodies)
 
 
-def _pulls(model: mujoco.MjModel, tendon: int) -> bool:
-    return any(np.any(getattr(model, f"tendon_{name}")[tendon]) for name in _PULLING.split())
+def _pulls(model: MjModel, tendon: int) -> bool:
+    fields = [getattr(model, f"tendon_{name}") for name in _PULLING.split()]
+    return any(np.any(values[tendon]) for values in fields)
 
 
-def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
+def _driven_beside_joints(model: MjModel, actuator: int) -> set[int]:
     """Joints that an actuator moves without being on one of them."""
     kind = int(model.actuator_trntype[actuator])
     first, second = (int(i) for i in model.actuator_trnid[actuator])
@@ -357,7 +356,7 @@ def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
     return set()
 
 
-def _or_hold(model: mujoco.MjModel, acts: set[int], moving: set[int]) -> str:
+def _or_hold(model: MjModel, acts: set[int], moving: set[int]) -> str:
     """How to hold the joints that something acts on, where others are left."""
     if acts == moving:
         return ""
@@ -371,7 +370,7 @@ def _or_hold(model: mujoco.MjModel, acts: set[int], moving: set[int]) -> str:
     )
 
 
-def _names(model: mujoco.MjModel, joints: set[int]) -> str:
+def _names(model: MjModel, joints: set[int]) -> str:
     return _listed([model.joint(j).name for j in sorted(joints)])
 
 
@@ -379,7 +378,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
 
 
-def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
+def _is_gripper(model: MjModel, group: set[int]) -> bool:
     """True if coupled joints are fingers: on two branches or more, with no joint beyond them."""
     body_of = model.jnt_bodyid.tolist()
     parent_of = model.body_parentid.tolist()
@@ -389,7 +388,7 @@ def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
     return carried <= group and len(first) > 1 and len(group) < model.njnt
 
 
-def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+def _require_inertia(model: MjModel, joints: Sequence[str]) -> None:
     """Refuse joints that move no inertia of their own, such as two about one axis."""
     data = mujoco.MjData(model)
     at = [int(model.joint(name).id) for name in joints]
@@ -408,9 +407,8 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         with np.errstate(over="ignore"):
             scaled = links / np.outer(scale, scale)
         if not np.isfinite(scaled).all():
-            raise ConfigurationError(
-                "the masses and inertias of the model are too large; see their units"
-            )
+            problem = "the masses and inertias of the model are too large"
+            raise ConfigurationError(f"{problem}; see their units")
         values, vectors = np.linalg.eigh(scaled)
         smallest.append((values[0], vectors[:, 0]))
     value, vector = max(smallest, key=lambda pair: pair[0])

@@ -41,7 +41,8 @@ def add_terms(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) 
         hinge: Of the link; its `frictionloss` is the part that does not change.
         joint: The rest.
     """
-    terms = [hinge.frictionloss, joint.load_friction, joint.static_friction, joint.stribeck_speed]
+    of_load = (joint.load_friction, joint.static_friction, joint.stribeck_speed)
+    terms = [hinge.frictionloss, *of_load]
     spec.add_numeric(name=friction_name(hinge.name), size=_TERMS, data=terms)
 
 
@@ -63,14 +64,14 @@ class VaryingFriction:
         self.joints = [name for name in hinges if friction_name(name) in names]
         at = JointAddresses.of(model, self.joints)
         self.links = at.q_dot
-        first = [model.numeric_adr[model.numeric(friction_name(j)).id] for j in self.joints]
-        self.numbers = np.array(first, dtype=np.int64) + np.arange(_TERMS)[:, None]
+        numerics = [model.numeric(friction_name(name)).id for name in self.joints]
+        first = model.numeric_adr[numerics]
+        self.numbers = first.astype(np.int64) + np.arange(_TERMS)[:, None]
         is_sprung = at.theta != at.q
         self._sprung = np.flatnonzero(is_sprung)
         self._rigid = np.flatnonzero(~is_sprung)
-        self._springs = np.array(
-            [model.tendon(spring_name(self.joints[i])).id for i in self._sprung], dtype=np.int64
-        )
+        springs = [model.tendon(spring_name(self.joints[i])).id for i in self._sprung]
+        self._springs = np.array(springs, dtype=np.int64)
         self._at = at
 
     @classmethod

@@ -291,9 +291,8 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     )
     t = rows[:, 0]
     if names[0] != "time_s":
-        raise ConfigurationError(
-            f"the first column of {file} must be time_s, got {quote(names[0])}"
-        )
+        needed = f"the first column of {file} must be time_s"
+        raise ConfigurationError(f"{needed}, got {quote(names[0])}")
     require_known(f"column of {file}", names[1:], joints)
     if len(rows) < 2 or len(names) < 2:
         raise ConfigurationError(

@@ -37,7 +37,7 @@ def require_clear_feet(feet: Footholds, sole_half_size: tuple[float, float]) -> 
         )
 
 
-def sole_gap(positions: Array, yaw: Array, sole_half_size: tuple[float, float]) -> Array:
+def sole_gap(positions: Array, yaw: Array, half_size: tuple[float, float]) -> Array:
     """Distance between two soles along the best of their sides, negative where they overlap.
 
     The right sole must lie to the right of a side of the left one, or in front of or behind it
@@ -46,12 +46,12 @@ def sole_gap(positions: Array, yaw: Array, sole_half_size: tuple[float, float]) 
     Args:
         positions: Middles of the soles, left first, (..., 2, 2) [m].
         yaw: Their headings, (..., 2) [rad].
-        sole_half_size: Half length and half width of a sole [m].
+        half_size: Half length and half width of a sole [m].
 
     Returns:
         (...) [m]; at most the distance by which the middle of the left sole is to the left.
     """
-    half = np.array(sole_half_size)
+    half = np.array(half_size)
     apart = positions[..., 0, :] - positions[..., 1, :]
     corners = half * np.array([[1.0, 1.0], [1.0, -1.0]])
     turned = (yaw[..., 0] - yaw[..., 1])[..., None]

@@ -6,10 +6,9 @@ stands, its feet side by side.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, plain_numbers, quantity
 from elastic_env.core.errors import ConfigurationError, quote
@@ -72,7 +71,8 @@ class Gait(Model):
     @property
     def step_period_s(self) -> float:
         """Duration of a step [s]."""
-        return self.double_support_s + self.single_support_s + self.last_double_support_s
+        swing_s = self.double_support_s + self.single_support_s
+        return swing_s + self.last_double_support_s
 
     @property
     def duration_s(self) -> float:
@@ -84,24 +84,18 @@ class Gait(Model):
         """The feet come down where they stood, side by side under the hips."""
         return not (self.step_length_m or self.turn_rad or self.step_width_m)
 
-    @model_validator(mode="after")
-    def _some_step_is_scored(self) -> Self:
+    def _check(self) -> None:
         if self.settling_steps >= self.num_steps:
             raise ValueError(
                 f"settling_steps must be less than num_steps = {self.num_steps}, so that a step is"
                 f" left to score, got {self.settling_steps}; take more steps"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _ramp_fits(self) -> Self:
         shortest = min(self.double_support_s, self.last_double_support_s)
         if self.transfer == "ramp" and shortest < _RAMP_SHIFT_S:
             raise ValueError(
                 f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of"
                 f" {shortest} s is shorter"
             )
-        return self
 
 
 def make_gait(

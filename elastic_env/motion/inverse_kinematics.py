@@ -50,12 +50,12 @@ def joint_path(
     return CubicSpline(s, np.array(angles))
 
 
-def _solved(tool: EndEffector, q: Array, wanted: Array, R_wanted: Array) -> Array | None:
+def _solved(tool: EndEffector, q: Array, place: Array, R_wanted: Array) -> Array | None:
     """Angles near q that reach a place; six joints or more keep the orientation. None for none."""
     keeps = len(q) >= _FOR_ORIENTATION
     for _ in range(_MOST_STEPS):
         position, R = tool.pose(q)
-        error = wanted - position
+        error = place - position
         if keeps:
             turn = Rotation.from_matrix(R_wanted @ R.T).as_rotvec()
             error = np.concatenate([error, turn])

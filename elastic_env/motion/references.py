@@ -6,10 +6,11 @@ and moves by quintic (minimum-jerk) polynomials, which start and end without acc
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from numpy.random import Generator
+from pydantic import Field
 from typing_extensions import override
 
 from elastic_env.core.config import LARGEST_SEED, Model, quantity
@@ -51,7 +52,7 @@ class RepeatableReference(Model):
         """True where every episode has a plan of its own."""
         return getattr(self, "seed", 0) is None
 
-    def own(self, generator: np.random.Generator) -> np.random.Generator:
+    def own(self, generator: Generator) -> Generator:
         """Its own generator where it has a seed, or the one that is given."""
         seed: int | None = getattr(self, "seed", None)
         return generator if seed is None else np.random.default_rng(seed)
@@ -60,7 +61,7 @@ class RepeatableReference(Model):
 class _JointReference(RepeatableReference):
     """A motion of one joint."""
 
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def plan(self, generator: Generator, control_period_s: float) -> Plan:
         """A plan by the draws of a generator, or of the reference's own seed."""
         raise NotImplementedError
 
@@ -68,18 +69,17 @@ class _JointReference(RepeatableReference):
         """Bounds over all its plans."""
         raise NotImplementedError
 
-    def about(self, home: Array, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def about(self, home: Array, generator: Generator, period_s: float) -> Plan:
         """A plan of joints that all follow it about their home, (n,) [rad].
 
         Of a random one each joint has a plan of its own.
         """
-        first = self.plan(generator, control_period_s)
+        first = self.plan(generator, period_s)
         plans = [first] * len(home)
         if self.is_random:
-            plans[1:] = [self.plan(generator, control_period_s) for _ in plans[1:]]
-        q = np.stack([plan.q for plan in plans], axis=-1)
-        q_dot = np.stack([plan.q_dot for plan in plans], axis=-1)
-        q_ddot = np.stack([plan.q_ddot for plan in plans], axis=-1)
+            plans[1:] = [self.plan(generator, period_s) for _ in plans[1:]]
+        motions = [(plan.q, plan.q_dot, plan.q_ddot) for plan in plans]
+        q, q_dot, q_ddot = (np.stack(own, axis=-1) for own in zip(*motions, strict=True))
         return Plan(q + home, q_dot, q_ddot, first.scored, first.rest)
 
 
@@ -116,22 +116,16 @@ class Hold(_JointReference):
     overrun: float = quantity("rad", 0.08, gt=0)
     """How far the sweep starts and turns outside the positions [rad]."""
 
-    @model_validator(mode="after")
-    def _range_is_ordered(self) -> Self:
+    def _check(self) -> None:
         if self.upper <= self.lower:
             given = f"lower {self.lower} and upper {self.upper}"
             raise ValueError(f"upper must exceed lower, got {given}")
-        return self
-
-    @model_validator(mode="after")
-    def _ends_in_time(self) -> Self:
         angles = self.angles
         way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
         quickest_s = (2 * self.positions + 1) * self.shortest_move_s
         moves_s = max(QUINTIC_PEAK_RATE * way / self.rate, quickest_s)
         rest_s = self.settle_s + self.measure_s
         _require_short(STAND_S + moves_s + 2 * self.positions * rest_s)
-        return self
 
     @property
     def angles(self) -> Array:
@@ -163,7 +157,7 @@ class Hold(_JointReference):
         return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
     @override
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def plan(self, generator: Generator, control_period_s: float) -> Plan:
         angles, _ = self.visits
         start = angles[0] - self.overrun
         targets = np.insert(angles, self.positions, self.angles[-1] + self.overrun)
@@ -236,7 +230,7 @@ class Sine(_Oscillation):
         return self._extent(self.amplitude * omega, self.amplitude * omega**2)
 
     @override
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def plan(self, generator: Generator, control_period_s: float) -> Plan:
         t = self._time_base(control_period_s)
         omega = 2.0 * np.pi * self.frequency_hz
         phase = omega * (t - STAND_S)
@@ -263,21 +257,15 @@ class Multisine(_Oscillation):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the phases; None draws new ones per episode [1]."""
 
-    @model_validator(mode="after")
-    def _frequencies_are_ordered(self) -> Self:
+    def _check(self) -> None:
         if self.highest_hz <= self.lowest_hz:
             given = f"{self.lowest_hz} to {self.highest_hz} Hz"
             raise ValueError(f"highest_hz must exceed lowest_hz, got {given}")
-        return self
-
-    @model_validator(mode="after")
-    def _is_summed_in_time(self) -> Self:
         if self.components * self.duration_s > _LONGEST_SUM_S:
             raise ValueError(
                 f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got"
                 f" {self.components} x {self.duration_s:g} s; take fewer sines or less time"
             )
-        return self
 
     @property
     def _omega(self) -> Array:
@@ -291,7 +279,7 @@ class Multisine(_Oscillation):
         return self._extent(share * float(omega.sum()), share * float((omega**2).sum()))
 
     @override
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def plan(self, generator: Generator, control_period_s: float) -> Plan:
         phases = self.own(generator).uniform(0.0, 2.0 * np.pi, self.components)
         t = self._time_base(control_period_s)
         omega = self._omega
@@ -320,10 +308,8 @@ class Steps(_JointReference):
     seed: int | None = quantity("1", None, ge=0, le=LARGEST_SEED)
     """Seed of the levels; None draws new ones per episode [1]."""
 
-    @model_validator(mode="after")
-    def _ends_in_time(self) -> Self:
+    def _check(self) -> None:
         _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
-        return self
 
     @override
     def extent(self) -> Extent:
@@ -333,7 +319,7 @@ class Steps(_JointReference):
         return Extent(*ends, QUINTIC_PEAK_RATE * span / self.move_s, q_ddot)
 
     @override
-    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+    def plan(self, generator: Generator, control_period_s: float) -> Plan:
         reach = self.amplitude
         offsets = self.own(generator).uniform(-reach, reach, self.moves)
         period = self.move_s + self.rest_s

@@ -119,7 +119,7 @@ class PlanTable:
 
     Args:
         motion: Of all joints.
-        control_period_s: Time between commands [s].
+        period_s: Time between commands [s].
         num_worlds: How many.
 
     Raises:
@@ -132,15 +132,15 @@ class PlanTable:
         scored, rest: As in a `Plan`, the same for all, (T,).
     """
 
-    def __init__(self, motion: Motion, control_period_s: float, num_worlds: int) -> None:
+    def __init__(self, motion: Motion, period_s: float, num_worlds: int) -> None:
         self._motion = motion
-        self._period = control_period_s
-        probe = motion.plan(np.random.default_rng(0), control_period_s)
+        self._period = period_s
+        probe = motion.plan(np.random.default_rng(0), period_s)
         self.num_steps = probe.num_steps
         if not probe.scored.any():
             raise ConfigurationError(
                 "the reference has no scored control step: its scored time is below the control"
-                f" period of {control_period_s} s; lengthen it"
+                f" period of {period_s} s; lengthen it"
             )
         plans = num_worlds if motion.is_random else 1
         one = _stacked(probe)

@@ -126,7 +126,8 @@ class WalkPlan:
         com = turn(self.com - origin[:, :2], -self.heading)
         rows = np.arange(len(com))
         lever = com - ankles[rows, self.timing.support, :2]
-        turning = self.heading_dot[:, None] * np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+        across = np.stack([-lever[:, 1], lever[:, 0]], axis=-1)
+        turning = self.heading_dot[:, None] * across
         return LocalPlan(
             com=com,
             com_dot=turn(self.com_dot, -self.heading) - turning,
@@ -294,8 +295,8 @@ class _Feet:
         return _Feet(self.ankles[:1], self.yaw[:1], self.heading[:1])
 
 
-def _foot_paths(gait: Gait, timing: Timing, footholds: Footholds, biped: Biped) -> _Feet:
-    positions, yaw = footholds.swinging(timing)
+def _foot_paths(gait: Gait, timing: Timing, holds: Footholds, biped: Biped) -> _Feet:
+    positions, yaw = holds.swinging(timing)
     ankles = np.empty((len(timing.time), 2, 3))
     ankles[..., :2] = positions
     ankles[..., 2] = biped.ankle_height
@@ -314,12 +315,12 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, feet: _Feet) -> tuple[Array,
     return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, time: Array) -> Array:
+def _pelvis_under(com: Array, start: Array, biped: Biped, feet: _Feet, t: Array) -> Array:
     """Pelvis of one height that puts the center of mass where it belongs."""
     pelvis = np.array(start)
     error = np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        q = _angles(biped, pelvis, feet, time)
+        q = _angles(biped, pelvis, feet, t)
         from_pelvis = turn(biped.chains.center_of_mass(q)[:, :2], feet.heading)
         error = pelvis[:, :2] + from_pelvis - com
         pelvis[:, :2] -= error
@@ -375,10 +376,11 @@ def _dynamics(biped: Biped, pelvis: Array, heading: Array, q: Array, period_s: f
 
     body = FloatingBody(biped.rigid, biped.joint_names)
     q_dot, q_ddot = derivatives(q, period_s)
-    moved = zip(derivatives(pelvis, period_s), derivatives(heading, period_s), strict=True)
+    moved = derivatives(pelvis, period_s)
+    turned = derivatives(heading, period_s)
     base_dot, base_ddot = (
         np.concatenate([turn(linear, -heading), angular[:, None]], axis=1)
-        for linear, angular in moved
+        for linear, angular in zip(moved, turned, strict=True)
     )
     wrench, torque = body.inverse_dynamics(q, base_dot, q_dot, base_ddot, q_ddot)
     force = turn(wrench[:, :3], heading)

@@ -70,8 +70,8 @@ class RigidBody:
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, (..., n) [rad], [rad/s], [rad/s²] to [N·m]."""
         if not q.shape == q_dot.shape == q_ddot.shape:
-            shapes = f"{q.shape}, {q_dot.shape} and {q_ddot.shape}"
-            raise ElasticError(f"angles, rates, accelerations must have one shape, got {shapes}")
+            got = f"got {q.shape}, {q_dot.shape} and {q_ddot.shape}"
+            raise ElasticError(f"angles, rates, accelerations must have one shape, {got}")
         motion = (self._rows(q), self._rows(q_dot), self._rows(q_ddot))
         torque = np.empty(motion[0].shape)
         kernels.inverse_dynamics(self._links, self._loads, motion, torque)

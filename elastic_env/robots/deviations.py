@@ -1,6 +1,7 @@
 """Deviations of joints from their reference, as pictures of fixed robots draw them: enlarged."""
 
 from collections.abc import Mapping
+from typing import Any
 
 WIDTH = 640
 HEIGHT = 480
@@ -12,7 +13,7 @@ REFERENCE_WORD_RGBA = (0.27, 0.55, 0.37, 1.0)
 """Colour of the translucent reference, and of its word in the legend."""
 
 
-def enlarge_deviation(angle: float, reference: float, factor: float = ENLARGEMENT) -> float:
+def enlarge_deviation(angle: Any, reference: Any, factor: float = ENLARGEMENT) -> Any:
     """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
     return reference + factor * (angle - reference)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import gymnasium
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjSpec
 
 from elastic_env.core.config import Model, read_mapping
 from elastic_env.core.errors import missing_extra, require_known
@@ -93,22 +94,18 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
     if file.parts[0] == "gymnasium":
         assets = Path(gymnasium.__file__).with_name("envs") / "mujoco" / "assets"
         return assets / file.name
-    path = (folder or _package_folder(name)) / file
+    robot = f"the robot {name!r}"
+    try:
+        path = (folder or Path(str(distribution(_PACKAGE).locate_file(_SHARE)))) / file
+    except PackageNotFoundError:
+        raise missing_extra(_PACKAGE, "robots", robot) from None
     if not path.is_file():
-        raise missing_extra(
-            _PACKAGE, "robots", f"the robot {name!r}, which has no model at {path},"
-        )
+        where = f"which has no model at {path},"
+        raise missing_extra(_PACKAGE, "robots", f"{robot}, {where}")
     return path
 
 
-def _package_folder(name: str) -> Path:
-    try:
-        return Path(str(distribution(_PACKAGE).locate_file(_SHARE)))
-    except PackageNotFoundError:
-        raise missing_extra(_PACKAGE, "robots", f"the robot {name!r}") from None
-
-
-def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -> mujoco.MjSpec:
+def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -> MjSpec:
     """Rigid specification of a robot, whose slides are held.
 
     Args:
@@ -144,9 +141,7 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
     return np.array([GALLERY[name].home.get(joint, 0.0) for joint in joints])
 
 
-def random_poses(
-    model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES
-) -> Array:
+def random_poses(model: MjModel, generator: np.random.Generator, number: int = _POSES) -> Array:
     """Poses within the inner part of the joints' ranges, (number, n) [rad].
 
     The robot may cross itself in them.
@@ -167,7 +162,7 @@ def gallery_joints(name: str, folder: Path | None = None) -> dict[str, ElasticJo
     return assumed_joints(gallery_robot(name, folder).compile())
 
 
-def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
+def assumed_joints(model: MjModel) -> dict[str, ElasticJoint]:
     r"""Elastic joints by one rule for all robots, for want of measured ones.
 
     .. math::
@@ -226,7 +221,7 @@ def _servo(inertia: float, stiffness: float, torque_limit: float) -> Servo:
     )
 
 
-def _inertia(model: mujoco.MjModel, pose: Array) -> Array:
+def _inertia(model: MjModel, pose: Array) -> Array:
     """Mass matrix without armature, (n, n) [kg·m²]."""
     data = mujoco.MjData(model)
     data.qpos[:] = pose

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
+from mujoco import MjSpec
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
@@ -33,9 +34,9 @@ from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector
 from elastic_env.robots import deviations
-from elastic_env.world import robot_model
+from elastic_env.world import joint_config, robot_model
 from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.world.joint_config import FRICTIONS, JointConfig, RewardWeights, require_torque
+from elastic_env.world.joint_config import JointConfig, RewardWeights
 from elastic_env.world.joint_signals import ACTION_BOUND_RAD
 from elastic_env.world.joint_task import JointPlant, JointTask
 from elastic_env.world.robot_model import RobotModel, joint_ranges
@@ -65,7 +66,7 @@ class JointRobot:
     """
 
     name: str
-    rigid: Callable[[], mujoco.MjSpec]
+    rigid: Callable[[], MjSpec]
     joints: Mapping[str, ElasticJoint]
     home: Sequence[float] | None = None
     imu: str | None = None
@@ -145,13 +146,18 @@ class JointRobot:
         names = true.joint_names
         n = len(names)
         body = RigidBody(loaded, names)
-        home = np.zeros(n) if self.home is None else np.array(self.home, dtype=np.float64)
+        own = [0.0] * n if self.home is None else self.home
+        home = np.array(own, dtype=np.float64)
         if home.shape != (n,):
-            raise ConfigurationError(f"home must have one angle per joint, {n}, got {len(home)}")
+            needed = f"must have one angle per joint, {n}"
+            raise ConfigurationError(f"home {needed}, got {len(home)}")
         tool = None
         if self.end_effector is not None:
             tool = EndEffector(loaded, names, self.end_effector)
-        motion = arm_references.motion_of(config.reference, _workspace(true, body, home, tool))
+        lowest, highest = joint_ranges(true.rigid, names)
+        holds = partial(_holds, true, body)
+        workspace = Workspace(tuple(names), lowest, highest, home, holds, tool)
+        motion = arm_references.motion_of(config.reference, workspace)
         plan = motion.plan(np.random.default_rng(0), period_s)
         rows = slice(None, None, max(plan.num_steps // 500, 1))
         q = np.ascontiguousarray(plan.q[rows])
@@ -171,7 +177,7 @@ class JointRobot:
             end_effector=tool,
         )
 
-    def elastic(self, config: "JointRobotConfig") -> mujoco.MjSpec:
+    def elastic(self, config: "JointRobotConfig") -> MjSpec:
         """The plant: the model with the scenario's load, with elastic joints, and with sensors.
 
         Raises:
@@ -184,13 +190,12 @@ class JointRobot:
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if ACCELEROMETER in config.sensors:
             if self.imu is None:
-                raise ConfigurationError(
-                    f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)"
-                )
+                cure = "name its site, JointRobot(..., imu=SITE)"
+                raise ConfigurationError(f"{self.name} has no IMU: {cure}")
             add_accelerometer(spec, self.imu)
         return spec
 
-    def _loaded(self, config: "JointRobotConfig") -> mujoco.MjSpec:
+    def _loaded(self, config: "JointRobotConfig") -> MjSpec:
         """The model with its load scaled, or with the share of a mass at its end effector."""
         spec = self.rigid()
         scale = config.scenario.pendulum_mass_scale
@@ -220,7 +225,7 @@ class JointRobotConfig(JointConfig):
         """Joints as a compensator knows them: without friction where the scenario has none."""
         if self.scenario.friction_scale > 0.0:
             return self.joints
-        none = dict.fromkeys(FRICTIONS, 0.0)
+        none = dict.fromkeys(joint_config.FRICTIONS, 0.0)
         return {name: one.replace(**none) for name, one in self.joints.items()}
 
     def plant(self) -> JointPlant:
@@ -252,7 +257,8 @@ class JointPicture(Picture):
         for geom in reference.geoms:
             geom.rgba = deviations.REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-        super().__init__(spec, (("translucent: reference", deviations.REFERENCE_WORD_RGBA),))
+        legend = [("translucent: reference", deviations.REFERENCE_WORD_RGBA)]
+        super().__init__(spec, legend)
         self._robot = robot
         self._task = task
         self._joints = list(robot.joints)
@@ -270,7 +276,7 @@ class JointPicture(Picture):
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002
         joints = self._task.sample().joints["truth"][world]
         q_ref = joints["q_ref"]
-        drawn = q_ref + deviations.ENLARGEMENT * (joints["q"] - q_ref)
+        drawn = deviations.enlarge_deviation(joints["q"], q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos = angle
             self._data.joint(_REFERENCE + name).qpos = reference
@@ -279,7 +285,7 @@ class JointPicture(Picture):
         return deviations.deviation_caption(now)
 
 
-def _scaled(spec: mujoco.MjSpec, body: int, scale: float) -> mujoco.MjSpec:
+def _scaled(spec: MjSpec, body: int, scale: float) -> MjSpec:
     """A model with the mass of a body scaled, where it is."""
     compiled = spec.copy().compile().body(body)
     carrier = spec.body(compiled.name)
@@ -291,7 +297,7 @@ def _scaled(spec: mujoco.MjSpec, body: int, scale: float) -> mujoco.MjSpec:
     return spec
 
 
-def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> mujoco.MjSpec:
+def _carrying(spec: MjSpec, end_effector: str | None, mass: float) -> MjSpec:
     """A model with one point mass more at its end effector."""
     site = next((site for site in spec.sites if site.name == end_effector), None)
     carrier = spec.body(end_effector) if site is None else site.parent
@@ -306,15 +312,6 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
     load.inertia = [_POINT * mass] * 3
     load.explicitinertial = True
     return spec
-
-
-def _workspace(
-    robot: RobotModel, body: RigidBody, home: Array, tool: EndEffector | None
-) -> Workspace:
-    """Joint ranges, home and load limits of a robot, which references need; by its true model."""
-    lowest, highest = joint_ranges(robot.rigid, robot.joint_names)
-    holds = partial(_holds, robot, body)
-    return Workspace(tuple(robot.joint_names), lowest, highest, home, holds, tool)
 
 
 def _holds(robot: RobotModel, body: RigidBody, q: Array) -> BoolArray:
@@ -335,12 +332,13 @@ def _require_torque(
     """
     q, q_dot, q_ddot = motion
     torque = body.inverse_dynamics(*motion) + robot.rotor_inertia * q_ddot
-    if config.reference.is_random:  # other draws have their largest torque at other speeds
+    # other draws have their largest torque at other speeds
+    if config.reference.is_random:
         torque = np.abs(torque).max(axis=0)
         q_dot = np.abs(q_dot).max(axis=0)
     needed, limits = robot.demand(torque, q_dot)
     if not isinstance(config.reference, arm_references.OfArm):
-        require_torque(config.reference, needed, limits)
+        joint_config.require_torque(config.reference, needed, limits)
     elif np.any(needed > limits):
         weakest = np.unravel_index(np.argmax(needed - limits), needed.shape)
         resting, enough = robot.demand(body.gravity_torque(q), np.zeros_like(q))

@@ -564,7 +564,8 @@ def add_foot_errors(bias: Any, wrench: Array, seconds: float, shown: Array) -> N
         for row in range(6):
             part = row // 3
             i = row % 3
-            error = bias.wrench[foot, part, i] + seconds * bias.wrench_rate[foot, part, i]
+            rate = bias.wrench_rate[foot, part, i]
+            error = bias.wrench[foot, part, i] + seconds * rate
             for column in range(6):
                 share = bias.cross_talk[foot, row, column]
                 error += share * wrench[foot, column // 3, column % 3]
@@ -595,7 +596,7 @@ def show_inertial(inertial: Any, walker: Walker, step: Step, world: int) -> bool
 
 
 @compiled
-def settle_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
+def settle_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Settle an inertial IMU that has been at rest for long, a bias of its gyroscope included."""
     if inertial is None:
         return
@@ -615,7 +616,7 @@ def settle_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any
 
 
 @compiled
-def advance_imu(inertial: Any, walker: Walker, step: Step, world: int, noise: Any) -> None:
+def advance_imu(inertial: Any, walker: Any, step: Step, world: int, noise: Any) -> None:
     """Advance an inertial IMU by a control period.
 
     Its gyroscope measures the mean rate, and its filter turns the vertical.
@@ -765,8 +766,8 @@ def complementary_filter(up: Array, turned: Array, force: Array, gain: float) ->
 
 
 @compiled
-def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: float) -> None:
-    """The vertical where the filter rests: into `up`, (3,).
+def settled_vertical(up: Array, force: Array, gyro: Array, delay_s: float) -> None:
+    """The vertical where a filter with a time constant `delay_s` rests: into `up`, (3,).
 
     The force is constant, and the bias of the gyroscope is small.
     """
@@ -775,9 +776,9 @@ def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: floa
     y = force[1] / size
     z = force[2] / size
     p, q, r = cross(x, y, z, gyro)
-    x = x + time_constant_s * p
-    y = y + time_constant_s * q
-    z = z + time_constant_s * r
+    x = x + delay_s * p
+    y = y + delay_s * q
+    z = z + delay_s * r
     size = math.sqrt(x * x + y * y + z * z)
     up[0] = x / size
     up[1] = y / size
@@ -807,12 +808,12 @@ def shown_angle(
 
 
 @compiled
-def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray) -> bool:
+def end(row: Any, rules: Any, diverged: bool, is_last: bool, ends: BoolArray) -> bool:
     """Say what ends the episode of a world, if anything does; what has diverged has not fallen."""
     is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
-    has_fallen = is_down and not has_diverged
-    is_terminated = has_diverged or has_fallen
-    ends[0] = has_diverged
+    has_fallen = is_down and not diverged
+    is_terminated = diverged or has_fallen
+    ends[0] = diverged
     ends[1] = has_fallen
     ends[2] = is_terminated
     ends[3] = is_last and not is_terminated
@@ -820,7 +821,7 @@ def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray
 
 
 @compiled
-def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any) -> float:
+def score(row: Any, planned: Any, weights: Any, is_failed: bool, terms: Any) -> float:
     """Weighted terms of the reward, and their sum."""
     x = row.zmp[0] - planned.zmp[0]
     y = row.zmp[1] - planned.zmp[1]
@@ -831,7 +832,7 @@ def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any)
     terms.zmp = weights.zmp * planned.weight * distance_penalty(math.hypot(x, y))
     terms.effort = weights.effort * -row.servo_torque
     terms.smoothness = weights.smoothness * -row.command_rate
-    terms.fall = weights.fall * (-1.0 if is_terminated else 0.0)
+    terms.fall = weights.fall * (-1.0 if is_failed else 0.0)
     terms.zmp_in_feet = weights.zmp_in_feet * planned.weight * distance_penalty(in_feet)
     drift = math.hypot(drift_x, drift_y)
     terms.foot_drift = weights.foot_drift * planned.weight * distance_penalty(drift)
@@ -895,15 +896,18 @@ def ground_wrench(
 ) -> None:
     """Wrench of the ground on the feet of one robot: into `force` and `moment`, (L, 3).
 
-    `FootSensors` has the equation.
+    It is in the world, about the ankles [N], [N·m]. The sensors show force and moment on the leg,
+    in the frames of the feet, (L, 2, 3), whose orientations are (L, 3, 3). `FootSensors` has
+    center of mass and weight of the feet.
     """
     c = np.empty(3)
     for foot in range(len(sensors)):
         R = foot_R[foot]
         f, n = sensors[foot]
         w = weight[foot]
+        p = com[foot]
         for i in range(3):
-            c[i] = R[i, 0] * com[foot, 0] + R[i, 1] * com[foot, 1] + R[i, 2] * com[foot, 2]
+            c[i] = R[i, 0] * p[0] + R[i, 1] * p[1] + R[i, 2] * p[2]
             force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
             moment[foot, i] = R[i, 0] * n[0] + R[i, 1] * n[1] + R[i, 2] * n[2]
         moment[foot, 0] -= c[1] * w[2] - c[2] * w[1]
@@ -913,7 +917,13 @@ def ground_wrench(
 
 @compiled
 def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
-    """ZMP of one robot, see `zero_moment_point`: into `zmp`, (2,)."""
+    r"""ZMP of both feet of one robot on the ground plane z = 0: into `zmp`, (2,) [m].
+
+    It is nan where the feet carry less than `least_n`. With the ground's forces on the feet, taken
+    about the origin,
+
+    .. math:: x = -M_y / F_z, \quad y = M_x / F_z
+    """
     about_x = about_y = vertical = 0.0
     for foot in range(len(force)):
         f = force[foot]
@@ -928,24 +938,14 @@ def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp:
 
 
 @compiled
-def ground_wrenches(
-    sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array
-) -> None:
-    """`ground_wrench` of several robots."""
-    for row in range(len(sensors)):
-        ground_wrench(sensors[row], foot_R[row], com, weight, force[row], moment[row])
-
-
-@compiled
-def moment_points(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
-    """`moment_point` of several robots."""
-    for row in range(len(force)):
-        moment_point(force[row], moment[row], ankle[row], least_n, zmp[row])
-
-
-@compiled
 def drift_of_feet(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
-    """Displacement of the standing feet of one robot, see `foot_drift`: into `drift`, (2,)."""
+    r"""Displacement of standing feet against the plan, in the ground plane: into `drift`, (2,).
+
+    .. math:: d = \sum_i w_i \, (p_i - p_{i, plan}), \quad w_i = F_{z, i} / \sum_j F_{z, j}
+
+    It is continuous, as the weights are, and nan where nothing is carried. The ZMP minus d is the
+    ZMP of the same wrenches on feet that stand where they are planned.
+    """
     carried = 0.0
     for foot in range(len(force)):
         carried += force[foot]
@@ -954,10 +954,3 @@ def drift_of_feet(force: Array, ankle: Array, planned: Array, drift: Array) -> N
         for foot in range(len(force)):
             total += force[foot] / carried * (ankle[foot, i] - planned[foot, i])
         drift[i] = total
-
-
-@compiled
-def foot_drifts(force: Array, ankle: Array, planned: Array, drift: Array) -> None:
-    """`drift_of_feet` of several robots."""
-    for row in range(len(force)):
-        drift_of_feet(force[row], ankle[row], planned[row], drift[row])

@@ -44,7 +44,8 @@ def set_joints(
         ends = further * np.array([-0.5, 0.5])
         factor = np.array(robot.stiffness) / scenario.fixed("stiffness")
         K = model.tendon_stiffness[springs] * factor
-        field("tendon_lengthspring")[springs] = model.tendon_lengthspring[springs] + ends
+        lengths = model.tendon_lengthspring[springs] + ends
+        field("tendon_lengthspring")[springs] = lengths
         field("tendon_stiffness")[springs] = K
         field("tendon_damping")[springs] = model.tendon_damping[springs] * robot.damping
     for name in ("dof_frictionloss", "dof_damping"):
@@ -58,7 +59,8 @@ def joints_differ(scenario: Scenario) -> bool:
     """True if robots have other joints than the plant with what is fixed in the scenario."""
     factors = (scenario.joint_stiffness, scenario.damping, scenario.friction)
     is_wide = scenario.draws("stiffness") or scenario.draws("backlash_rad")
-    return is_wide or any(own != (1.0, 1.0) for own in factors) or bool(scenario.mixture)
+    is_other = any(own != (1.0, 1.0) for own in factors)
+    return is_wide or is_other or bool(scenario.mixture)
 
 
 def require_passing(robot: RobotModel, scenario: Scenario) -> None:

@@ -205,7 +205,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self.action_space = batch_space(self.single_action_space, n)
         self.task = task
         task.attach(simulation, num_threads)
-        self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        self._generators = [_generator() for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
 
     def reset(self, *, seed: Seeds = None, options: Info | None = None) -> tuple[Observation, Info]:
@@ -220,7 +220,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         robots = _robot_seeds(options, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
-                self._generators[world] = seeding.np_random(seeds[world])[0]
+                self._generators[world] = _generator(seeds[world])
         self._begin(mask, robots)
         return self.task.observe(), self.task.signals()
 
@@ -265,9 +265,9 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         """Free the renderer, let hardware go."""
         self._let_go()
 
-    def _begin(self, worlds: BoolArray, robots: Sequence[int | None] | None = None) -> None:
-        robots = robots or [None] * self.num_envs
-        self.task.restart(worlds, _episodes(self._generators, robots))
+    def _begin(self, worlds: BoolArray, robots: list[int | None] | None = None) -> None:
+        seeds = robots or [None] * self.num_envs
+        self.task.restart(worlds, _episodes(self._generators, seeds))
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
@@ -308,10 +308,15 @@ def _episodes(
     generators: Sequence[np.random.Generator], robots: Sequence[int | None]
 ) -> list[EpisodeRandom]:
     """Generators of new episodes, of new robots or of those that some seeds draw."""
+    pairs = zip(generators, robots, strict=True)
     return [
-        EpisodeRandom(own) if seed is None else EpisodeRandom(seeding.np_random(seed)[0], own)
-        for own, seed in zip(generators, robots, strict=True)
+        EpisodeRandom(own) if seed is None else EpisodeRandom(_generator(seed), own)
+        for own, seed in pairs
     ]
+
+
+def _generator(seed: int | None = None) -> np.random.Generator:
+    return seeding.np_random(seed)[0]
 
 
 def _robot_seeds(options: Info | None, num_envs: int) -> list[int | None]:
@@ -324,13 +329,11 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
-        raise ConfigurationError(
-            f"{name} must be a whole number, one per world ({num_envs}), or None; got {quote(seed)}"
-        )
+        needed = f"a whole number, one per world ({num_envs}), or None"
+        raise ConfigurationError(f"{name} must be {needed}; got {quote(seed)}")
     if len(seed) != num_envs:
-        raise ConfigurationError(
-            f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}"
-        )
+        needed = f"must have one seed per world, {num_envs}"
+        raise ConfigurationError(f"a list of seeds {needed}, got {len(seed)}")
     return [None if one is None else int(one) for one in seed]
 
 
@@ -343,10 +346,8 @@ def reset_mask(options: Info | None, num_envs: int) -> BoolArray:
     mask = (options or {}).get("reset_mask", np.ones(num_envs, dtype=np.bool_))
     given = np.asarray(mask)
     if given.dtype != np.bool_ or given.shape != (num_envs,):
-        raise ConfigurationError(
-            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got"
-            f" {quote(mask)}"
-        )
+        needed = f"an array of {num_envs} booleans, one per world"
+        raise ConfigurationError(f"options['reset_mask'] must be {needed}, got {quote(mask)}")
     return given
 
 

@@ -1,4 +1,7 @@
-r"""Errors of the six-axis force-torque sensors of the feet, beside their noise.
+r"""Six-axis force-torque sensors of the feet: what they carry, and errors beside their noise.
+
+A sensor at the ankle measures what the foot passes on to the leg: the ground's force less the
+weight of the foot itself, (f, n) about the ankle, in the frame of the foot.
 
 A foot's sensor shows its wrench w = (f, n) with a constant bias b, a drift of rate d, and
 cross-talk:
@@ -16,10 +19,36 @@ import numpy as np
 
 from elastic_env.core.robot_ranges import CROSS_TALK_ENTRIES, FOOT_ERRORS, DrawnRobot
 from elastic_env.core.signals import Array
+from elastic_env.rigid.biped import Biped
 
 _RANGE_RATIO_M = 0.04
 """Range of the moments over that of the forces [m]: 8 N·m over 200 N of a six-axis sensor as it is
 sold (RealMan), 120 N·m over 2800 N of the name of an ATI Mini58-SI-2800-120."""
+
+
+class FootSensors:
+    """Force-torque sensors at the ankles of feet that hardly accelerate.
+
+    Args:
+        foot_mass: (L,) [kg].
+        foot_com: Center of mass of the feet from the ankle, in the frame of the foot, (L, 3) [m].
+        gravity: Acceleration of gravity in the world, (3,) [m/s²].
+
+    Attributes:
+        com: As `foot_com`.
+        weight: Of each foot, in the world, (L, 3) [N].
+    """
+
+    def __init__(self, foot_mass: Array, foot_com: Array, gravity: Array) -> None:
+        self.com = foot_com
+        self.weight = foot_mass[:, None] * gravity
+
+    @classmethod
+    def of_biped(cls, biped: Biped) -> "FootSensors":
+        """The force-torque sensors at the ankles of a biped."""
+        model = biped.rigid
+        feet = biped.feet
+        return cls(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
 
 
 def cross_talk_matrix(shares: Array) -> Array:

@@ -135,7 +135,8 @@ class FurtherSensors:
         count_rad = angle_of_count(counts_per_turn)
         self._homing_rad = [own.homing_width_rad for own in scenarios]
         self._scale = np.array([[own.sensor_noise] for own in scenarios])
-        self._count_rad = count_rad * np.array([[own.encoder_counts] for own in scenarios])
+        has_counts = np.array([[own.encoder_counts] for own in scenarios])
+        self._count_rad = count_rad * has_counts
         groups = [sensor.group(name, joints) for name, sensor in self._sensors.items()]
         self.signals = SignalTable.of(groups).signals
         """Their columns of the observation, in order."""

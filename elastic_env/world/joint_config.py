@@ -1,9 +1,9 @@
 """Parameters of a task of elastic joints, whatever the robot."""
 
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -55,7 +55,8 @@ class TaskConfig(Model):
     def with_friction_of_ground(self, joint: ElasticJoint) -> ElasticJoint:
         """A known joint with the share of its friction that acts."""
         scale = self.scenario.friction_scale
-        return joint.replace(**{name: scale * getattr(joint, name) for name in FRICTIONS})
+        acting = {name: scale * getattr(joint, name) for name in FRICTIONS}
+        return joint.replace(**acting)
 
 
 class JointConfig(TaskConfig):
@@ -68,16 +69,13 @@ class JointConfig(TaskConfig):
     action_bound_rad: float = quantity("rad", ACTION_BOUND_RAD, gt=0, lt=np.pi)
     """Largest command offset; servos that give way far need more than the default [rad]."""
 
-    @model_validator(mode="after")
-    def _scenario_acts(self) -> Self:
+    def _check(self) -> None:
         set_ = {name for own in self.scenario.parts for name in own.changes}
         acting = [name for name in WALKER_FIELDS if name in set_]
         if acting:
-            raise ValueError(
-                f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker"
-                " knows; leave it out, or make a named scenario by make_scenario(name, walks=False)"
-            )
-        return self
+            problem = f"scenario {self.scenario.name!r} sets {', '.join(acting)}"
+            cure = "leave it out, or make a named scenario by make_scenario(name, walks=False)"
+            raise ValueError(f"{problem}, which only a walker knows; {cure}")
 
     def plant(self) -> Any:
         """The robot as it is built, and as it is known: `elastic_env.world.joint_task.JointPlant`.

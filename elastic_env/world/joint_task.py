@@ -9,6 +9,7 @@ of the offsets' rates, largest joint torque.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -16,6 +17,7 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import read_rows
 from elastic_env.core.robot_ranges import draw_robot, draw_robots
 from elastic_env.core.signals import Array, BoolArray, Parameter, Signal, Signals
 from elastic_env.joint.elasticity import static_link_angle
@@ -34,7 +36,7 @@ from elastic_env.world.drawn_robot import (
 from elastic_env.world.further_sensors import SensorInputs
 from elastic_env.world.joint_config import JointConfig
 from elastic_env.world.joint_signals import joint_groups
-from elastic_env.world.metrics import Metric, metrics_of
+from elastic_env.world.metrics import Metric
 from elastic_env.world.physics import DIVERGED_RAD_S
 from elastic_env.world.rest_check import RestWatch
 from elastic_env.world.robot_model import RobotModel
@@ -51,31 +53,17 @@ the scenario's IMU.
 _RIGID_NM_PER_RAD = 1e15
 """Stiffness of a joint without a spring beside servos that give way."""
 
-_OF_EVERY_STEP = (
-    *metrics_of("command_rate", "rad_s", "rms", "peak", over="all"),
-    *metrics_of("joint_torque", "nm", "peak", over="all"),
-    Metric("clipped_share", "clipped", "mean", over="all"),
-)
-METRICS_OF_ONE = (
-    *metrics_of("link_error", "rad", "rms", "peak", "min", "max"),
-    *metrics_of("link_error_imu", "rad", "rms", "min", "max"),
-    *metrics_of("deflection", "rad", "rms", "peak"),
-    *metrics_of("servo_error", "rad", "rms", "peak"),
-    *_OF_EVERY_STEP,
-)
-METRICS_OF_SEVERAL = (
-    Metric("link_error_rms_rad", "link_error", "rms"),
-    Metric("link_error_peak_rad", "link_error_largest", "peak"),
-    Metric("link_error_min_rad", "link_error_lowest", "min"),
-    Metric("link_error_max_rad", "link_error_highest", "max"),
-    *metrics_of("deflection", "rad", "rms"),
-    *metrics_of("servo_error", "rad", "rms"),
-    *_OF_EVERY_STEP,
-)
-METRICS_OF_TOOL = (
-    *metrics_of("end_effector_error", "m", "rms", "peak"),
-    *metrics_of("end_effector_tilt", "rad", "rms", "peak"),
-)
+_METRICS = read_rows(Path(__file__).with_name("joint_metrics.csv"))
+
+
+def _metrics_of(robots: str) -> tuple[Metric, ...]:
+    rows = [dict[str, Any](row) for row in _METRICS]
+    return tuple(Metric(**row) for row in rows if row.pop("robots") == robots)
+
+
+METRICS_OF_ONE = _metrics_of("one")
+METRICS_OF_SEVERAL = _metrics_of("several")
+METRICS_OF_TOOL = _metrics_of("end_effector")
 
 
 @dataclass(frozen=True)
@@ -186,6 +174,8 @@ class JointTask(Task):
                 f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has"
                 f" {len(joints)}; choose link_encoder to observe the links of several"
             )
+        groups = joint_groups(dict.fromkeys(joints)).values()
+        standard = [signal for group in groups for signal in group.signals]
         scenario = config.scenario
         period_s = config.control_period_s
         counts = plant.true.encoder_counts_per_turn if scenario.encoder_counts else None
@@ -200,7 +190,7 @@ class JointTask(Task):
             model=plant.model,
             assumed=plant.assumed,
             motion=plant.motion,
-            table=_observed(joints, observe_imu),
+            table=[*standard, LINK_IMU] if observe_imu else standard,
             sensors=[name for name in config.sensors if name != LINK_IMU_SENSOR],
             joints=dict.fromkeys(joints),
             scenarios=[scenario] * num_worlds,
@@ -232,7 +222,8 @@ class JointTask(Task):
         self._springs = spring_ids(self.model, joints, config.form)
         self._joints_differ = joints_differ(scenario)
         is_one = scenario.has_one_robot
-        self._robot = draw_robots(scenario.parts, 1, len(joints), [0])[0] if is_one else None
+        same = draw_robots(scenario.parts, int(is_one), len(joints), [0])
+        self._robot = same[0] if is_one else None
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
         """Begin new episodes, also for the watch over windows at rest."""
@@ -256,13 +247,11 @@ class JointTask(Task):
     def truth(self) -> JointTruth:
         """State without noise, and the true parameters."""
         state = self._joints[self._row]["truth"]
+        names = ("theta", "theta_dot", "q_dot", "stiffness")
         return JointTruth(
             **vars(self._sensor_inputs()),
-            theta=state["theta"].copy(),
-            theta_dot=state["theta_dot"].copy(),
-            q_dot=state["q_dot"].copy(),
+            **{name: state[name].copy() for name in names},
             deflection=state["theta"] - state["q"],
-            stiffness=state["stiffness"].copy(),
             model=self._true_model,
         )
 
@@ -273,7 +262,8 @@ class JointTask(Task):
         parts = self.config.scenario.parts
         robot = self._robot or draw_robot(parts, n, random.fork())
         self._take_robot(world, robot)
-        generator.random(n + 1)  # not used: noise follows what has always been drawn here
+        # not used: noise follows what has always been drawn here
+        generator.random(n + 1)
         self._noise.restart(world, random.noise())
         self._imu_bias[world] = robot.mounting_rad[0]
         if self._imu is not None:
@@ -388,13 +378,6 @@ class JointTask(Task):
         }
 
 
-def _observed(joints: Sequence[str], observe_imu: bool) -> list[Signal]:
-    """The standard columns."""
-    groups = joint_groups(dict.fromkeys(joints)).values()
-    standard = [signal for group in groups for signal in group.signals]
-    return [*standard, LINK_IMU] if observe_imu else standard
-
-
 def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
     """Records of `SCHEDULE`, one per step."""
     rows = np.zeros(reference.num_steps + 1, records.SCHEDULE)
@@ -425,5 +408,5 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
             " not have; choose another one, or the testbed or the walker"
         )
     gravity = float(np.linalg.norm(plant.model.opt.gravity))
-    period_s = config.control_period_s
-    return PendulumImu(scenario.inertial, plant.imu_arm_m, gravity, period_s, num_worlds)
+    place = (plant.imu_arm_m, gravity, config.control_period_s)
+    return PendulumImu(scenario.inertial, *place, num_worlds)

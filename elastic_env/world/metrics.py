@@ -27,13 +27,6 @@ class Metric:
     over: str = "scored"
 
 
-def metrics_of(
-    signal: str, unit: str, *statistics: Statistic, over: str = "scored"
-) -> tuple[Metric, ...]:
-    """Statistics of a signal, each named `signal_statistic_unit`."""
-    return tuple(Metric(f"{signal}_{s}_{unit}", signal, s, over) for s in statistics)
-
-
 _NEUTRAL: dict[Statistic, float] = {
     "rms": 0.0,
     "mean": 0.0,
@@ -101,9 +94,10 @@ class EpisodeMetrics:
         self._signals = [*dict.fromkeys(metric.signal for metric in metrics)]
         self._masks = [*dict.fromkeys(metric.over for metric in metrics)]
         self._folds = np.zeros(len(metrics), FOLD)
-        self._folds["statistic"] = [statistics.index(metric.statistic) for metric in metrics]
-        self._folds["signal"] = [self._signals.index(metric.signal) for metric in metrics]
-        self._folds["mask"] = [self._masks.index(metric.over) for metric in metrics]
+        for row, own in zip(self._folds, metrics, strict=True):
+            row["statistic"] = statistics.index(own.statistic)
+            row["signal"] = self._signals.index(own.signal)
+            row["mask"] = self._masks.index(own.over)
         neutral = [[_NEUTRAL[metric.statistic]] for metric in metrics]
         self._neutral = np.tile(neutral, num_worlds)
         self._total = self._neutral.copy()
@@ -126,7 +120,8 @@ class EpisodeMetrics:
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
         found: dict[str, Array] = {}
-        for metric, total, count in zip(self._metrics, self._total, self._count, strict=True):
+        rows = zip(self._metrics, self._total, self._count, strict=True)
+        for metric, total, count in rows:
             value = total.copy()
             if metric.statistic in ("rms", "mean"):
                 value /= np.maximum(count, 1)

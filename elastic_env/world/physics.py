@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import mujoco
 import numpy as np
-from mujoco import batch
+from mujoco import MjData, MjModel, batch
 from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError
@@ -28,7 +28,7 @@ class Simulation(Protocol):
     The state arrays are live views; writing `ctrl` commands the next advance.
     """
 
-    model: mujoco.MjModel
+    model: MjModel
     num_worlds: int
     qpos: Array
     qvel: Array
@@ -52,7 +52,7 @@ class Simulation(Protocol):
         """A live (num_worlds, ...) array of a field of `MjModel`, from now on each world's own."""
         ...
 
-    def take(self, world: int, model: mujoco.MjModel) -> None:
+    def take(self, world: int, model: MjModel) -> None:
         """Give a world a model of its own, in place of varied fields.
 
         It must have as many bodies, joints and sensors.
@@ -148,12 +148,14 @@ class Worlds(Simulation):
         if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
         is_bad = np.asarray(counts[:, _BAD].any(axis=1))
-        others = np.asarray(counts[~is_bad].any(axis=0))  # what explodes has every fault
+        # what explodes has every fault
+        others = np.asarray(counts[~is_bad].any(axis=0))
         for kind, meaning in _OTHERS.items():
             number = int(getattr(mujoco.mjtWarning, f"mjWARN_{kind}"))
             if others[number] and kind not in self._said:
                 self._said.add(kind)
-                warnings.warn(f"MuJoCo goes on, less exact; the model has {meaning}", stacklevel=2)
+                problem = f"MuJoCo goes on, less exact; the model has {meaning}"
+                warnings.warn(problem, stacklevel=2)
         return is_bad
 
     @override
@@ -166,16 +168,12 @@ class SingleWorld(Worlds):
 
     num_worlds = 1
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._start(model, mujoco.MjData(model), set(), is_own=False)
-
-    def _start(
-        self, model: mujoco.MjModel, data: mujoco.MjData, said: set[str], is_own: bool
-    ) -> None:
+    def __init__(self, model: MjModel, given: MjData | None = None) -> None:
+        data: MjData = given or MjData(model)
         self.model = model
         self._data = data
-        self._said = said
-        self._is_own = is_own
+        self._said = set()
+        self._is_own = False
         self._counts = data.warning.number[None]
         self._views = {}
         self._friction = VaryingFriction.of(model)
@@ -186,15 +184,12 @@ class SingleWorld(Worlds):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views, for `copy.deepcopy` and pickle."""
-        return {
-            "model": self.model,
-            "data": self._data,
-            "said": self._said,
-            "is_own": self._is_own,
-        }
+        own = {"_said": self._said, "_is_own": self._is_own}
+        return {"made": (self.model, self._data), "own": own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._start(**state)
+        self.__init__(*state["made"])
+        vars(self).update(state["own"])
 
     @override
     def bind(self, field: str) -> Array:
@@ -208,10 +203,10 @@ class SingleWorld(Worlds):
         return getattr(self.model, field)[None]
 
     @override
-    def take(self, world: int, model: mujoco.MjModel) -> None:
+    def take(self, world: int, model: MjModel) -> None:
         self.model = model
 
-    def model_of(self, world: int) -> mujoco.MjModel:  # noqa: ARG002  there is one
+    def model_of(self, world: int) -> MjModel:  # noqa: ARG002  there is one
         """The model of a world with all that is its own, for reading."""
         return self.model
 
@@ -239,30 +234,19 @@ class SingleWorld(Worlds):
 class ManyWorlds(Worlds):
     """Many worlds on `mujoco.batch`, stepped by a pool of threads."""
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:
-        threads = min(num_threads or os.cpu_count() or 1, num_worlds)
-        self._start(model, num_worlds, threads, set())
-
-    def _start(
-        self,
-        model: mujoco.MjModel,
-        num_worlds: int,
-        num_threads: int,
-        said: set[str],
-        own: list[mujoco.MjModel] | None = None,
-    ) -> None:
-        """Begin with worlds in the model's default state, and threads of this process."""
+    def __init__(self, model: MjModel, num_worlds: int, num_threads: int = 0) -> None:
         self.model = model
         self.num_worlds = num_worlds
-        self._said = said
+        self._said = set()
         self._process = os.getpid()
-        self._own_models = own
-        self._are_given = own is None
+        self._own_models: list[MjModel] | None = None
+        self._are_given = True
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views = {}
         self._friction = VaryingFriction.of(model)
-        self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
+        threads = min(num_threads or os.cpu_count() or 1, num_worlds)
+        self._batch = batch.Batch(model, nsim=num_worlds, nthread=threads)
         self._counts = self._batch.warning[..., 1]
         self.qpos = self._batch.bind("qpos")
         self.qvel = self._batch.bind("qvel")
@@ -271,9 +255,10 @@ class ManyWorlds(Worlds):
 
     def __getstate__(self) -> dict[str, Any]:
         """State without live views and threads, for copies, pickle, and a forked process."""
-        threads = self._batch.nthread
         return {
-            "made": (self.model, self.num_worlds, threads, self._said, self._own_models),
+            "made": (self.model, self.num_worlds, self._batch.nthread),
+            "said": self._said,
+            "own": self._own_models,
             "bound": self._bound,
             "varied": {field: self.vary(field).copy() for field in self._varied},
             "state": self._batch.state.copy(),
@@ -281,7 +266,10 @@ class ManyWorlds(Worlds):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self._start(*state["made"])
+        self.__init__(*state["made"])
+        self._said = state["said"]
+        self._own_models = state["own"]
+        self._are_given = state["own"] is None
         for field, values in state["varied"].items():
             self.vary(field)[:] = values
         for field in state["bound"]:
@@ -315,19 +303,20 @@ class ManyWorlds(Worlds):
         return self._batch.expand(field)
 
     @override
-    def take(self, world: int, model: mujoco.MjModel) -> None:
+    def take(self, world: int, model: MjModel) -> None:
         if self._own_models is None:
             self._own_models = [self.model] * self.num_worlds
         self._own_models[world] = model
         self._are_given = False
 
-    def model_of(self, world: int) -> mujoco.MjModel:
+    def model_of(self, world: int) -> MjModel:
         """The model of a world with all that is its own, for reading."""
         return self._ready().get_model(world)
 
     @override
     def _field(self, name: str) -> Array:
-        return self.vary(name) if name in self._varied else getattr(self.model, name)[None]
+        is_own = name in self._varied
+        return self.vary(name) if is_own else getattr(self.model, name)[None]
 
     @override
     def _step(self, num_substeps: int) -> None:
@@ -346,7 +335,7 @@ class ManyWorlds(Worlds):
             self._ready().forward(worlds)
 
 
-def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:
+def simulate(model: MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:
     """The fastest simulation for a number of worlds.
 
     Args:
@@ -354,7 +343,8 @@ def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Si
         num_worlds: How many.
         num_threads: Threads for many worlds, 0 for all cores; the results do not depend on it.
     """
-    return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
+    is_one = num_worlds == 1
+    return SingleWorld(model) if is_one else ManyWorlds(model, num_worlds, num_threads)
 
 
 MOST_SUBSTEPS = 1000
@@ -374,8 +364,6 @@ def substeps(control_period_s: float, timestep_s: float) -> int:
             f" {MOST_SUBSTEPS}th of the control period, got {timestep_s:g} s"
         )
     if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
-        raise ConfigurationError(
-            f"timestep_s must divide the control period of {control_period_s:g} s, got"
-            f" {timestep_s:g} s"
-        )
+        needed = f"must divide the control period of {control_period_s:g} s"
+        raise ConfigurationError(f"timestep_s {needed}, got {timestep_s:g} s")
     return round(ratio)

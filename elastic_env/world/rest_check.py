@@ -103,7 +103,8 @@ class RestWatch:
         joint = int(moved[0, worst].argmax())
         weight = f"and the weight bends the joints by {1e3 * sag[worst]:.3g} mrad"
         if sag[worst] < _SMALLEST_RAD:
-            weight = "and no weight bends the joints, so that nothing is there to compensate"
+            nothing = "so that nothing is there to compensate"
+            weight = f"and no weight bends the joints, {nothing}"
         warnings.warn(
             f"joint {self._joints[joint]!r} does not rest where it is scored at rest: at position"
             f" {window[worst] + 1} its link moves by {1e3 * links[worst]:.3g} mrad while it is"

@@ -22,6 +22,8 @@ from elastic_env.rigid.biped import Biped
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Key of K in an identification file."""
+Stiffness = float | str | Path | Sequence[float] | Array
+"""A stiffness as users give it: a number, one per joint, or a file [N·m/rad]."""
 _UNLIMITED_RAD = 200.0 * np.pi
 
 
@@ -29,8 +31,8 @@ def _of_joints(parameter: str) -> Any:
     """A property of a robot: a parameter of all its joints, (n,)."""
 
     def values(robot: "RobotModel") -> Array:
-        joints = robot.joints.values()
-        return np.array([getattr(joint, parameter) for joint in joints], dtype=np.float64)
+        each = [getattr(joint, parameter) for joint in robot.joints.values()]
+        return np.array(each, dtype=np.float64)
 
     return property(values)
 
@@ -101,8 +103,8 @@ class RobotModel:
         Raises:
             ConfigurationError: A joint has no servo.
         """
-        each = [servo.largest_torque(speed[..., i]) for i, servo in enumerate(self.servos)]
-        return np.stack(each, axis=-1)
+        pairs = zip(self.servos, np.moveaxis(speed, -1, 0), strict=True)
+        return np.stack([servo.largest_torque(own) for servo, own in pairs], axis=-1)
 
     def demand(self, torque: Array, speed: Array) -> tuple[Array, Array]:
         """Torques that servos need along a motion, and those that they have then.
@@ -145,18 +147,17 @@ class RobotModel:
         servos = {name: joint.servo for name, joint in self.joints.items()}
         without = ", ".join(name for name, servo in servos.items() if servo is None)
         if without:
-            raise ConfigurationError(
-                f"a servo is needed on every joint, but there is none on: {without}"
-            )
+            needed = "a servo is needed on every joint"
+            raise ConfigurationError(f"{needed}, but there is none on: {without}")
         return tuple(servo for servo in servos.values() if servo is not None)
 
     @property
     def servo_compliance(self) -> Array:
         """Compliance of the servos, (n,) [rad/(N·m)]: 1/k_p, 0 with an integrator."""
         servos = [joint.servo for joint in self.joints.values()]
-        gives_way = [servo is not None and servo.integral_gain == 0.0 for servo in servos]
-        gains = [1.0 if servo is None else servo.position_gain for servo in servos]
-        return np.where(gives_way, 1.0 / np.array(gains), 0.0)
+        sags = [bool(s and s.integral_gain == 0.0) for s in servos]
+        gains = [s.position_gain if s else 1.0 for s in servos]
+        return np.where(sags, 1.0 / np.array(gains), 0.0)
 
     @property
     def servo_lag(self) -> Array:
@@ -165,7 +166,7 @@ class RobotModel:
         The back-EMF of a motor damps like k_v.
         """
         servos = [joint.servo for joint in self.joints.values()]
-        return np.array([0.0 if s is None else s.braking / s.position_gain for s in servos])
+        return np.array([s.braking / s.position_gain if s else 0.0 for s in servos])
 
     def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
         """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
@@ -227,7 +228,8 @@ def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> tuple[Array, A
     """
     at = [model.joint(name).id for name in joints]
     limits = model.jnt_range[at]
-    limited = model.jnt_limited[at].astype(bool)[:, None] & (np.abs(limits) < _UNLIMITED_RAD)
+    is_near = np.abs(limits) < _UNLIMITED_RAD
+    limited = model.jnt_limited[at, None].astype(bool) & is_near
     lowest, highest = np.where(limited, limits, [-np.inf, np.inf]).T
     return lowest, highest
 
@@ -240,7 +242,7 @@ class WalkerModel(RobotModel):
     plan: WalkPlan = field(kw_only=True)
 
 
-def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "float | Array":
+def read_stiffness(value: Stiffness) -> "float | Array":
     """Read a stiffness: a number, one per joint, or a file of `elastic identify` [N·m/rad].
 
     Raises:
@@ -249,15 +251,9 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     given = value
     value = plain_numbers(value)
     if isinstance(value, list | tuple):
-        try:
-            # NumPy would convert them
-            if any(isinstance(item, str | bool) for item in value):
-                raise TypeError
+        if all(type(item) in (int, float) for item in value):
             return np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigurationError(
-                f"stiffness must be numbers [N·m/rad], got {quote(given)}"
-            ) from None
+        raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {quote(given)}")
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(
             f"stiffness must be a number [N·m/rad] or an identification file, got {quote(value)}"
@@ -269,10 +265,8 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     try:
         content = read_bounded(path, LARGEST_JSON)
     except (OSError, ValueError):
-        raise ConfigurationError(
-            "stiffness must be a number [N·m/rad] or an identification file, found no file"
-            f" {shorten(path)}"
-        ) from None
+        needed = "stiffness must be a number [N·m/rad] or an identification file"
+        raise ConfigurationError(f"{needed}, found no file {shorten(path)}") from None
     try:
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
     except (KeyError, TypeError, ValueError):

@@ -28,29 +28,20 @@ def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
     return np.dtype((np.record, list(fields)))
 
 
-JOINT = record_type(
-    (
-        "truth",
-        record_type(
-            ("q_ref", REAL),  # [rad]
-            ("theta", REAL),
-            ("theta_dot", REAL),  # motor side [rad], [rad/s]
-            ("q", REAL),
-            ("q_dot", REAL),  # link side [rad], [rad/s]
-            ("offset", REAL),
-            ("command", REAL),  # a, and θ_cmd = q_ref + a [rad]
-            ("command_rate", REAL),  # change of a [rad/s]
-            ("stiffness", REAL),
-            ("damping", REAL),  # true K [N·m/rad] and D [N·m·s/rad]
-            ("backlash", REAL),  # dead band [rad]
-            ("homing", REAL),  # what the encoder shows beyond θ [rad]
-        ),
-    ),
-    (
-        "shown",
-        record_type(("encoder", REAL), ("encoder_before", REAL)),
-    ),  # now and one control step ago [rad]
+def reals(names: str, shape: int | tuple[int, ...] = ()) -> list[tuple[Any, ...]]:
+    """Fields of real numbers of one shape."""
+    return [(name, REAL, shape) for name in names.split()]
+
+
+_JOINT_TRUTH = record_type(
+    *reals("q_ref theta theta_dot q q_dot"),  # motor and link side [rad], [rad/s]
+    # a, θ_cmd = q_ref + a [rad]; change of a [rad/s]
+    *reals("offset command command_rate"),
+    *reals("stiffness damping"),  # true K [N·m/rad] and D [N·m·s/rad]
+    *reals("backlash homing"),  # dead band, and what the encoder shows beyond θ [rad]
 )
+_JOINT_SHOWN = record_type(*reals("encoder encoder_before"))  # now and a step ago [rad]
+JOINT = record_type(("truth", _JOINT_TRUTH), ("shown", _JOINT_SHOWN))
 """A joint in a control step. What is true of its spring and its encoder is drawn per episode."""
 
 COURSE: Any = (
@@ -70,31 +61,25 @@ RULES = record_type(
 """Rules of the joints of a world."""
 
 ADDRESS = record_type(
-    ("theta", WHOLE),
-    ("q", WHOLE),  # in qpos
-    ("theta_dot", WHOLE),
-    ("q_dot", WHOLE),  # in qvel
-    ("servo", WHOLE),  # in ctrl
+    # in qpos, in qvel, in ctrl
+    *((name, WHOLE) for name in ("theta", "q", "theta_dot", "q_dot", "servo"))
 )
 """Addresses of a joint in the physics."""
 
-LINK_SCORES = record_type(("link_error", REAL), ("command_rate", REAL), ("divergence", REAL))
+LINK_SCORES = record_type(*reals("link_error command_rate divergence"))
 """Weighted terms of the reward of links on a fixed base, or their weights."""
 
 LINK_WORLD = record_type(
     # as in a `Plan`
     ("truth", record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))),
     # link angle now, and as old as the scenario has it [rad]
-    ("shown", record_type(("imu", REAL), ("visible_imu", REAL))),
+    ("shown", record_type(*reals("imu visible_imu"))),
     ("scores", LINK_SCORES),
 )
 """A control step of a world with links on a fixed base."""
 
 LINK_CONSTANTS = record_type(
-    ("weights", LINK_SCORES),
-    ("imu_noise_rad", REAL),
-    ("imu_bias_rad", REAL),
-    ("imu_sine_error_rad", REAL),
+    ("weights", LINK_SCORES), *reals("imu_noise_rad imu_bias_rad imu_sine_error_rad")
 )
 """Constants of links on a fixed base."""
 

@@ -4,21 +4,22 @@ Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` 
 friction, sensor noise, encoder counts), and changes on top of either. A change alone is meant on
 top of `nominal`; `ideal+soft` puts it on `ideal`, and changes can be joined: `soft+payload`.
 
+`scenarios.yaml` beside this file says what grounds and changes set.
+
 [AndradeChavez2019] F. J. Andrade Chavez, S. Traversaro, D. Pucci, "Six-Axis Force Torque Sensor
 Model-Based In Situ Calibration Method and Its Impact in Floating-Based Robot Dynamic Performance",
 Sensors 19(24), 5521.
 """
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from pathlib import Path
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from elastic_env.core.config import Title, quantity
+from elastic_env.core.config import Title, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
 from elastic_env.core.robot_ranges import LOAD_PLACE, WALKER_FIELDS, RobotRanges
-from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
 MOST_RANGES = 100
@@ -58,14 +59,13 @@ class Scenario(RobotRanges):
     mixture: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
     """Ranges in place of the scenario's own, each of an equal share of the robots."""
 
-    @model_validator(mode="after")
-    def _mixture_says_all_that_differs(self) -> Self:
+    def _check(self) -> None:
+        super()._check()
         if self.mixture and self.changes:
             raise ValueError(
                 f"mixture says in what robots differ; leave out {', '.join(self.changes)}, or give"
                 " it to the ranges of the mixture"
             )
-        return self
 
     @property
     def parts(self) -> tuple[RobotRanges, ...]:
@@ -85,7 +85,8 @@ class Scenario(RobotRanges):
     @property
     def places_loads(self) -> bool:
         """True if robots carry other loads than that of all of them on the shoulders."""
-        return self.shoulder_load_kg == 0.0 and max(own.load_kg[1] for own in self.parts) > 0.0
+        heaviest = max(own.load_kg[1] for own in self.parts)
+        return self.shoulder_load_kg == 0.0 and heaviest > 0.0
 
     @property
     def draws_robots(self) -> bool:
@@ -109,104 +110,20 @@ class Scenario(RobotRanges):
         return max(abs(end) for own in self.parts for end in own.homing_rad)
 
 
-_IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
-# the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs
-# at 500 Hz
-_PELVIS_IMU = AttitudeSensor(noise_rad=0.2e-3, rate_hz=500.0)
-# 3DM-GX4-25: 8.73e-5 rad/s/√Hz (KumarRobotics/imu_3dm_gx4) at half the control rate of 250 Hz
-_GYRO_NOISE_RAD_S = 1.0e-3
-# an assumption for the six-axis sensors of the feet, whose data were not found
-_FORCE_NOISE_N = 1.0
-_MOMENT_NOISE_NM = 0.05
-# assumptions: a six-axis sensor as it is sold is accurate to 2 % of 200 N and 8 N·m (RealMan), that
-# is 4 N and 0.16 N·m. THORMANG3 tares its feet in the air (thormang3_feet_ft_module), and from then
-# on the temperature of strain gauges makes them drift [AndradeChavez2019]: 1.2 N a minute. Good
-# sensors have up to 2 % of the full scale in cross-talk
-_FOOT_ERRORS: dict[str, Any] = {
-    "force_bias_n": (-5.0, 5.0),
-    "moment_bias_nm": (-0.15, 0.15),
-    "force_drift_n_s": (-0.02, 0.02),
-    "moment_drift_nm_s": (-0.0006, 0.0006),
-    "cross_talk": (-0.01, 0.01),
-}
-# an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
-_HOMING_ERROR_RAD = 2e-3
-_HOMING = (-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD)
-
-GROUNDS: dict[str, Scenario] = {
-    "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
-    "nominal": Scenario(
-        name="nominal",
-        imu=_IMU,
-        pelvis_imu=_PELVIS_IMU,
-        gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
-        force_noise_n=_FORCE_NOISE_N,
-        moment_noise_nm=_MOMENT_NOISE_NM,
-        sensor_noise=1.0,
-    ),
-}
-
+_DATA = read_mapping(Path(__file__).with_name("scenarios.yaml"))
+GROUNDS = {name: Scenario(name=name, **own) for name, own in _DATA["grounds"].items()}
+CHANGES: dict[str, dict[str, Any]] = _DATA["changes"]
+"""Parameters that a change sets on its ground."""
+TRAINING_RANGES = RobotRanges(**_DATA["training_ranges"])
+"""Ranges of `drawn`."""
+RANGES_BEYOND: list[dict[str, Any]] = _DATA["ranges_beyond"]
+"""Intervals beyond those of `drawn`, each of a ninth of the robots of `drawn_beyond`."""
 _LONGEST_JOINED = 1000
 """Characters of a joined name that are looked at."""
-
-CHANGES: dict[str, dict[str, Any]] = {
-    "soft": {"stiffness": 0.7},
-    "stiff": {"stiffness": 1.3},
-    "spread": {"joint_stiffness": (0.7, 1.3)},
-    "payload": {"pendulum_mass_scale": 1.2, "load_kg": 5.0},
-    "backlash": {"backlash_rad": BACKLASH_BOUND_RAD},
-    "sensor": {
-        "homing_rad": _HOMING,
-        "mounting_rad": _HOMING,
-        "delay_share": 1.0,
-        **_FOOT_ERRORS,
-    },
-    "imu": {"inertial_share": 1.0, "delay_share": 1.0},
-    "push": {"push_n": 50.0},
-    "slope": {"slope_rad": math.radians(1.0)},
-    "foot_sensors": _FOOT_ERRORS,
-    "slip": {"floor_friction": 0.3},
-}
-"""Parameters that a change sets on its ground."""
-
-_MOST_FRICTION = 8.0 / H54_200_S500_R.coulomb_friction
-TRAINING_RANGES = RobotRanges(
-    stiffness=(0.75, 1.25),
-    joint_stiffness=(0.8, 1.12),
-    damping=(0.5, 2.0),
-    friction=(0.0, _MOST_FRICTION),
-    backlash_rad=(0.0, 2e-3),
-    load_kg=(0.0, 8.0),
-    load_x_m=(-0.1, 0.1),
-    load_y_m=(-0.1, 0.1),
-    load_z_m=(-0.15, 0.15),
-    homing_rad=_HOMING,
-    mounting_rad=_HOMING,
-    slope_rad=(0.0, math.radians(1.5)),
-    push_n=(0.0, 50.0),
-    push_share=0.5,
-    delay_share=0.5,
-    **_FOOT_ERRORS,
-)
-"""Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named
-changes but `stiff`'s on all joints at once."""
-RANGES_BEYOND: tuple[dict[str, Any], ...] = (
-    {"stiffness": (0.6, 0.7)},
-    {"stiffness": (1.3, 1.5)},
-    {"friction": (_MOST_FRICTION, 11.0 / H54_200_S500_R.coulomb_friction)},
-    {"backlash_rad": (2e-3, 3e-3)},
-    {"load_kg": (8.0, 11.0)},
-    {"homing_rad": (_HOMING_ERROR_RAD, 1.5 * _HOMING_ERROR_RAD)},
-    {"mounting_rad": (_HOMING_ERROR_RAD, 2.0 * _HOMING_ERROR_RAD)},
-    {"slope_rad": (math.radians(1.5), math.radians(2.5))},
-    {"push_n": (50.0, 80.0), "push_share": 1.0},
-)
-"""Intervals beyond those of `drawn`, each of a ninth of the robots of `drawn_beyond`."""
-
 DISTRIBUTIONS = ("drawn", "drawn_beyond")
 """Changes that draw every episode's robot from ranges: those to learn from, and for tests robots
 that have one quantity beyond these."""
-WALKER_ONLY = tuple(name for name, own in CHANGES.items() if own.keys() <= {*WALKER_FIELDS})
+WALKER_ONLY = [name for name, own in CHANGES.items() if own.keys() <= {*WALKER_FIELDS}]
 """Changes that set quantities of walkers alone."""
 
 RangeChanges = Mapping[str, Any] | Sequence[Mapping[str, Any]]
@@ -226,7 +143,7 @@ def _distribution(name: str, ranges: RangeChanges) -> dict[str, Any]:
 
 def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
     """Parameters of a change for a robot that does not walk."""
-    kept = {field: value for field, value in parameters.items() if field not in WALKER_FIELDS}
+    kept = {name: own for name, own in parameters.items() if name not in WALKER_FIELDS}
     if "mixture" in kept:
         kept["mixture"] = [own.on_fixed_base() for own in kept["mixture"]]
     return kept
@@ -235,28 +152,26 @@ def _without_walking(parameters: dict[str, Any]) -> dict[str, Any]:
 def _require_ranges(ranges: Any, walks: bool) -> None:
     """Refuse what is no mapping or list of mappings, and intervals of walkers elsewhere."""
     each = [ranges] if isinstance(ranges, Mapping) else ranges
-    if not isinstance(each, list | tuple) or not all(isinstance(own, Mapping) for own in each):
-        raise ConfigurationError(
-            f"ranges must be a mapping of intervals, or a list of such, got {quote(ranges)}"
-        )
+    is_list = isinstance(each, list | tuple)
+    if not is_list or not all(isinstance(own, Mapping) for own in each):
+        needed = "a mapping of intervals, or a list of such"
+        raise ConfigurationError(f"ranges must be {needed}, got {quote(ranges)}")
     of_walkers = sorted({field for own in each for field in own} & {*WALKER_FIELDS})
     if of_walkers and not walks:
-        here = [field for field in RobotRanges.model_fields if field not in WALKER_FIELDS]
-        raise ConfigurationError(
-            f"ranges: only a walker has {', '.join(of_walkers)}; here choose from:"
-            f" {', '.join(here)}"
-        )
+        here = ", ".join(name for name in RobotRanges.model_fields if name not in WALKER_FIELDS)
+        problem = f"ranges: only a walker has {', '.join(of_walkers)}"
+        raise ConfigurationError(f"{problem}; here choose from: {here}")
 
 
 def _in_each_part(parameters: dict[str, Any], name: str) -> dict[str, Any]:
     """Parameters of a mixture whose ranges also hold the intervals that stand beside it."""
-    beside = {field: parameters[field] for field in parameters.keys() & RobotRanges.model_fields}
+    fields = parameters.keys() & RobotRanges.model_fields
+    beside = {field: parameters.pop(field) for field in fields}
     parts: list[RobotRanges] = parameters["mixture"]
-    twice = sorted({field for own in parts for field in own.changes} & beside.keys())
+    twice = sorted({field for own in parts for field in own.changes} & fields)
     if twice:
         raise ConfigurationError(f"scenario {name!r} sets {', '.join(twice)} a second time")
-    others = {field: value for field, value in parameters.items() if field not in beside}
-    return {**others, "mixture": [own.replace(**beside) for own in parts]}
+    return parameters | {"mixture": [own.replace(**beside) for own in parts]}
 
 
 def scenario_names(walks: bool = True) -> list[str]:
@@ -290,10 +205,9 @@ def make_scenario(
     parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
-            raise ConfigurationError(
-                f"scenario {name!r}: {change!r} is a ground and can only stand first"
-            )
-        if change not in CHANGES and change not in DISTRIBUTIONS:
+            problem = f"{change!r} is a ground and can only stand first"
+            raise ConfigurationError(f"scenario {name!r}: {problem}")
+        if change not in (*CHANGES, *DISTRIBUTIONS):
             choices = [*scenario_names(walks), *DISTRIBUTIONS]
             raise unknown_name("scenario", change, choices)
         added = CHANGES.get(change) or _distribution(change, ranges or {})
@@ -301,9 +215,8 @@ def make_scenario(
             added = _without_walking(added)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
-            raise ConfigurationError(
-                f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time"
-            )
+            problem = f"{change!r} sets {', '.join(twice)} a second time"
+            raise ConfigurationError(f"scenario {name!r}: {problem}")
         parameters |= added
     if "mixture" in parameters:
         parameters = _in_each_part(parameters, str(name))

@@ -6,10 +6,10 @@ disturbs it. `PendulumImu` plays one on a link that hangs from a horizontal axis
 """
 
 import math
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import model_validator
+from numpy.random import Generator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
@@ -75,15 +75,13 @@ class InertialSensor(Model):
     bandwidth_hz: float = quantity("Hz", 125.0, gt=0)
     """Of the noise: half the control rate of 250 Hz [Hz]."""
 
-    @model_validator(mode="after")
-    def _biases_are_within_the_static_error(self) -> Self:
+    def _check(self) -> None:
         if self.static_error_rad < self._error_by_bias_rad:
             raise ValueError(
                 "static_error_rad must be at least what the biases make of it,"
                 f" {self._error_by_bias_rad:.3g} rad, got {self.static_error_rad:g}; lower"
                 " accelerometer_bias_m_s2, gyro_bias_rad_s or time_constant_s"
             )
-        return self
 
     @property
     def gyro_noise_rad_s(self) -> float:
@@ -184,7 +182,7 @@ class NoiseStream:
         self._most_used = 0
         self._generators = [np.random.default_rng(0) for _ in range(num_worlds)]
 
-    def restart(self, world: int, generator: np.random.Generator) -> None:
+    def restart(self, world: int, generator: Generator) -> None:
         """Begin a new stream for one world."""
         self._generators[world] = generator
         self._refill(world)
@@ -260,7 +258,7 @@ class PendulumImu:
         self._bias = np.zeros((num_worlds, 3))
         self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
 
-    def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
+    def draw(self, world: int, generator: Generator, noise: Generator) -> float:
         """Draw the errors of an episode; the caller adds the returned offset [rad]."""
         sensor = self._sensor
         gyro, x, z, offset = generator.standard_normal(4)
@@ -276,7 +274,8 @@ class PendulumImu:
         for world in np.flatnonzero(worlds):
             force = self._force(q, at_rest, at_rest)[world]
             gyro = np.array([0.0, -self._bias[world, 0], 0.0])
-            kernels.settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
+            delay_s = self._sensor.time_constant_s
+            kernels.settled_vertical(self._up[world], force, gyro, delay_s)
 
     def advance(self, worlds: BoolArray, q: Array, q_dot: Array) -> None:
         """Advance by a control period to angles q [rad] and rates q̇ [rad/s], (num_worlds,)."""
@@ -289,7 +288,8 @@ class PendulumImu:
         turned = q - last[:, 0] + self._period_s * error
         for world in np.flatnonzero(worlds):
             about_y = np.array([0.0, -turned[world], 0.0])
-            kernels.complementary_filter(self._up[world], about_y, force[world], self._gain)
+            seen = (about_y, force[world], self._gain)
+            kernels.complementary_filter(self._up[world], *seen)
         self._last[worlds] = np.stack([q, q_dot], axis=1)[worlds]
 
     @property

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import gymnasium
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import ResetNeeded
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
@@ -227,8 +227,7 @@ class Task(ABC):
         if not self._is_begun:
             missing = np.flatnonzero(~self._begun).tolist()
             some = f", of the worlds {missing} too" if self._begun.any() else ""
-            problem = f"reset() comes before the first step(){some}"
-            raise gymnasium.error.ResetNeeded(problem)
+            raise ResetNeeded(f"reset() comes before the first step(){some}")
         offset, is_clipped = self._command(action)
         self._disturb()
         self.simulation.advance(self.num_substeps)
@@ -302,7 +301,8 @@ class Task(ABC):
 
     def robot_record(self, world: int) -> dict[str, float]:
         """The robot of a world in figures, where robots differ; else nothing."""
-        return {} if self._scenarios[world].has_one_robot else self._robots[world].record()
+        is_one = self._scenarios[world].has_one_robot
+        return {} if is_one else self._robots[world].record()
 
     @abstractmethod
     def truth(self) -> Any:
@@ -457,16 +457,17 @@ class Task(ABC):
         shape = self._action_shape
         bounds = f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
-            kind = given.dtype
-            return ActionError(f"an action must be real numbers, {bounds}, got an array of {kind}")
-        if given.shape != shape:
+            problem = f"be real numbers, {bounds}, got an array of {given.dtype}"
+        elif given.shape != shape:
             # a scalar environment adds the axis of worlds itself
             first = int(self._is_scalar)
-            needed = f"shape {shape[first:]} [rad], {bounds}"
-            return ActionError(f"an action must have {needed}; got shape {given.shape[first:]}")
-        world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
-        needed = f"finite, {bounds}, shape {shape[1:]} a world"
-        return ActionError(f"an action must be {needed}; got {given[world]} in world {world}")
+            got = f"got shape {given.shape[first:]}"
+            problem = f"have shape {shape[first:]} [rad], {bounds}; {got}"
+        else:
+            world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
+            got = f"got {given[world]} in world {world}"
+            problem = f"be finite, {bounds}, shape {shape[1:]} a world; {got}"
+        return ActionError(f"an action must {problem}")
 
 
 def _joint_rules(period_s: float, kinds: Sequence[tuple[int | None, bool]]) -> Records:

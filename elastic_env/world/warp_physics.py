@@ -16,6 +16,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 from typing_extensions import override
 
 from elastic_env.core.errors import ConfigurationError, missing_extra, quote
@@ -29,7 +30,8 @@ try:
 except ImportError as error:
     raise missing_extra(str(error.name), "gpu", 'the backend "warp"') from None
 
-warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)  # no line per kernel
+# no line per kernel
+warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
 
 _CONTACTS = 16
 _ROWS = 64
@@ -54,7 +56,7 @@ _FULL = int(
 )
 
 
-def for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
+def for_warp(model: MjModel) -> MjModel:
     """The same plant in terms that MuJoCo Warp knows.
 
     It refuses PID actuators. A DC motor with K = R = 1 and these gains is one: its controller adds
@@ -69,10 +71,9 @@ def for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
     servos = np.flatnonzero(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_PID)
     integral_limit, slew_limit = model.actuator_dynprm[servos, :2].T
     if slew_limit.any():
-        raise ConfigurationError(
-            'the backend "warp" needs PID actuators with slewmax = 0, got'
-            f' {slew_limit.max():g} rad/s; choose the backend "mujoco"'
-        )
+        needed = 'the backend "warp" needs PID actuators with slewmax = 0'
+        got = f'got {slew_limit.max():g} rad/s; choose the backend "mujoco"'
+        raise ConfigurationError(f"{needed}, {got}")
     _, position_gain, velocity_gain = -model.actuator_biasprm[servos, :3].T
     integral_gain = model.actuator_gainprm[servos, 0]
     plant.actuator_dyntype[servos] = mujoco.mjtDyn.mjDYN_DCMOTOR
@@ -103,14 +104,15 @@ class WarpWorlds(Worlds):
         ConfigurationError: The device is not there, or the model has what MuJoCo Warp lacks.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_worlds: int, device: str | None = None) -> None:
+    def __init__(self, model: MjModel, num_worlds: int, device: str | None = None) -> None:
         self.model = model
         self.num_worlds = num_worlds
         self._device = _find_device(device or "cuda:0")
         self._said = set()
         self._views = {}
         self._friction = VaryingFriction.of(model)
-        self._counts = np.zeros((num_worlds, int(mujoco.mjtWarning.mjNWARNING)), dtype=np.int64)
+        warnings_known = int(mujoco.mjtWarning.mjNWARNING)
+        self._counts = np.zeros((num_worlds, warnings_known), dtype=np.int64)
         self._plant = for_warp(model)
         self._shapes = mujoco.MjData(model)
         self._bound: dict[str, Array] = {}
@@ -121,10 +123,10 @@ class WarpWorlds(Worlds):
             try:
                 self._model = mujoco_warp.put_model(self._plant)
             except (NotImplementedError, ValueError) as error:
-                raise ConfigurationError(f'the backend "warp" refuses the model: {error}') from None
-            self._data = mujoco_warp.make_data(
-                self._plant, nworld=num_worlds, nconmax=_CONTACTS, njmax=_ROWS
-            )
+                problem = f'the backend "warp" refuses the model: {error}'
+                raise ConfigurationError(problem) from None
+            memory = {"nconmax": _CONTACTS, "njmax": _ROWS}
+            self._data = mujoco_warp.make_data(self._plant, nworld=num_worlds, **memory)
         self._model.opt.warn_overflow = 0  # `_watch` warns
         self.qpos, self.qvel, self.act, _ = self.views(_STATE)
         self.ctrl = self.bind("ctrl")
@@ -167,7 +169,7 @@ class WarpWorlds(Worlds):
         return self._varied[field]
 
     @override
-    def take(self, world: int, model: mujoco.MjModel) -> None:
+    def take(self, world: int, model: MjModel) -> None:
         plant = for_warp(model)
         for name in {*_differing(model, self.model), *self._varied}:
             # names and sizes differ too, and the device has none
@@ -195,7 +197,8 @@ class WarpWorlds(Worlds):
 
     @override
     def _field(self, name: str) -> Array:
-        return self._varied[name] if name in self._varied else getattr(self.model, name)[None]
+        is_own = name in self._varied
+        return self._varied[name] if is_own else getattr(self.model, name)[None]
 
     @override
     def _step(self, num_substeps: int) -> None:
@@ -240,7 +243,8 @@ class WarpWorlds(Worlds):
             )
         shared = getattr(self._model, field)
         shape = (self.num_worlds, *shared.shape[1:])
-        setattr(self._model, field, warp.empty(shape, shared.dtype, device=self._device))
+        own = warp.empty(shape, shared.dtype, device=self._device)
+        setattr(self._model, field, own)
         self._graph = None  # it reads the shared row
 
     def _send(self) -> None:
@@ -257,12 +261,11 @@ class WarpWorlds(Worlds):
 
 
 @lru_cache(maxsize=1024)
-def _differing(model: mujoco.MjModel, other: mujoco.MjModel) -> tuple[str, ...]:
+def _differing(model: MjModel, other: MjModel) -> tuple[str, ...]:
     """Names of the arrays in which two models differ."""
-    arrays = [name for name in dir(model) if isinstance(getattr(model, name), np.ndarray)]
-    return tuple(
-        name for name in arrays if not np.array_equal(getattr(model, name), getattr(other, name))
-    )
+    pairs = [(name, getattr(model, name), getattr(other, name)) for name in dir(model)]
+    arrays = [pair for pair in pairs if isinstance(pair[1], np.ndarray)]
+    return tuple(name for name, own, its in arrays if not np.array_equal(own, its))
 
 
 def _find_device(name: str) -> Any:

@@ -19,6 +19,8 @@ class DynamixelBus(ServoBus):
     position_mode = 3
     full_replies = 2
     status_bytes = 11
+    word_bytes = 2
+    ping_bytes = 3
     patience_s = 0.003
     slowest_trip_s = 2.5e-3
 
@@ -34,20 +36,8 @@ class DynamixelBus(ServoBus):
 
     @override
     def ping(self, servo_id: int) -> ServoInfo:
-        reply = self._request(servo_id, packets.PING, b"", length=3)
+        reply = self.knock(servo_id)
         return ServoInfo(servo_id, int.from_bytes(reply[:2], "little"), reply[2])
-
-    @override
-    def knock(self, servo_id: int) -> None:
-        self.ping(servo_id)
-
-    @override
-    def _place(self, address: int, length: int) -> bytes:
-        return word(address) + word(length)
-
-    @override
-    def _place_to_write(self, address: int) -> bytes:
-        return word(address)
 
     @override
     def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
@@ -75,12 +65,3 @@ class DynamixelBus(ServoBus):
             has_alert=bool(error & packets.ALERT),
             data=bytes(received[9:-2]),
         )
-
-    @override
-    def _is_unheard(self, error: int) -> bool:
-        return error == packets.CRC_ERROR
-
-    @override
-    def _explain(self, error: int) -> str:
-        unknown = f"error {error}, which the protocol does not have"
-        return packets.STATUS_ERRORS.get(error, unknown)

@@ -28,6 +28,8 @@ class FeetechBus(ServoBus):
     position_mode = 0
     full_replies = 1
     status_bytes = 6
+    word_bytes = 1
+    ping_bytes = 0
     patience_s = 0.006
     slowest_trip_s = 5e-3
 
@@ -35,9 +37,9 @@ class FeetechBus(ServoBus):
         super().__init__(port, baudrate)
         self._parser = feetech_packets.Parser()
         self._received: deque[Packet] = deque()
-        known = [model for model in servo_models().values() if model.protocol == self.protocol]
-        registers = [known[0].table[name] for name in _WHO]
-        self._who = range(registers[0].address, registers[1].end)
+        known = [model for model in servo_models().values() if model.protocol == "feetech"]
+        first, last = (known[0].table[name] for name in _WHO)
+        self._who = range(first.address, last.end)
 
     @override
     def scan(self) -> list[ServoInfo]:
@@ -57,18 +59,6 @@ class FeetechBus(ServoBus):
         return ServoInfo(servo_id, int.from_bytes(reply[-2:], "little"), reply[0])
 
     @override
-    def knock(self, servo_id: int) -> None:
-        self._request(servo_id, packets.PING, b"", length=0)
-
-    @override
-    def _place(self, address: int, length: int) -> bytes:
-        return bytes([address, length])
-
-    @override
-    def _place_to_write(self, address: int) -> bytes:
-        return bytes([address])
-
-    @override
     def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
         wire = feetech_packets.packet(servo_id, instruction, data)
         self._parser = feetech_packets.Parser()
@@ -78,7 +68,8 @@ class FeetechBus(ServoBus):
             self.port.clearPort()
             sent = self.port.writePort(wire)
         if sent != len(wire):
-            raise ReplyError(f"cannot send at {self.name}: {sent} of {len(wire)} bytes were taken")
+            taken = f"{sent} of {len(wire)} bytes were taken"
+            raise ReplyError(f"cannot send at {self.name}: {taken}")
 
     @override
     def _receive(self) -> Status | None:
@@ -91,11 +82,3 @@ class FeetechBus(ServoBus):
         if not found.is_intact:
             return DAMAGED
         return Status(found.servo_id, 0, bool(found.instruction), found.parameters)
-
-    @override
-    def _is_unheard(self, error: int) -> bool:
-        return False
-
-    @override
-    def _explain(self, error: int) -> str:
-        return f"error {error}, which the protocol does not have"

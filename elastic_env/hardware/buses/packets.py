@@ -84,6 +84,11 @@ def crc16(data: bytes, crc: int = 0) -> int:
     return crc
 
 
+def explain_error(error: int) -> str:
+    """Words for the error number in a status."""
+    return STATUS_ERRORS.get(error, f"error {error}, which the protocol does not have")
+
+
 def stuff(body: bytes) -> bytes:
     """Instruction and parameters as they are sent: FD stands behind every FF FF FD."""
     return body.replace(_STUFFED, _STUFFED + b"\xfd")
@@ -97,11 +102,6 @@ def unstuff(body: bytes) -> bytes:
 def word(value: int) -> bytes:
     """Two bytes, the low one first, as addresses and lengths are sent."""
     return value.to_bytes(2, "little")
-
-
-def words(data: bytes) -> tuple[int, int]:
-    """The first two words of some bytes: in most instructions address and length."""
-    return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little")
 
 
 def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:

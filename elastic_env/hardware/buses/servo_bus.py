@@ -74,6 +74,12 @@ class ServoBus(ABC):
     """Status return level of a servo that answers every instruction."""
     status_bytes: ClassVar[int]
     """Length of a reply without data."""
+
+    word_bytes: ClassVar[int]
+    """Length of an address, and of a length, in an instruction."""
+
+    ping_bytes: ClassVar[int]
+    """Length of the data in the answer to a ping."""
     patience_s: ClassVar[float]
     """How long replies in motion may take beyond the time on the wire [s]."""
     slowest_trip_s: ClassVar[float]
@@ -129,21 +135,13 @@ class ServoBus(ABC):
             ReplyError: It does not answer.
         """
 
-    @abstractmethod
-    def knock(self, servo_id: int) -> None:
+    def knock(self, servo_id: int) -> bytes:
         """One request and its answer, as short as there are.
 
         Raises:
             ReplyError: It does not answer.
         """
-
-    @abstractmethod
-    def _place(self, address: int, length: int) -> bytes:
-        """Address and length of registers, as an instruction names them."""
-
-    @abstractmethod
-    def _place_to_write(self, address: int) -> bytes:
-        """Address of registers, as an instruction names them before their content."""
+        return self._request(servo_id, packets.PING, b"", length=self.ping_bytes)
 
     @abstractmethod
     def _transmit(self, servo_id: int, instruction: int, data: bytes) -> None:
@@ -153,13 +151,9 @@ class ServoBus(ABC):
     def _receive(self) -> Status | None:
         """The next reply; None if none comes in time."""
 
-    @abstractmethod
-    def _is_unheard(self, error: int) -> bool:
-        """True if an error says that the instruction arrived damaged: worth another try."""
-
-    @abstractmethod
-    def _explain(self, error: int) -> str:
-        """Words for an error."""
+    def _place(self, *numbers: int) -> bytes:
+        """Address of registers, and their length, as an instruction names them."""
+        return b"".join(number.to_bytes(self.word_bytes, "little") for number in numbers)
 
     def attach(self, ids: Sequence[int]) -> None:
         """Take servos into the cycle; each is asked for its model, which decides on its registers.
@@ -215,7 +209,7 @@ class ServoBus(ABC):
             ReplyError: No answer in three tries, or a refusal, with the servo's reason.
         """
         register = self.models[servo_id].table[name]
-        data = self._place_to_write(register.address) + register.encode(value)
+        data = self._place(register.address) + register.encode(value)
         self._request(servo_id, packets.WRITE, data, length=0)
 
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
@@ -277,7 +271,8 @@ class ServoBus(ABC):
         Nothing on models that have none.
         """
         if self.models[servo_id].has_watchdog:
-            self.write_register(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
+            counts = _WATCHDOG_COUNTS if is_on else 0
+            self.write_register(servo_id, "bus_watchdog", counts)
 
     def restore_effort(self) -> None:
         """Let the servos give all the torque that their settings allow; each confirms it.
@@ -342,8 +337,8 @@ class ServoBus(ABC):
         self._awaited.append(block)
         asked = self._place(block.start, len(block)) + bytes(self.ids)
         self._transmit(packets.BROADCAST, packets.SYNC_READ, asked)
-        wire_ms = self.port.tx_time_per_byte * len(self.ids) * (self.status_bytes + len(block))
-        longest_ms = wire_ms + 1e3 * timeout_s
+        length = len(self.ids) * (self.status_bytes + len(block))
+        longest_ms = self.port.tx_time_per_byte * length + 1e3 * timeout_s
         self.port.setPacketTimeoutMillis(longest_ms)
         replies: dict[int, bytes] = {}
         alerts: set[int] = set()
@@ -404,12 +399,12 @@ class ServoBus(ABC):
                     break
                 if reply.servo_id != servo_id:
                     continue
-                if self._is_unheard(reply.error):
-                    problem = f"says that {self._explain(reply.error)}"
-                    break
                 if reply.error:
-                    reason = self._explain(reply.error)
-                    raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
+                    reason = packets.explain_error(reply.error)
+                    if reply.error != packets.CRC_ERROR:
+                        raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
+                    problem = f"says that {reason}"
+                    break
                 if len(reply.data) == length:
                     return reply.data
             self._wait_for_silence()
@@ -481,8 +476,9 @@ class BusGroup:
             time.sleep(_LOWER_S)
             share = max(1.0 - (time.monotonic() - begin) / duration_s, 0.0)
             # most of the torque is not needed to hold the arm: cubed, it is gone early
-            calls = [partial(_call, partial(bus.limit_effort, share**3)) for bus in self.buses]
-            if all(isinstance(answer, HardwareError) for answer in self._call_all(calls)):
+            limits = [partial(bus.limit_effort, share**3) for bus in self.buses]
+            answers = self._call_all([partial(_call, limit) for limit in limits])
+            if all(isinstance(answer, HardwareError) for answer in answers):
                 return
 
     def torque_off(self, when_sent: Any = None) -> HardwareError | None:

@@ -6,17 +6,18 @@ protocol needs a row there and, if its registers differ, a table. Names of regis
 driver uses are the same in all tables.
 """
 
-import csv
 import functools
 import math
 from dataclasses import dataclass
-from importlib import resources
-from typing import Literal, NoReturn, get_args
+from pathlib import Path
+from typing import Literal, NoReturn, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from elastic_env.core.errors import unknown_name
+from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.joint.dynamixel import SERVO
@@ -33,11 +34,10 @@ LARGEST_TORQUE_NM = SERVO.torque_limit
 More hurts the gear.
 """
 
-_RPM = 2.0 * math.pi / 60.0
 Protocol = Literal["dynamixel", "feetech"]
 """Packets on the wire: Dynamixel Protocol 2.0, or that of Feetech's STS and SMS."""
 
-_PROTOCOLS: dict[str, Protocol] = {name: name for name in get_args(Protocol)}
+Row = TypeVar("Row")
 _TEMPERATURE = "present_temperature"
 _ERRORS: dict[Protocol, dict[int, str]] = {
     "dynamixel": {
@@ -135,27 +135,44 @@ class ServoModel:
     number: int
     name: str
     protocol: Protocol
-    table: ControlTable
+    registers: str
+    """File of its control table."""
+
     counts_per_turn: int
     zero_count: int
     """Count that is the angle zero: the middle of a servo that counts one turn from 0."""
-    velocity_unit: float
-    """One count of velocity [rad/s]."""
+    velocity_unit_rpm: float
+    """One count of velocity [rpm]."""
     load_register: str
     """Register of the current, or of the load where there is no current."""
-    current_unit: float
-    """One count of it as a current [A]."""
+    current_unit_ma: float
+    """One count of it as a current [mA]."""
     torque_per_ampere: float
     loss: float
     """Line from current to torque at the output: slope [N·m/A], and what is lost [N·m]."""
     largest_torque: float
     """Torque that the servo may give for long [N·m]."""
-    current_limit: str
+    current_limit: str = ""
     """Name of the register that limits the current, "" where nothing hurts the gear."""
-    effort_register: str
+    effort_register: str = ""
     """Register that limits the torque at once, in RAM; "" where there is none."""
-    effort_maximum: str
+    effort_maximum: str = ""
     """Register that bounds it, in EEPROM."""
+
+    @functools.cached_property
+    def table(self) -> ControlTable:
+        """Its registers."""
+        return _read_table(self.registers)
+
+    @property
+    def velocity_unit(self) -> float:
+        """One count of velocity [rad/s]."""
+        return self.velocity_unit_rpm * (2.0 * math.pi / 60.0)
+
+    @property
+    def current_unit(self) -> float:
+        """One count of `load_register` as a current [A]."""
+        return 1e-3 * self.current_unit_ma
 
     @property
     def position_unit(self) -> float:
@@ -180,7 +197,8 @@ class ServoModel:
 
     def current(self, torque: float) -> float:
         """Signed current [A] for a torque at the output [N·m]."""
-        return float(np.sign(torque) * (abs(torque) + self.loss) / self.torque_per_ampere)
+        effort = abs(torque) + self.loss
+        return float(np.sign(torque) * effort / self.torque_per_ampere)
 
     def explain_errors(self, status: int) -> str:
         """Words for a hardware error status, "" where there is none."""
@@ -218,7 +236,8 @@ class ServoModel:
 
         Nan where it has none.
         """
-        position, velocity, load = (self._decode(name, block, data) for name in self._motion)
+        counts = [self._decode(name, block, data) for name in self._motion]
+        position, velocity, load = counts
         degrees = math.nan
         if self.has_temperature(block):
             degrees = self._decode(_TEMPERATURE, block, data)
@@ -270,49 +289,17 @@ def servo_model(number: int) -> ServoModel:
 @functools.cache
 def servo_models() -> dict[int, ServoModel]:
     """All known servo types by model number."""
-    models = (
-        ServoModel(
-            number=int(row["model_number"]),
-            name=row["name"],
-            protocol=_PROTOCOLS[row["protocol"]],
-            table=_read_table(row["table"]),
-            counts_per_turn=int(row["counts_per_turn"]),
-            zero_count=int(row["zero_count"]),
-            velocity_unit=float(row["velocity_unit_rpm"]) * _RPM,
-            load_register=row["load_register"],
-            current_unit=1e-3 * float(row["current_unit_ma"]),
-            torque_per_ampere=float(row["torque_per_ampere"]),
-            loss=float(row["loss_nm"]),
-            largest_torque=float(row["torque_nm"]),
-            current_limit=row["current_limit"],
-            effort_register=row["effort_register"],
-            effort_maximum=row["effort_maximum"],
-        )
-        for row in _read_rows("models.csv")
-    )
-    return {model.number: model for model in models}
+    return {model.number: model for model in _read(ServoModel, "models.csv")}
 
 
 @functools.cache
 def _read_table(file: str) -> ControlTable:
-    registers = (
-        Register(
-            address=int(row["address"]),
-            size=int(row["size"]),
-            name=row["name"],
-            is_writable="W" in row["access"],
-            memory="EEPROM" if row["memory"] == "EEPROM" else "RAM",
-            initial=int(row["initial"] or 0),
-            is_signed=row["signed"] == "Y",
-            sign_bit=int(row["signed"]) if row["signed"].isdigit() else None,
-        )
-        for row in _read_rows(file)
-    )
-    in_order = sorted(registers, key=lambda register: register.address)
-    return ControlTable({register.name: register for register in in_order})
+    return ControlTable({register.name: register for register in _read(Register, file)})
 
 
-def _read_rows(file: str) -> list[dict[str, str]]:
-    path = resources.files("elastic_env.hardware.buses") / file
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
+def _read(kind: type[Row], file: str) -> list[Row]:
+    """Rows of a table beside this file as what they describe; empty cells are not given."""
+    rows = read_rows(Path(__file__).with_name(file))
+    given = [{column: cell for column, cell in row.items() if cell} for row in rows]
+    read = TypeAdapter(kind).validate_python
+    return [read(row) for row in given]

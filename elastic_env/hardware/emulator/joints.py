@@ -1,11 +1,10 @@
 """The joints behind emulated servos, in real time: pendulums of the testbed, or an arm."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
@@ -46,8 +45,9 @@ class ServoJoints:
         n = len(joints)
         self._simulation = simulate(model, worlds, num_threads=1)
         self._at = JointAddresses.of(model, joints)
-        self._world: IntArray = np.arange(n) if worlds > 1 else np.zeros(n, dtype=np.int64)
-        self._actuator = np.array([model.actuator(servo_name(name)).id for name in joints])
+        self._world: IntArray = np.arange(n) * int(worlds > 1)
+        actuators = [model.actuator(servo_name(name)).id for name in joints]
+        self._actuator = np.array(actuators)
         self._force = self._simulation.bind("actuator_force")
         self._range = self._simulation.vary("actuator_forcerange")
         self._torque_limits = [servo.torque_limit for servo in servos]
@@ -125,8 +125,8 @@ class Joints(ServoJoints):
             cure = "leave `motor` of its servo out, or emulate an arm"
             raise ConfigurationError(f"{problem}; {cure}")
         spec = elastic_spec(config.true_pendulum, joint, config.form, config.timestep_s)
-        names = [JOINT] * num_joints
-        super().__init__(spec.compile(), names, [joint.servo] * num_joints, num_joints, start_s)
+        n = num_joints
+        super().__init__(spec.compile(), [JOINT] * n, [joint.servo] * n, n, start_s)
 
 
 class EmulatedArm(Model):
@@ -145,12 +145,11 @@ class EmulatedArm(Model):
     home: dict[str, float] = {}
     """Where the arm lies until torque goes on for the first time, by joint [rad]."""
 
-    @model_validator(mode="after")
-    def _lists_agree(self) -> Self:
+    def _check(self) -> None:
         lengths = {len(self.order), len(self.direction), len(self.zero_rad)}
         if len(lengths) > 1:
-            raise ValueError(f"order, direction and zero_rad must be equally long, got {lengths}")
-        return self
+            lists = "order, direction and zero_rad"
+            raise ValueError(f"{lists} must be equally long, got {lengths}")
 
 
 class ArmJoints(ServoJoints):
@@ -167,7 +166,8 @@ class ArmJoints(ServoJoints):
     """
 
     def __init__(self, arm: EmulatedArm, start_s: float) -> None:
-        config = configure_robot(arm.model, arm.joints, "hold", home=dict(arm.home) or None)
+        home = arm.home or None
+        config = configure_robot(arm.model, arm.joints, "hold", home=home)
         joints: dict[str, ElasticJoint] = config.true_joints
         for name in arm.order:
             if name not in joints or joints[name].servo is None:
@@ -175,7 +175,8 @@ class ArmJoints(ServoJoints):
                     f"the emulated joint {name!r} has no elastic joint with a servo; there are"
                     f" {', '.join(joints)}"
                 )
-        servos = [servo for name in arm.order if (servo := joints[name].servo) is not None]
+        found = [joints[name].servo for name in arm.order]
+        servos = [servo for servo in found if servo is not None]
         spec = config.robot.elastic(config)
         spec.option.timestep = _ARM_STEP_S
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -184,8 +185,8 @@ class ArmJoints(ServoJoints):
         self._direction = np.array(arm.direction, dtype=np.float64)
         self._zero = np.array(arm.zero_rad)
         super().__init__(spec.compile(), arm.order, servos, 1, start_s)
-        home = dict(zip(config.robot.joints, config.robot.home or (), strict=False))
-        lying = [home.get(name, 0.0) for name in arm.order]
+        places = dict(zip(config.robot.joints, config.robot.home or (), strict=False))
+        lying = [places.get(name, 0.0) for name in arm.order]
         self._simulation.qpos[0, self._at.q] = lying
         self._simulation.qpos[0, self._at.theta] = lying
 
@@ -198,7 +199,8 @@ class ArmJoints(ServoJoints):
 
     def command(self, index: int, angle: float) -> None:
         """See `ServoJoints`."""
-        super().command(index, float(self._direction[index] * (angle - self._zero[index])))
+        turned = angle - self._zero[index]
+        super().command(index, float(self._direction[index] * turned))
 
     def set_torque(self, index: int, share: float) -> None:
         """See `ServoJoints`."""

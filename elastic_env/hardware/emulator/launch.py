@@ -4,10 +4,9 @@ import json
 import subprocess
 import termios
 from contextlib import AbstractContextManager
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.buses import packets
@@ -117,20 +116,18 @@ class EmulatorConfig(Model):
     seed: int = quantity("1", 0, ge=0)
     """Seed of faults and noise [1]."""
 
-    @model_validator(mode="after")
-    def _servos_exist(self) -> Self:
+    def _check(self) -> None:
         model = servo_model(self.model_number)
         for name in self.registers:
             _ = model.table[name]
         if self.arm is not None and len(self.arm.order) != len(self.ids):
-            count = f"{len(self.ids)} ids for {len(self.arm.order)} joints"
-            raise ValueError(f"an emulated arm needs one id for each of its joints, got {count}")
+            got = f"got {len(self.ids)} ids for {len(self.arm.order)} joints"
+            raise ValueError(f"an emulated arm needs one id for each of its joints, {got}")
         if not hasattr(termios, f"B{self.rate}"):
             raise ValueError(
                 f"a pseudo-terminal has no rate of {self.rate} bit/s; it has {packets.RATES}"
             )
         packets.require_ids(self.ids)
-        return self
 
     @property
     def rate(self) -> int:
@@ -168,8 +165,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         Monotonic time, id, register, value [count]; `present_position` is what a state that was
         asked for is to tell.
         """
-        events = self._request({"events": True})
-        return [(float(t), int(i), str(name), int(count)) for t, i, name, count in events]
+        return [tuple(event) for event in self._request({"events": True})]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""

@@ -113,8 +113,8 @@ class Emulator:
         for index, servo_id in enumerate(config.ids):
             motion = partial(self._joints.motion, index)
             note = partial(self._note, index)
-            servo = EmulatedServo(servo_id, model, note, claimed, motion, config.registers)
-            self._servos.append(servo)
+            shared = (note, claimed, motion, config.registers)
+            self._servos.append(EmulatedServo(servo_id, model, *shared))
         self._bus = EmulatedBus(self._servos)
         self._imu = EmulatedImu(config, now)
         self._parser = self._bus.wire.parser()

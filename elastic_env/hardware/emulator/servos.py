@@ -3,10 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from elastic_env.hardware.buses import packets
-from elastic_env.hardware.buses.packets import Packet
-from elastic_env.hardware.buses.servo_models import OVERLOAD, Register, ServoModel
-from elastic_env.hardware.emulator.wires import WIRES, is_ping_to_all
+from elastic_env.hardware.buses import feetech_packets, packets
+from elastic_env.hardware.buses.packets import Packet, word
+from elastic_env.hardware.buses.servo_models import OVERLOAD, Protocol, Register, ServoModel
 
 Notify = Callable[[int, str, int], None]
 
@@ -125,11 +124,14 @@ class EmulatedServo:
         wire = WIRES[self.model.protocol]
         match instruction:
             case packets.PING:
-                return wire.status(self, self._alert, wire.greeting(self))
-            case packets.READ if len(parameters) == wire.place_bytes:
+                version = word(self["model_number"]) + bytes([self["firmware_version"]])
+                return wire.status(self, self._alert, version if wire.is_talkative else b"")
+            case packets.READ if len(parameters) == 2 * wire.word_bytes:
                 return wire.status(self, *self.read_memory(*wire.place(parameters)))
-            case packets.WRITE if len(parameters) > wire.place_bytes // 2:
-                return wire.status(self, self.write_memory(*wire.written(parameters)))
+            case packets.WRITE if len(parameters) > wire.word_bytes:
+                address, _ = wire.place(parameters)
+                data = parameters[wire.word_bytes :]
+                return wire.status(self, self.write_memory(address, data))
             case _:
                 return wire.status(self, packets.INSTRUCTION_ERROR | self._alert)
 
@@ -197,7 +199,8 @@ class EmulatedServo:
         they do not.
         """
         if name == "goal_position" and self.model.protocol == "feetech":
-            value = min(max(value, self["min_position_limit"]), self["max_position_limit"])
+            value = max(value, self["min_position_limit"])
+            value = min(value, self["max_position_limit"])
         self[name] = value
         if name in (*_SWITCHES, self.model.effort_register):
             self.notify(self.servo_id, name, value)
@@ -205,6 +208,47 @@ class EmulatedServo:
     @property
     def _alert(self) -> int:
         return packets.ALERT if self["hardware_error_status"] else 0
+
+
+@dataclass(frozen=True)
+class Wire:
+    """How servos of a protocol speak.
+
+    Attributes:
+        word_bytes: Length of an address, and of a length, in an instruction.
+        parser: Of instructions.
+        status: A reply of a servo; its error is that of Protocol 2.0, with its alert bit.
+        is_talkative: Whether a ping tells the model, and damaged instructions are complained of.
+    """
+
+    word_bytes: int
+    parser: type[packets.Parser]
+    status: Callable[..., bytes]
+    is_talkative: bool
+
+    def place(self, parameters: bytes) -> tuple[int, int]:
+        """Address and length at the beginning of an instruction."""
+        length = self.word_bytes
+        numbers = (parameters[:length], parameters[length : 2 * length])
+        address, size = (int.from_bytes(number, "little") for number in numbers)
+        return address, size
+
+
+def _dynamixel_status(servo: EmulatedServo, error: int, data: bytes = b"") -> bytes:
+    return packets.status(servo.servo_id, error, data)
+
+
+def _feetech_status(servo: EmulatedServo, _: int, data: bytes = b"") -> bytes:
+    """Nobody says how these servos refuse an instruction; here such a reply has no data."""
+    status = servo["hardware_error_status"]
+    return feetech_packets.packet(servo.servo_id, status, data)
+
+
+WIRES: dict[Protocol, Wire] = {
+    "dynamixel": Wire(2, packets.Parser, _dynamixel_status, is_talkative=True),
+    "feetech": Wire(1, feetech_packets.Parser, _feetech_status, is_talkative=False),
+}
+"""How servos speak, by protocol."""
 
 
 class EmulatedBus:
@@ -224,20 +268,25 @@ class EmulatedBus:
             servo.hear(now_s)
         one = self.servos.get(packet.servo_id)
         if not packet.is_intact:
-            return [] if one is None else self.wire.complaint(one)
+            if one is None or not self.wire.is_talkative:
+                return []
+            return [self.wire.status(one, packets.CRC_ERROR)]
         parameters = packet.parameters
-        begin = self.wire.place_bytes
+        begin = 2 * self.wire.word_bytes
         match packet.instruction:
             case packets.SYNC_READ:
                 place = self.wire.place(parameters)
                 asked = [self.servos[i] for i in parameters[begin:] if i in self.servos]
-                return [self.wire.status(each, *each.read_memory(*place)) for each in asked]
+                return [self.wire.status(one, *one.read_memory(*place)) for one in asked]
             case packets.SYNC_WRITE:
                 address, length = self.wire.place(parameters)
                 for at in range(begin, len(parameters) - length, length + 1):
                     if servo := self.servos.get(parameters[at]):
-                        servo.write_memory(address, parameters[at + 1 : at + 1 + length])
+                        data = parameters[at + 1 : at + 1 + length]
+                        servo.write_memory(address, data)
                 return []
-        found = sorted(self.servos) if is_ping_to_all(packet) else [packet.servo_id]
+        is_ping = packet.instruction == packets.PING
+        is_to_all = is_ping and packet.servo_id == packets.BROADCAST
+        found = sorted(self.servos) if is_to_all else [packet.servo_id]
         reached = [self.servos[i] for i in found if i in self.servos]
         return [each.answer(packet.instruction, parameters) for each in reached]

@@ -205,7 +205,8 @@ class Guard:
     def _ends(self, are: BoolArray, between: str) -> str:
         """Ranges of the goals of some servos [rad], each once."""
         ends = zip(self._lowest[are], self._highest[are], strict=True)
-        return ", ".join(dict.fromkeys(f"{low:.3f}{between}{high:.3f}" for low, high in ends))
+        ranges = [f"{low:.3f}{between}{high:.3f}" for low, high in ends]
+        return ", ".join(dict.fromkeys(ranges))
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:
         """Names of some servos, with their values."""
@@ -222,7 +223,8 @@ def explain_heat(which: str, hottest: Array) -> str:
         which: Their names with their temperatures [°C].
         hottest: Temperature that each may have, (n,) [°C].
     """
-    allowed = ", ".join(dict.fromkeys(f"{degrees:g}" for degrees in np.atleast_1d(hottest)))
+    limits = [f"{degrees:g}" for degrees in np.atleast_1d(hottest)]
+    allowed = ", ".join(dict.fromkeys(limits))
     return (
         f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own "
         "temperature_limit); let it cool, and look for what it has to hold or what blocks it"

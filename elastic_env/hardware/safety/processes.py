@@ -87,14 +87,10 @@ def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, 
         environment: Variables by name, default those of this program.
     """
     found = environment.get(_PATH, "").split(os.pathsep)
-    entries = [entry for entry in found if not _is_here(entry)]
+    here = os.path.realpath(".")  # which an empty entry means too
+    entries = [entry for entry in found if entry and os.path.realpath(entry) != here]
     others = {name: value for name, value in environment.items() if name != _PATH}
     return {**others, _PATH: os.pathsep.join(entries)} if entries else others
-
-
-def _is_here(entry: str) -> bool:
-    """True if an entry of PYTHONPATH is the working directory, which an empty one means too."""
-    return not entry or os.path.realpath(entry) == os.path.realpath(".")
 
 
 def _folder(package: str) -> Path:

@@ -273,7 +273,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             how = f"ended (exit code {self._process.poll()})"
         else:
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
-        outcome = emergency_stop(self._ports, self._baudrate, self.models, self._protocol)
+        known = (self._baudrate, self.models, self._protocol)
+        outcome = emergency_stop(self._ports, *known)
         return FaultError(f"the supervisor process {how}; {outcome}")
 
 

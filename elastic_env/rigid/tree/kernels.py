@@ -361,8 +361,9 @@ def lift(links: Any, loads: Any, rows: int) -> None:
         above = links[link["parent"]]
         R = matrix(link["R"])
         for row in range(rows):
-            up = into_link(R, link["cosine"][row], link["sine"][row], at(above["up"], row))
-            put(link["up"], row, up)
+            c = link["cosine"][row]
+            s = link["sine"][row]
+            put(link["up"], row, into_link(R, c, s, at(above["up"], row)))
 
 
 @compiled

@@ -6,6 +6,7 @@ from typing import Any, Self
 
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.kernels import LINK
@@ -30,7 +31,7 @@ class Tree:
     R: Array
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, joints: Sequence[str], held: Held, root: int = 0) -> Self:
+    def of(cls, model: MjModel, joints: Sequence[str], held: Held, root: int = 0) -> Self:
         """Of a model whose other joints are held.
 
         Args:
@@ -71,7 +72,7 @@ class Tree:
         return links
 
 
-def _carriers(model: mujoco.MjModel, moving: Sequence[int]) -> list[int]:
+def _carriers(model: MjModel, moving: Sequence[int]) -> list[int]:
     """Link that every body moves with: that of its last moving joint, or of its parent."""
     last = {int(model.jnt_bodyid[j]): i for i, j in enumerate(moving, start=1)}
     carrier = [0]

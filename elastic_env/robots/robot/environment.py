@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-import mujoco
+from mujoco import MjModel
 
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, quote, require_known
@@ -137,9 +137,8 @@ def joint_robot(
     mass = float(rigid.body_subtreemass[0])
     elastic = own_joints.elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
-        raise ConfigurationError(
-            "encoder_counts_per_turn must be the same for all joints; give it under '*'"
-        )
+        needed = "encoder_counts_per_turn must be the same for all joints"
+        raise ConfigurationError(f"{needed}; give it under '*'")
     return JointRobot(
         NAME,
         RigidModel(model, tuple(names)),
@@ -150,7 +149,7 @@ def joint_robot(
     )
 
 
-def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
+def _elastic_hinges(model: MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
     """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
     hinges = supported.hinges_of(model)
     if not isinstance(joints, Mapping | str | Path):

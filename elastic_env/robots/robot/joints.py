@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjSpec
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -96,7 +97,7 @@ def elastic_settings(
 
 
 def elastic_joints(
-    spec: mujoco.MjSpec, settings: Mapping[str, JointSettings], load_kg: float
+    spec: MjSpec, settings: Mapping[str, JointSettings], load_kg: float
 ) -> dict[str, ElasticJoint]:
     """Elastic joints from what is given, what the model says, and defaults.
 
@@ -150,7 +151,7 @@ class _Links:
     together: float
 
 
-def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Array, Array, Array]:
+def _inertias(model: MjModel, names: list[str], poses: Array) -> tuple[Array, Array, Array]:
     """Least and most inertia, and that of all together, as `_Links` has them, (n,) each [kg·m²]."""
     data = mujoco.MjData(model)
     at = [int(model.joint(name).id) for name in names]
@@ -185,7 +186,7 @@ class _Assumed:
             values.
     """
 
-    model: mujoco.MjModel
+    model: MjModel
     name: str
     own: JointSettings
     links: _Links
@@ -315,9 +316,7 @@ def _first(*values: float | None) -> float:
     return next(float(value) for value in values if value is not None)
 
 
-def drawn_poses(
-    model: mujoco.MjModel, joints: list[str], count: int = _POSES, seed: int = 0
-) -> Array:
+def drawn_poses(model: MjModel, joints: list[str], count: int = _POSES, seed: int = 0) -> Array:
     """Poses within the ranges of the joints, or within half a turn about home, (count, n) [rad]."""
     lowest, highest = joint_ranges(model, joints)
     home = home_of_joints(model, joints)
@@ -327,7 +326,7 @@ def drawn_poses(
     return generator.uniform(lowest, highest, (count, len(joints)))
 
 
-def home_of_joints(model: mujoco.MjModel, joints: list[str]) -> Array:
+def home_of_joints(model: MjModel, joints: list[str]) -> Array:
     """The first keyframe or the model's reference, a tenth inside the joint ranges, (n,) [rad].
 
     That is 0.1 rad where only one side has a limit.

@@ -68,9 +68,8 @@ class RigidModel:
             # they were said when it was read for the first time
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                self._spec = _bare(
-                    hold_other_joints(read_robot(self._model), self._joints), self._joints
-                )
+                moving = hold_other_joints(read_robot(self._model), self._joints)
+                self._spec = _bare(moving, self._joints)
         return self._spec.copy()
 
     def __getstate__(self) -> dict[str, Any]:

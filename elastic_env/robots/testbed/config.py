@@ -67,10 +67,8 @@ class TestbedConfig(JointConfig):
 
     def _require_feasible(self, joint: ElasticJoint, pendulum: Pendulum) -> None:
         if joint.servo is None:
-            raise ConfigurationError(
-                "the testbed's joint needs a servo, got None; see"
-                " elastic_env.joint.elasticity.Servo"
-            )
+            problem = "the testbed's joint needs a servo, got None"
+            raise ConfigurationError(f"{problem}; see elastic_env.joint.elasticity.Servo")
         robot = self._robot_model(joint, pendulum)
         if not self.reference.is_random:
             plan = self.reference.plan(np.random.default_rng(0), self.control_period_s)

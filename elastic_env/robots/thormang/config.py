@@ -2,11 +2,9 @@
 
 import copy
 from functools import lru_cache, partial
-from typing import Self
 
-import mujoco
 import numpy as np
-from pydantic import model_validator
+from mujoco import MjModel
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
@@ -77,48 +75,35 @@ class WalkConfig(TaskConfig):
     spare_bodies: int = quantity("1", 0, ge=0)
     """Massless bodies on the torso, which give robots with other loads as many bodies [1]."""
 
-    @model_validator(mode="after")
-    def _joints_are_plain(self) -> Self:
+    def _check(self) -> None:
         if any(varies(one) or (one.servo and one.servo.motor) for one in self.joints):
             raise ValueError(
                 "joints of the walker must have neither load_friction nor static_friction nor a"
                 " motor, which its plan and policies do not know; the testbed and Robot-v0 do"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _walks_can_be_shorter(self) -> Self:
-        fewest = self.fewest_steps
-        if fewest is None:
-            return self
-        if not self.gait.is_in_place:
-            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         most = self.gait.num_steps
+        fewest = self.fewest_steps or most
+        if self.fewest_steps and not self.gait.is_in_place:
+            raise ValueError("fewest_steps is for walks in place, whose strides are all alike")
         if fewest > most or (most - fewest) % 2:
             raise ValueError(
                 f"fewest_steps must be num_steps = {most} less whole strides of two steps, got"
                 f" {fewest}"
             )
-        return self
+        frictions = {own.friction_scale: own.name for own in self.scenarios}
+        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
+        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
+        for name, values in known.items():
+            if len(values) > 1:
+                given = " and ".join(f"{one:g} of {own!r}" for one, own in values.items())
+                needed = f"the scenarios of all worlds must have the same {name}"
+                raise ValueError(f"{needed}, got {given}")
 
     @property
     def numbers_of_steps(self) -> range:
         """Numbers of steps that a walk can have."""
         most = self.gait.num_steps
-        return range(most if self.fewest_steps is None else self.fewest_steps, most + 1, 2)
-
-    @model_validator(mode="after")
-    def _worlds_know_the_same(self) -> Self:
-        frictions = {own.friction_scale: own.name for own in self.scenarios}
-        rates = {own.pelvis_imu.rate_hz: own.name for own in self.scenarios}
-        known = {"friction_scale": frictions, "rate_hz of pelvis_imu": rates}
-        for name, values in known.items():
-            given = " and ".join(f"{value:g} of {own!r}" for value, own in values.items())
-            if len(values) > 1:
-                raise ValueError(
-                    f"the scenarios of all worlds must have the same {name}, got {given}"
-                )
-        return self
+        return range(self.fewest_steps or most, most + 1, 2)
 
     def of_each_scenario(self) -> "list[WalkConfig]":
         """Configurations of the scenarios, in the order in which these first occur."""
@@ -152,10 +137,10 @@ class WalkConfig(TaskConfig):
         load_kg = self.robot.torso_load_kg + self.scenario.shoulder_load_kg
         return self.robot.replace(torso_load_kg=load_kg)
 
-    def true_model(self) -> mujoco.MjModel:
+    def true_model(self) -> MjModel:
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
-        joints = self.true_joints
-        spec = thormang.elastic_spec(self.true_robot, joints, self.form, self.timestep_s)
+        own = (self.true_joints, self.form, self.timestep_s)
+        spec = thormang.elastic_spec(self.true_robot, *own)
         if self.scenario.places_loads:
             thormang.add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
         for number in range(self.spare_bodies):
@@ -179,7 +164,7 @@ def require_stable_walker(config: WalkConfig) -> None:
 
 
 @lru_cache(maxsize=_SETTLED)
-def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel, Equilibrium]:
+def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[MjModel, Equilibrium]:
     """The plant of a robot of the bank, and where it rests under zero offset; found once.
 
     Raises:
@@ -193,12 +178,11 @@ def placed_robot(config: WalkConfig, robot: DrawnRobot) -> tuple[mujoco.MjModel,
     except ElasticError as error:
         if config.scenario.has_one_robot:
             raise
-        raise ConfigurationError(
-            f"the drawn robot {robot} cannot walk: {error}; narrow the ranges"
-        ) from None
+        problem = f"the drawn robot {robot} cannot walk: {error}"
+        raise ConfigurationError(f"{problem}; narrow the ranges") from None
 
 
-def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
+def drawn_model(config: WalkConfig, robot: DrawnRobot) -> MjModel:
     """The plant of a robot of the bank."""
     undrawn = undrawn_model(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     springs = spring_ids(undrawn, LEG_JOINTS, config.form)
@@ -215,7 +199,7 @@ def drawn_model(config: WalkConfig, robot: DrawnRobot) -> mujoco.MjModel:
 
 
 @lru_cache(maxsize=64)
-def undrawn_model(config: WalkConfig) -> mujoco.MjModel:
+def undrawn_model(config: WalkConfig) -> MjModel:
     """The plant, what is drawn aside, compiled once."""
     return config.true_model()
 

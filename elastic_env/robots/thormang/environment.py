@@ -16,8 +16,8 @@ from elastic_env.robots.thormang.task import WalkTask
 from elastic_env.world.robot_model import read_stiffness, with_stiffness
 from elastic_env.world.scenario import Scenario, make_scenario
 
-_OF_STEP_PERIOD = ("double_support_s", "single_support_s", "last_double_support_s", "num_steps")
-_GAIT = tuple(name for name in Gait.model_fields if name not in _OF_STEP_PERIOD)
+_GAIT = list(Gait.model_fields)[4:]
+"""Parameters behind the durations and the number of steps."""
 
 
 def configure_walk(

@@ -1,14 +1,17 @@
 """The walker as it is drawn: shapes on its links, solid, and translucent for the plan."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjsGeom, MjSpec
 
+from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
 from elastic_env.rendering.picture import CAMERA, Rgba, set_stage
-from elastic_env.robots.thormang.model import SIDES, Thormang, read_rows, rigid_spec
+from elastic_env.robots.thormang.model import SIDES, Thormang, rigid_spec
 
 PLAN = "plan_"
 """Prefix of the names of the translucent robot."""
@@ -44,7 +47,7 @@ follows it.
 """
 
 
-def display_spec(robot: Thormang) -> mujoco.MjSpec:
+def display_spec(robot: Thormang) -> MjSpec:
     """A model for drawing only: robot, plan with the prefix `PLAN`, floor, markers."""
     spec = _dress(robot, is_plan=False)
     set_stage(spec, _SIZE, _SIZE)
@@ -60,14 +63,14 @@ def display_spec(robot: Thormang) -> mujoco.MjSpec:
     return spec
 
 
-def solid_spec(robot: Thormang) -> mujoco.MjSpec:
+def solid_spec(robot: Thormang) -> MjSpec:
     """The robot alone, without floor and light."""
     spec = _dress(robot, is_plan=False)
     spec.delete(spec.body("floor"))
     return spec
 
 
-def set_floor_and_light(spec: mujoco.MjSpec) -> None:
+def set_floor_and_light(spec: MjSpec) -> None:
     """Add to a scene what lies under the robot and above it."""
     spec.worldbody.add_body(name="floor").add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05]
@@ -76,14 +79,14 @@ def set_floor_and_light(spec: mujoco.MjSpec) -> None:
     _add_light(spec)
 
 
-def _dress(robot: Thormang, is_plan: bool) -> mujoco.MjSpec:
+def _dress(robot: Thormang, is_plan: bool) -> MjSpec:
     """The robot's links with the shapes of `shapes.csv`; the solid one brings the floor."""
     spec = rigid_spec(robot)
     for site in list(spec.sites):
         spec.delete(site)
     if is_plan:
         spec.delete(spec.body("floor"))
-    for row in read_rows("shapes.csv"):
+    for row in read_rows(Path(__file__).with_name("shapes.csv")):
         size = [float(number) for number in row["size_m"].split()]
         if row["link"] == "pelvis" and row["kind"] == "block":
             size[1] = robot.hip_half_spacing + _BESIDE_HIP_M
@@ -103,7 +106,7 @@ def _inset(lengths: Any, is_plan: bool) -> list[float]:
     return [max(length - _PLAN_INSET_M, length / 2) for length in lengths]
 
 
-def _add_shape(spec: mujoco.MjSpec, row: Mapping[str, str], size: list[float]) -> mujoco.MjsGeom:
+def _add_shape(spec: MjSpec, row: Mapping[str, str], size: list[float]) -> MjsGeom:
     """A sphere, cylinder, capsule, box, or block, whose edges are the rounder, 0 to 1."""
     kind = row["kind"]
     place: dict[str, Any] = {"pos": [float(x) for x in row["place_m"].split()]}
@@ -123,7 +126,7 @@ def _add_shape(spec: mujoco.MjSpec, row: Mapping[str, str], size: list[float]) -
     return spec.body(row["link"]).add_geom(type=shape, mass=0.0, **place)
 
 
-def _add_floor(spec: mujoco.MjSpec) -> None:
+def _add_floor(spec: MjSpec) -> None:
     """A light floor with a grid."""
     texture = spec.add_texture(name="grid", width=128, height=128)
     texture.type = mujoco.mjtTexture.mjTEXTURE_2D
@@ -138,16 +141,17 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     spec.geom("floor").material = "floor"
 
 
-def _add_marker(spec: mujoco.MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
+def _add_marker(spec: MjSpec, name: str, radius: float, height: float, rgba: Rgba) -> None:
     """A disc on the floor, higher than the soles, so that one sees it under a foot."""
     spec.add_material(name=name, rgba=rgba, emission=0.25, specular=0.0)
-    disc = spec.worldbody.add_body(name=name, mocap=True).add_geom(name=name, material=name)
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    disc = body.add_geom(name=name, material=name)
     disc.type = mujoco.mjtGeom.mjGEOM_CYLINDER
     disc.size = [radius, height / 2, 0]
     disc.pos = [0, 0, height / 2]
 
 
-def _add_light(spec: mujoco.MjSpec) -> None:
+def _add_light(spec: MjSpec) -> None:
     """Light from above with a shadow, which shows where the feet leave the floor."""
     spec.stat.extent = 1.6
     spec.stat.center = _TARGET

@@ -1,5 +1,8 @@
 """The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from `legs.csv`.
 
+That table has links, parents before children, in the link frame and SI units. The column `joint` is
+"fixed", "floating" or the name of a hinge.
+
 All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between
 the hip axes. x forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs.
 Sources (public GitHub repositories):
@@ -13,7 +16,6 @@ Sources (public GitHub repositories):
 * joint limits: THORMANG3, assumed for this robot.
 """
 
-import csv
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -21,8 +23,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco import MjModel, MjsBody, MjSpec
 
 from elastic_env.core.config import Model, quantity
+from elastic_env.core.files import read_rows
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
@@ -78,28 +82,18 @@ def biped(robot: Thormang) -> Biped:
     return Biped(rigid, LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
 
 
-def read_rows(table: str) -> list[dict[str, str]]:
-    """Rows of a table beside this file.
-
-    `legs.csv` has links, parents before children, in the link frame and SI units. The column
-    `joint` is "fixed", "floating" or the name of a hinge.
-    """
-    text = Path(__file__).with_name(table).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
-
-
 def _numbers(row: dict[str, str], *columns: str) -> Array:
     return np.array([float(row[column]) for column in columns])
 
 
-def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
+def rigid_spec(robot: Thormang, floating: bool = True) -> MjSpec:
     """The robot with rigid joints and no actuator, all inertias explicit, standing over a floor.
 
     Args:
         robot: Options.
         floating: Whether the pelvis is free; False fixes it in the air, for checks of the legs.
     """
-    spec = mujoco.MjSpec()
+    spec = MjSpec()
     spec.modelname = "thormang"
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -108,7 +102,7 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     spec.option.impratio = 10.0
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     bodies = {"world": spec.worldbody}
-    for row in read_rows("legs.csv"):
+    for row in read_rows(Path(__file__).with_name("legs.csv")):
         joint = row["joint"]
         position = _numbers(row, "x_m", "y_m", "z_m")
         if joint.endswith("hip_yaw"):
@@ -145,7 +139,7 @@ def elastic_spec(
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     timestep_s: float = 1e-3,
-) -> mujoco.MjSpec:
+) -> MjSpec:
     """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
 
     Args:
@@ -169,7 +163,7 @@ DRAWN_LOAD = "drawn_load"
 """Body of the load that a scenario draws."""
 
 
-def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoco.MjsBody:
+def add_load(spec: MjSpec, name: str, mass: float, place: Array) -> MjsBody:
     """Fix a load to the upper body; its body.
 
     Args:
@@ -186,7 +180,7 @@ def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> mujoc
     return load
 
 
-def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
+def place_load(model: MjModel, mass: float, place: Array) -> None:
     """Change mass and place of the `DRAWN_LOAD` in a compiled model, as `add_load` has them."""
     load = model.body(DRAWN_LOAD)
     load.mass[:] = mass
@@ -195,7 +189,7 @@ def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
+def _add_sole(foot: MjsBody, side: str, friction: float) -> None:
     """Box sole and the site of the force-torque sensor at the ankle."""
     sole = foot.add_geom(name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, mass=0.0)
     sole.size = [*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS]

@@ -72,7 +72,8 @@ class Posture:
     def of_plan(cls, plan: WalkPlan, row: int) -> "Posture":
         """That of the plan, with pelvis and feet level."""
         R = rotation_z(plan.heading[row])
-        return cls(plan.pelvis[row], R, plan.ankles[row], rotation_z(plan.foot_yaw[row]))
+        feet_R = rotation_z(plan.foot_yaw[row])
+        return cls(plan.pelvis[row], R, plan.ankles[row], feet_R)
 
     def joint_angles(self, robot: Biped) -> Array:
         """Its joint angles, (12,) [rad]; of a straight leg where a foot is out of reach."""

@@ -8,38 +8,35 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.tables import GROUPS, MEASURED
 from elastic_env.world.robot_model import WalkerModel
-from elastic_env.world.rows import COURSE, REAL, WHOLE, record_type
+from elastic_env.world.rows import COURSE, REAL, WHOLE, reals, record_type
 
 _FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
 
 TRUTH = record_type(
     *COURSE,
-    ("servo_torque", REAL),  # rms over the joints [N·m]
-    ("pelvis", REAL, 3),
-    ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
-    ("pelvis_velocity", REAL, 3),  # of its origin, where the IMU is, in the world [m/s]
-    ("pelvis_rate", REAL, 3),  # in the frame of the pelvis [rad/s]
-    ("roll", REAL),
-    ("pitch", REAL),
-    ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
-    ("ankles", REAL, (2, 3)),  # positions [m]
+    *reals("servo_torque"),  # rms over the joints [N·m]
+    *reals("pelvis", 3),  # position [m]
+    *reals("quaternion", 4),  # orientation w, x, y, z
+    # of its origin, where the IMU is, in the world [m/s]; in the frame of the pelvis [rad/s]
+    *reals("pelvis_velocity pelvis_rate", 3),
+    *reals("roll pitch tilt"),  # of yaw, pitch, roll; angle from the vertical [rad]
+    *reals("ankles", (2, 3)),  # positions [m]
     # of the feet on the legs, in the frames of the feet [N], [N·m]
-    ("wrench", REAL, _FEET_WRENCH),
-    ("force", REAL, 2),  # vertical force of the ground on the feet [N]
-    ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
-    ("drift", REAL, 2),  # of the feet that stand, against the plan [m], nan likewise
+    *reals("wrench", _FEET_WRENCH),
+    # vertical force of the ground on the feet [N]; ZMP, and drift of the feet that stand against
+    # the plan [m], nan where the feet are not loaded
+    *reals("force zmp drift", 2),
     # step of the first touch in the second half of the swing, -1 before it
     ("contact_since", WHOLE),
 )
 """True state after a control step."""
 
 SHOWN = record_type(
-    ("imu_attitude", REAL, 2),
-    ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
-    ("wrench", REAL, _FEET_WRENCH),  # as in the truth
+    *reals("imu_attitude", 2),  # roll and pitch [rad]
+    *reals("imu_rate", 3),  # as pelvis_rate [rad/s]
+    *reals("wrench", _FEET_WRENCH),  # as in the truth
     # within an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
-    ("imu_up", REAL, 3),
-    ("imu_gyro", REAL, 3),
+    *reals("imu_up imu_gyro", 3),
 )
 """Measurements, and the state of an inertial IMU."""
 
@@ -51,43 +48,40 @@ the signals.
 """
 
 BIAS = record_type(
-    ("imu_attitude", REAL, 2),  # of mounting [rad]
-    ("gyro", REAL, 3),
-    ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
+    *reals("imu_attitude", 2),  # of mounting [rad]
+    *reals("gyro specific_force", 3),  # within an inertial IMU [rad/s], [m/s²]
     # of the feet's sensors, as in `elastic_env.world.foot_sensors`
     ("has_foot_errors", np.bool_),
-    ("wrench", REAL, _FEET_WRENCH),  # [N], [N·m]
-    ("wrench_rate", REAL, _FEET_WRENCH),  # [N/s], [N·m/s]
-    ("cross_talk", REAL, (2, 6, 6)),
+    *reals("wrench wrench_rate", _FEET_WRENCH),  # [N], [N·m]; [N/s], [N·m/s]
+    *reals("cross_talk", (2, 6, 6)),
     ("skipped", WHOLE),  # control steps of the plan that the walk leaves out
     # of the robot, where nothing measures them: load [kg] and its moments [kg·m], slope of the
     # ground forward and to the left [rad], friction over the assumed one [1]
-    ("load", REAL, 3),
-    ("slope", REAL, 2),
-    ("friction", REAL),
+    *reals("load", 3),
+    *reals("slope", 2),
+    *reals("friction"),
 )
 """Errors of the sensors, length of the walk, and more that is drawn per episode."""
 
-_TERMS = ("tilt", "zmp", "zmp_in_feet", "foot_drift", "effort", "smoothness", "fall")
-SCORES = record_type(*((term, REAL) for term in _TERMS))
+SCORES = record_type(*reals("tilt zmp zmp_in_feet foot_drift effort smoothness fall"))
 """Weighted terms of the reward."""
 
 WORLD = record_type(("truth", TRUTH), ("shown", SHOWN), ("scores", SCORES))
 """A control step of a world."""
 
 ROW_OF_PLAN = record_type(
-    ("clock", REAL, 3),
-    ("share", REAL),
-    ("zmp", REAL, 2),  # time, swing, support; μ; [m]
-    ("ankles", REAL, (2, 3)),  # [m]
+    *reals("clock", 3),  # time, swing, support
+    *reals("share"),  # μ
+    *reals("zmp", 2),  # [m]
+    *reals("ankles", (2, 3)),  # [m]
     ("half_of_swing", WHOLE),
     ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_),
-    ("weight", REAL),  # factor of tilt and zmp in the reward
+    *reals("weight"),  # factor of tilt and zmp in the reward
 )
 """The plan as a control step needs it."""
 
-INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
+INERTIAL = record_type(("is_fitted", np.bool_), *reals("time_constant_s gravity_m_s2"))
 """An inertial IMU, one row beside every row of `CONSTANTS`.
 
 Where none is fitted, the attitude comes with the errors that these have for it.
@@ -95,16 +89,14 @@ Where none is fitted, the attitude comes with the errors that these have for it.
 
 CONSTANTS = record_type(
     ("ankles", WHOLE, 2),  # among the sites
-    ("foot_com", REAL, (2, 3)),  # from the ankle [m]
-    ("foot_weight", REAL, (2, 3)),  # in the world [N]
+    *reals("foot_com foot_weight", (2, 3)),  # from the ankle [m], in the world [N]
     ("noise", NOISE),  # standard deviations
-    ("imu_bias_rad", REAL),
-    ("imu_sine_error_rad", REAL),
-    ("lowest_pelvis_m", REAL),
-    ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
-    ("loaded_n", REAL),  # vertical force of a loaded foot
-    ("zmp_n", REAL),  # least vertical force for a ZMP
-    ("skips_at", WHOLE),  # control step from which a shorter walk goes on further behind
+    *reals("imu_bias_rad imu_sine_error_rad"),
+    *reals("lowest_pelvis_m highest_tilt_rad"),  # beyond them the robot has fallen
+    # vertical force of a loaded foot, and least one for a ZMP
+    *reals("loaded_n zmp_n"),
+    # control step from which a shorter walk goes on further behind
+    ("skips_at", WHOLE),
     ("weights", SCORES),
 )
 """Constants of a kind of world: feet, quality of the sensors, and rules."""

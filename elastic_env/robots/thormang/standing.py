@@ -10,6 +10,7 @@ from pathlib import Path
 import llvmlite.binding as processor
 import mujoco
 import numpy as np
+from mujoco import MjModel
 
 from elastic_env.core.disk_cache import DiskCache, key_of
 from elastic_env.core.errors import ElasticError
@@ -40,7 +41,7 @@ _KEPT = DiskCache("standing")
 
 
 def equilibrium(
-    model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
+    model: MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
 ) -> Equilibrium:
     """`settle`, or what an earlier process kept of it, which is the same to the last bit."""
     content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
@@ -65,7 +66,7 @@ def _calculation() -> tuple[bytes | str, ...]:
 
 
 def settle(
-    model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
+    model: MjModel, joints: Sequence[str], pelvis: Array, q: Array, command: Array
 ) -> Equilibrium:
     """Let a robot come to rest from a posture.
 
@@ -113,7 +114,7 @@ def settle(
     )
 
 
-def _diverged(model: mujoco.MjModel, data: mujoco.MjData) -> ElasticError:
+def _diverged(model: MjModel, data: mujoco.MjData) -> ElasticError:
     """The error for a state that is not finite: joints that the physics step cannot resolve."""
     # the elastic joints' springs are all tendons that there are
     stiffest = model.tendon_stiffness.max(initial=0.0)

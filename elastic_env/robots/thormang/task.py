@@ -76,9 +76,10 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import DrawnRobot
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
+from elastic_env.motion import walk_plan
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import STAND_S, Motion, Plan
-from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
+from elastic_env.motion.walk_plan import WalkPlan, plan_walk
 from elastic_env.robots.thormang import NAME, tables
 from elastic_env.robots.thormang import rows as records
 from elastic_env.robots.thormang.config import (
@@ -91,8 +92,7 @@ from elastic_env.robots.thormang.config import (
 )
 from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.world import control_kernels as kernels
-from elastic_env.world.foot_sensors import foot_errors
-from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.foot_sensors import FootSensors, foot_errors
 from elastic_env.world.robot_model import WalkerModel
 from elastic_env.world.rows import Records, Sample, columns_of, one
 from elastic_env.world.sensors import is_due
@@ -129,7 +129,7 @@ class _Kind:
         body = biped(config.true_robot)  # pyright: ignore[reportArgumentType]
         period_s = config.control_period_s
         if config.true_robot != config.robot:
-            plan = with_torque(plan, body, period_s)
+            plan = walk_plan.with_torque(plan, body, period_s)
         joints = config.true_joints
         model = WalkerModel(joints, body.rigid, period_s, biped=body, plan=plan)
         return _Kind(config, bank, config.true_model(), model)
@@ -159,16 +159,14 @@ class WalkTask(Task):
     def __init__(self, config: WalkConfig, num_worlds: int) -> None:
         scenarios = config.scenarios or (config.scenario,) * num_worlds
         if len(scenarios) != num_worlds:
-            raise ConfigurationError(
-                f"scenario must be a name, or a list with one for each world, {num_worlds}, got"
-                f" {len(scenarios)}"
-            )
+            needed = f"a name, or a list with one for each world, {num_worlds}"
+            raise ConfigurationError(f"scenario must be {needed}, got {len(scenarios)}")
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         joints = config.assumed_joints
         period_s = config.control_period_s
         plan = plan_walk(config.gait, robot, period_s)  # pyright: ignore[reportArgumentType]
         assumed = WalkerModel(joints, robot.rigid, period_s, biped=robot, plan=plan)
-        require_feasible(plan, robot, assumed.servos)
+        walk_plan.require_feasible(plan, robot, assumed.servos)
         kinds = [_Kind.of(own, plan) for own in config.of_each_scenario()]
         self._fits = [(kind, *fit) for kind in kinds for fit in kind.fits]
         super().__init__(
@@ -182,7 +180,7 @@ class WalkTask(Task):
             joints=tables.JOINTS,
             scenarios=scenarios,
             metrics=tables.METRICS,
-            kinds=[(kind.encoder_counts, is_delayed) for kind, is_delayed, _ in self._fits],
+            kinds=[(kind.encoder_counts, is_late) for kind, is_late, _ in self._fits],
         )
         table = self.observation_table
         by_scenario = {kind.config.scenario: kind for kind in kinds}
@@ -197,7 +195,8 @@ class WalkTask(Task):
         most = plan.gait.num_steps
         self._skips = [of_step * (most - number) for number in config.numbers_of_steps]
         self.fewest_control_steps = self.num_steps - max(self._skips)
-        self._walk_constants = np.concatenate([_constants_of(*fit) for fit in self._fits])
+        constants = [_constants_of(*fit) for fit in self._fits]
+        self._walk_constants = np.concatenate(constants)
         self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(plan, config)
         self._walk_columns = columns_of(table, records.COLUMNS)
@@ -220,23 +219,15 @@ class WalkTask(Task):
         """State without noise, and the true parameters."""
         joints = self._joints[self._row]["truth"]
         body = self._worlds[self._row]["truth"]
+        of_joints = ("theta", "theta_dot", "q", "q_dot", "stiffness", "backlash")
+        of_body = ("pelvis", "ankles", "pelvis_rate", "wrench")
         return records.WalkTruth(
-            theta=joints["theta"].copy(),
-            theta_dot=joints["theta_dot"].copy(),
-            q=joints["q"].copy(),
-            q_dot=joints["q_dot"].copy(),
-            stiffness=joints["stiffness"].copy(),
-            backlash=joints["backlash"].copy(),
-            load=self._bias["load"].copy(),
-            slope=self._bias["slope"].copy(),
-            friction=self._bias["friction"].copy(),
+            **{name: joints[name].copy() for name in of_joints},
+            **{name: self._bias[name].copy() for name in ("load", "slope", "friction")},
+            **{name: body[name].copy() for name in of_body},
             mounting=self._bias["imu_attitude"].copy(),
-            pelvis=body["pelvis"].copy(),
-            ankles=body["ankles"].copy(),
             pelvis_R=kernels.rotations_of(body["quaternion"].copy()),
             attitude=np.column_stack([body["roll"], body["pitch"]]),
-            pelvis_rate=body["pelvis_rate"].copy(),
-            wrench=body["wrench"].copy(),
             models=self._true_models,
         )
 
@@ -248,11 +239,13 @@ class WalkTask(Task):
         bias = self._bias
         kg = robot.load_kg
         bias["load"][world] = kg, kg * robot.load_x_m, kg * robot.load_y_m
-        direction = robot.slope_direction_rad
-        bias["slope"][world] = robot.slope_rad * np.array([np.cos(direction), np.sin(direction)])
+        way = robot.slope_direction_rad
+        rise = np.array([np.cos(way), np.sin(way)])
+        bias["slope"][world] = robot.slope_rad * rise
         bias["friction"][world] = robot.friction
         bias["imu_attitude"][world] = robot.mounting_rad
-        generator.random(2)  # not used: the trial follows what has always been drawn here
+        # not used: the trial follows what has always been drawn here
+        generator.random(2)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
         fit = (kind, robot.is_delayed, robot.is_inertial)
@@ -348,19 +341,14 @@ class WalkTask(Task):
             "pelvis_pitch": truth["pitch"].copy(),
             "pelvis_error": truth["tilt"].copy(),
             "pelvis_height": truth["pelvis"][:, 2].copy(),
-            "zmp_x": truth["zmp"][:, 0].copy(),
-            "zmp_y": truth["zmp"][:, 1].copy(),
-            "zmp_reference_x": zmp_ref[:, 0],
-            "zmp_reference_y": zmp_ref[:, 1],
+            **_parts("zmp", truth["zmp"].copy()),
+            **_parts("zmp_reference", zmp_ref),
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
-            "zmp_deviation_x": deviation[:, 0],
-            "zmp_deviation_y": deviation[:, 1],
+            **_parts("zmp_deviation", deviation),
             "zmp_in_feet": np.hypot(in_feet[:, 0], in_feet[:, 1]),
-            "zmp_in_feet_x": in_feet[:, 0],
-            "zmp_in_feet_y": in_feet[:, 1],
+            **_parts("zmp_in_feet", in_feet),
             "foot_drift": np.hypot(drift[:, 0], drift[:, 1]),
-            "foot_drift_x": drift[:, 0].copy(),
-            "foot_drift_y": drift[:, 1].copy(),
+            **_parts("foot_drift", drift.copy()),
             "link_error": rms(error),
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
@@ -465,7 +453,9 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], gravity)
     g = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * g
-    weights = {term: getattr(config.reward, term) for term in records.SCORES.names or ()}
+    terms = records.SCORES.names or ()
+    weights = {term: getattr(config.reward, term) for term in terms}
+    walked_s = STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s
     return one(
         records.CONSTANTS,
         ankles=[model.site(f"{side}_ft").id for side in SIDES],
@@ -480,7 +470,7 @@ def _constants_of(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records: 
         # sensors that carry nothing stand for a ground that carries the feet
         zmp_n=loaded_n + float(model.body_mass[feet].sum()) * g,
         weights=one(records.SCORES, **weights),
-        skips_at=round((STAND_S + _STEPS_BEFORE_SKIP * config.gait.step_period_s) / period_s),
+        skips_at=round(walked_s / period_s),
     )
 
 
@@ -489,10 +479,16 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
     if not any(is_inertial for _, _, is_inertial in fits):
         return None
     rows = np.zeros(len(fits), records.INERTIAL)
-    rows["is_fitted"] = [is_inertial for _, _, is_inertial in fits]
-    rows["time_constant_s"] = [kind.config.scenario.inertial.time_constant_s for kind, _, _ in fits]
+    for row, (kind, _, is_inertial) in zip(rows, fits, strict=True):
+        row["is_fitted"] = is_inertial
+        row["time_constant_s"] = kind.config.scenario.inertial.time_constant_s
     rows["gravity_m_s2"] = gravity_m_s2
     return rows
+
+
+def _parts(name: str, vectors: Array) -> Signals:
+    """Components of vectors in the plane, (rows, 2)."""
+    return {f"{name}_x": vectors[:, 0], f"{name}_y": vectors[:, 1]}
 
 
 def heading_error(quaternion: Array, planned: Array) -> Array:
