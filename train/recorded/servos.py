@@ -6,13 +6,12 @@ and replayed by a fit to the others.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from baselines.identification.servo_fit import ServoFit, fit_servo
+from baselines.identification.servo_fit import fit_servo
 from baselines.identification.servo_holdout import PREDICTIONS, ServoHoldout, judge_servo
 from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import describe_servo
@@ -20,28 +19,26 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.json_text import parse_json
 from train.figures.servo_plots import draw_servo
 
-XL330_LEFT_OUT = (("sin_time_square", "lift_and_drop"), ("up_and_down",), ("sin_sin",))
-"""Motions of the XL330 that are left out together; the first are those of the source's figures."""
-STS3250_LEFT_OUT = (("up_and_down",), ("sin_sin",), ("lift_and_drop",), ("sin_time_square",))
-"""Motions of the STS3250 that are left out in turn; the last is faster than those that are left."""
+LEFT_OUT = {
+    "xl330": (("sin_time_square", "lift_and_drop"), ("up_and_down",), ("sin_sin",)),
+    "sts3250": (("up_and_down",), ("sin_sin",), ("lift_and_drop",), ("sin_time_square",)),
+}
+"""Motions of each servo that are left out together, in turn. The first ones of the XL330 are those
+of the source's figures. The last one of the STS3250 is faster than those that are left."""
 FURTHER_SEEDS = (1, 2, 3)
 """Seeds of further starts of the first fit of the XL330."""
+COLUMNS = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
+"""Errors of the rivals and of the replay in the table."""
 _LARGEST_JSON = 20_000_000
 
-
-@dataclass(frozen=True)
-class RecordedLog:
-    """A log with the servo and the motion that its file names."""
-
-    motor: str
-    trajectory: str
-    log: ServoLog
+Recordings = Sequence[tuple[str, ServoLog]]
+"""Logs of a servo with their motions."""
 
 
 def servo_figures(
     files: Sequence[Path],
     pictures: Path | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """All figures of the two servos.
 
@@ -59,64 +56,77 @@ def servo_figures(
     Raises:
         ConfigurationError: A servo has no log.
     """
-    tell = say or (lambda text: None)  # noqa: ARG005
     recorded = read_recordings(files)
     figures = {}
-    for motor, groups in (("xl330", XL330_LEFT_OUT), ("sts3250", STS3250_LEFT_OUT)):
-        own = [one for one in recorded if one.motor == motor]
-        if not own:
+    for motor, groups in LEFT_OUT.items():
+        own = recorded.get(motor)
+        if own is None:
             raise ConfigurationError(f"there is no log of the {motor} among {len(files)} files")
         held_out = []
-        for number, group in enumerate(groups):
-            tell(f"{motor}: fit without {', '.join(group)}")
-            outer = [one.log for one in own if one.trajectory in group]
-            fit = fit_servo([one.log for one in own if one.trajectory not in group])
+        for group in groups:
+            say(f"{motor}: fit without {', '.join(group)}")
+            inner, outer = _split(own, group)
+            fit = fit_servo(inner)
             held_out.append(judge_servo(fit, outer))
-            if number == 0 and pictures is not None:
+            if group == groups[0] and pictures is not None:
                 played = [fit.replay(log) for log in outer]
                 draw_servo(outer, played, pictures / f"{motor}.png", is_held_out=True)
-        tell(f"{motor}: fit to all")
-        all_logs = fit_servo([one.log for one in own])
-        figures[motor] = _described(all_logs, groups, held_out)
+        say(f"{motor}: fit to all")
+        all_logs = fit_servo([log for _, log in own])
+        figures[motor] = {
+            "held_out": [
+                {"motions": list(group), **part.model_dump(mode="json")}
+                for group, part in zip(groups, held_out, strict=True)
+            ],
+            "sag": sag_by_gain(held_out),
+            "identified": describe_servo(all_logs).model_dump(mode="json"),
+        }
         if motor == "xl330":
-            figures[motor] |= _varied(own, tell)
+            figures[motor] |= _varied(own, say)
     return figures
 
 
-def _varied(logs: Sequence[RecordedLog], tell: Callable[[str], None]) -> dict[str, Any]:
+def _split(logs: Recordings, group: Sequence[str]) -> tuple[list[ServoLog], list[ServoLog]]:
+    """Logs of other motions than those of a group, and of these."""
+    inner = [log for motion, log in logs if motion not in group]
+    return inner, [log for motion, log in logs if motion in group]
+
+
+def _varied(logs: Recordings, say: Callable[[str], None]) -> dict[str, Any]:
     """The first motions that are left out, by fits without priors and from other starts."""
-    group = XL330_LEFT_OUT[0]
-    outer = [one.log for one in logs if one.trajectory in group]
-    inner = [one.log for one in logs if one.trajectory not in group]
-    tell("xl330: fit without priors")
-    figures: dict[str, Any] = {
-        "without_priors": judge_servo(fit_servo(inner, priors=False), outer).model_dump(mode="json")
+    inner, outer = _split(logs, LEFT_OUT["xl330"][0])
+
+    def judged(what: str, **options: Any) -> dict[str, Any]:
+        say(f"xl330: fit {what}")
+        return judge_servo(fit_servo(inner, **options), outer).model_dump(mode="json")
+
+    return {
+        "without_priors": judged("without priors", priors=False),
+        "other_starts": [
+            judged(f"from other starts, seed {seed}", seed=seed) for seed in FURTHER_SEEDS
+        ],
     }
-    figures["other_starts"] = []
-    for seed in FURTHER_SEEDS:
-        tell(f"xl330: fit from other starts, seed {seed}")
-        judged = judge_servo(fit_servo(inner, seed=seed), outer)
-        figures["other_starts"].append(judged.model_dump(mode="json"))
-    return figures
 
 
-def read_recordings(files: Sequence[Path]) -> list[RecordedLog]:
-    """Logs by gain and name.
+def read_recordings(files: Sequence[Path]) -> dict[str, list[tuple[str, ServoLog]]]:
+    """Motions and logs by servo, in the order of gain and name.
 
     Raises:
         ConfigurationError: One cannot be read.
     """
-    found = []
+    found: dict[str, list[tuple[str, ServoLog]]] = {}
     for path in files:
+        facts = parse_json(path.read_text(encoding="utf-8"), most=_LARGEST_JSON)
         log = read_servo_log(path)
-        facts: Mapping[str, Any] = parse_json(path.read_text(encoding="utf-8"), most=_LARGEST_JSON)
-        found.append(RecordedLog(str(facts["motor"]), str(facts["trajectory"]), log))
-    return sorted(found, key=lambda one: (one.log.gain, one.log.name))
+        found.setdefault(str(facts["motor"]), []).append((str(facts["trajectory"]), log))
+    for own in found.values():
+        own.sort(key=lambda recording: (recording[1].gain, recording[1].name))
+    return found
 
 
 def num_fits() -> int:
     """How often `servo_figures` says what is being done."""
-    return len(XL330_LEFT_OUT) + len(STS3250_LEFT_OUT) + 2 + 1 + len(FURTHER_SEEDS)
+    return sum(len(groups) + 1 for groups in LEFT_OUT.values()) + 1 + len(FURTHER_SEEDS)
 
 
 def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -127,28 +137,24 @@ def servo_rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     rows = []
     for motor, figure in figures.items():
-        replays = [("replay", part) for part in figure["held_out"]]
         first = {"motions": figure["held_out"][0]["motions"]}
-        if "without_priors" in figure:
-            replays.append(("replay without priors", {**figure["without_priors"], **first}))
-        replays += [
-            ("replay from other starts", {**part, **first})
-            for part in figure.get("other_starts", ())
-        ]
-        for measure, part in replays:
-            errors = dict(
-                zip(_COLUMNS, (error["rms_mrad"] for error in part["errors"]), strict=True)
-            )
-            of = ", ".join(part["motions"])
-            row = {"servo": motor, "measure": measure, "of": of, **errors}
-            rows.append({**row, "replay_all_mrad": part["replay_mrad"]})
+        others = [figure["without_priors"]] if "without_priors" in figure else []
+        measures = {
+            "replay": figure["held_out"],
+            "replay without priors": [own | first for own in others],
+            "replay from other starts": [own | first for own in figure.get("other_starts", ())],
+        }
+        for measure, parts in measures.items():
+            for part in parts:
+                row = {"servo": motor, "measure": measure, "of": ", ".join(part["motions"])}
+                errors = [error["rms_mrad"] for error in part["errors"]]
+                row |= zip(COLUMNS, errors, strict=True)
+                rows.append({**row, "replay_all_mrad": part["replay_mrad"]})
         for gain in figure["sag"]:
-            errors = dict(zip(_COLUMNS, (gain[name] for name in PREDICTIONS), strict=True))
-            rows.append({"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}", **errors})
+            row = {"servo": motor, "measure": "slow", "of": f"{gain['gain']:g}"}
+            row |= zip(COLUMNS, (gain[name] for name in PREDICTIONS), strict=True)
+            rows.append(row)
     return rows
-
-
-_COLUMNS = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad")
 
 
 def sag_by_gain(held_out: Sequence[ServoHoldout]) -> list[dict[str, float]]:
@@ -160,24 +166,6 @@ def sag_by_gain(held_out: Sequence[ServoHoldout]) -> list[dict[str, float]]:
         rows = np.array([log.slow_rows for log in own])
         errors = np.array([log.slow_mrad for log in own])
         mean = np.sqrt(rows @ errors**2 / rows.sum())
-        table.append(
-            {
-                "gain": gain,
-                "rows": float(rows.sum()),
-                **dict(zip(PREDICTIONS, map(float, mean), strict=True)),
-            }
-        )
+        figures = dict(zip(PREDICTIONS, map(float, mean), strict=True))
+        table.append({"gain": gain, "rows": float(rows.sum()), **figures})
     return table
-
-
-def _described(
-    fit: ServoFit, groups: Sequence[Sequence[str]], held_out: Sequence[ServoHoldout]
-) -> dict[str, Any]:
-    return {
-        "held_out": [
-            {"motions": list(group), **part.model_dump(mode="json")}
-            for group, part in zip(groups, held_out, strict=True)
-        ],
-        "sag": sag_by_gain(held_out),
-        "identified": describe_servo(fit).model_dump(mode="json"),
-    }
