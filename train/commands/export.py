@@ -1,6 +1,6 @@
 """`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
 from elastic_env.core.files import write_whole
 from elastic_env.joint.model_text import is_file, name_of, read_bytes
-from train.commands.options import StiffnessOrFile, option_name
+from train.commands.options import StiffnessOrFile, given_options
 from train.export.c_arm import c_example, c_header
 from train.export.c_text import prefix_of, require_prefix
 
@@ -114,7 +114,10 @@ class C(Output):
         elif self.model in _OF_WALKER:
             export = self._walker
             name = "walker"
-        self._refuse(["env"] if export == self._arm else _OF_ARMS)
+        if unused := given_options(self, ["env"] if export == self._arm else _OF_ARMS):
+            raise ConfigurationError(
+                f"{', '.join(unused)}: without effect on {shorten(self.model)}; leave it out"
+            )
         prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
         output = self.output or Path(f"{prefix}.h")
         header, example = export(prefix, f"../{output.name}")
@@ -123,16 +126,6 @@ class C(Output):
             folder = output.with_name(f"{prefix}_example")
             files |= {folder / name: text for name, text in example.items()}
         self.write(files, console)
-
-    def _refuse(self, names: Sequence[str]) -> None:
-        """Refuse options that have no effect here."""
-        given = [
-            name for name in names if getattr(self, name) != type(self).model_fields[name].default
-        ]
-        if given:
-            listed = ", ".join(option_name((name,)) for name in given)
-            problem = f"{listed}: without effect on {shorten(self.model)}; leave it out"
-            raise ConfigurationError(problem)
 
     def _residual(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
         """Header and example of a residual."""
