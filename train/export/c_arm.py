@@ -96,19 +96,6 @@ def c_header(
     )
 
 
-def c_example(prefix: str, header: str) -> dict[str, str]:
-    """Contents of a program that checks the header and times it, and of its CMakeLists, by name.
-
-    Args:
-        prefix: Of the header's names.
-        header: Its file, as the program includes it.
-    """
-    return {
-        f"{prefix}_main.c": fill("arm_main.c.in", prefix, header=header),
-        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
-    }
-
-
 def payload_frames(constants: CompensatorConstants) -> list[Frame]:
     """Bodies and sites with names that joints move; the body of the last joint first."""
     model = constants.model

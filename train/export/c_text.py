@@ -54,6 +54,20 @@ def fill(template: str, prefix: str, **parts: Any) -> str:
     return Template(text).substitute(parts)
 
 
+def c_example(program: str, prefix: str, header: str) -> dict[str, str]:
+    """Contents of a program that checks a header and times it, and of its CMakeLists, by name.
+
+    Args:
+        program: What the header has: arm, residual or walker.
+        prefix: Of the header's names.
+        header: Its file, as the program includes it.
+    """
+    return {
+        f"{prefix}_main.c": fill(f"{program}_main.c.in", prefix, header=header),
+        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
+    }
+
+
 def number(value: Any) -> str:
     """A double, or a float of NumPy as one, read back bit for bit."""
     if np.isnan(value):

@@ -104,19 +104,6 @@ def c_walker(policy: Any, prefix: str) -> str:
     )
 
 
-def c_walker_example(prefix: str, header: str) -> dict[str, str]:
-    """Contents of a program that checks the header and times it, and of its CMakeLists, by name.
-
-    Args:
-        prefix: Of the header's names.
-        header: Its file, as the program includes it.
-    """
-    return {
-        f"{prefix}_main.c": fill("walker_main.c.in", prefix, header=header),
-        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
-    }
-
-
 def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
     """Random sensors about rows of the plan, and what a policy makes of them, from its begin.
 
