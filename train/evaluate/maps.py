@@ -3,6 +3,7 @@
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -189,6 +190,17 @@ class HeatMap:
     def flat(self) -> list[MapCell]:
         """All cells."""
         return [cell for row in self.cells for cell in row]
+
+    @property
+    def wins(self) -> dict[str, int]:
+        """Cells in which a policy is the best, of those that are somewhere, most first."""
+        wins = Counter(cell.best for cell in self.flat)
+        ranked = sorted(self.table.policies, key=lambda title: -wins[title])
+        return {title: wins[title] for title in ranked if wins[title]}
+
+    def changes_of(self, title: str) -> list[Change]:
+        """Changes of a residual in all cells that have one."""
+        return [cell.learned[title] for cell in self.flat if title in cell.learned]
 
 
 def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[HeatMap]:
