@@ -11,8 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.errors import ElasticError, SystemFailedError
-from train.cells.key import cell_key
-from train.cells.store import Store, UnfitCellError
+from train.cells.store import Store, UnfitCellError, cell_key
 from train.evaluate import rollout
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together

@@ -17,9 +17,10 @@ from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env
-from train.figures import comparison_figures, plots, testbed_plots
+from train.figures import comparison_figures, plots
 from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
+from train.figures.identification_plots import draw_identification
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.specs import page_chart
@@ -101,8 +102,8 @@ class Demo(Model):
             names = ("fig5_identification", "fig6_static_errors", "sine")
             fig5, fig6, sine = (folder / f"{name}.{self.figure_format}" for name in names)
             files = [
-                testbed_plots.draw_identification(result, points, [model], fig5),
-                testbed_plots.draw_static_errors(static, model, fig6),
+                draw_identification(result, points, [model], fig5),
+                comparison_figures.draw_static_errors(static, model, fig6),
                 comparison_figures.draw_picture("time", known.curves, motion, sine),
             ]
             for walk in comparison_figures.cells_together(walks):
@@ -179,7 +180,7 @@ def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
     ]
     ranges = ("-56.2 to +41.7", "-3.7 to +7.1")
     for evaluation, paper in zip(static, ranges, strict=True):
-        error = 1e3 * testbed_plots.static_errors(evaluation)
+        error = 1e3 * comparison_figures.static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
     return rows

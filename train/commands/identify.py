@@ -21,7 +21,7 @@ from train.commands.identify_arm import identify_arm
 from train.commands.identify_options import ArmOptions, IdentificationRun, OfTestbed
 from train.commands.options import OnHardware, given_options
 from train.figures import plots
-from train.figures.testbed_plots import draw_identification
+from train.figures.identification_plots import draw_identification
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder

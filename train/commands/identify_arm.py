@@ -49,7 +49,7 @@ from train.commands.identify_options import ArmOptions, IdentificationRun, Servo
 from train.commands.identify_servo import are_servo_logs, identify_servo
 from train.commands.options import given_options
 from train.figures import plots
-from train.figures.arm_plots import draw_arm_identification
+from train.figures.identification_plots import draw_arm_identification
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress

@@ -22,7 +22,7 @@ from elastic_env.joint.model_file import read_model
 from elastic_env.rigid.tree.links import Tree
 from train.commands.held_out import judge_poses, number_or_dash, show_held_out
 from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
-from train.figures.geometry_plots import draw_geometry
+from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress

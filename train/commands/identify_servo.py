@@ -26,7 +26,7 @@ from train.commands.identify_options import (
 )
 from train.commands.options import given_options
 from train.figures import plots
-from train.figures.servo_plots import draw_servo
+from train.figures.identification_plots import draw_servo
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress

@@ -17,7 +17,7 @@ from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import describe_servo
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.json_text import parse_json
-from train.figures.servo_plots import draw_servo
+from train.figures.identification_plots import draw_servo
 
 LEFT_OUT = {
     "xl330": (("sin_time_square", "lift_and_drop"), ("up_and_down",), ("sin_sin",)),
