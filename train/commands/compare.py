@@ -269,7 +269,9 @@ class CompareConfig(CodeNamingModel):
         kinds = [known.label(reference) for reference in self.references]
 
         def label(kind: str, reference: Reference) -> str | None:
-            words = dict.fromkeys([*kind.split(), *_parameters(reference, known)])
+            given = reference.items() if isinstance(reference, dict) else ()
+            others = [f"{k}={v}" for k, v in given if k not in ("kind", known.motion)]
+            words = dict.fromkeys([*kind.split(), *others])
             return " ".join(words) if kinds.count(kind) > 1 else None
 
         return list(map(label, kinds, self.references))
@@ -458,12 +460,6 @@ def _motions_of_map(axes: Any, known: Environment) -> list[Any]:
             values = axis.get("values")
             return values if isinstance(values, list) else []
     return []
-
-
-def _parameters(reference: Reference, known: Environment) -> list[str]:
-    given = reference if isinstance(reference, dict) else {}
-    others = [name for name in given if name not in ("kind", known.motion)]
-    return [f"{name}={given[name]}" for name in others]
 
 
 class Compare(Model):

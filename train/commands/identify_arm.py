@@ -167,10 +167,13 @@ def _require_poses(options: ArmOptions) -> None:
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
     joints = result.joints
+    intervals = [_interval(joint) for joint in joints]
+    stiffness = [number_or_dash(joint.stiffness_nm_per_rad) for joint in joints]
+    told = zip(stiffness, intervals, strict=True)
     columns: dict[str, Sequence[str]] = {
         "joint": [joint.joint for joint in joints],
-        "K": [number_or_dash(_stiffness(joint)) for joint in joints],
-        "95 % interval": [_interval(joint) for joint in joints],
+        "K": [interval if interval == "–" else own for own, interval in told],
+        "95 % interval": intervals,
         "±": [_percent(joint.half_width) for joint in joints],
     }
     if joints[0].planned_half_width is not None:
@@ -354,10 +357,6 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
         for i, joint in enumerate(arm.joints):
             columns[f"direction.{joint}"] = plan.direction[:, i]
     return write_poses(path, columns)
-
-
-def _stiffness(joint: JointStiffness) -> float | None:
-    return None if _interval(joint) == "–" else joint.stiffness_nm_per_rad
 
 
 def _interval(joint: JointStiffness) -> str:

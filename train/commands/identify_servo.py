@@ -143,16 +143,12 @@ def show_result(result: ServoIdentification, console: Console) -> None:
             f"error of the angle at {len(result.held_out.logs)} logs that were not fitted [mrad]"
         )
         console.print(make_table(title, head, rows, box=box.SIMPLE))
-    rows = [
-        [
-            f"k_p at gain {one.register_value:g}{_volts(one.supply_v)}",
-            f"{one.position_gain_nm_per_rad:.4g}",
-            _width(one.half_width),
-            "N·m/rad",
-            "",
-        ]
-        for one in result.gains
-    ]
+    rows = []
+    for one in result.gains:
+        supply = "" if one.supply_v is None else f", {one.supply_v:.4g} V"
+        name = f"k_p at gain {one.register_value:g}{supply}"
+        gain = f"{one.position_gain_nm_per_rad:.4g}"
+        rows.append([name, gain, _width(one.half_width), "N·m/rad", ""])
     for one in result.parameters:
         if one.name != "position_gain" and one.value is not None:
             width = _width(one.half_width)
@@ -238,10 +234,6 @@ def _require_one_supply(logs: Sequence[ServoLog]) -> None:
         raise ConfigurationError(
             "some logs say their supply voltage and some do not; give it in all or in none"
         )
-
-
-def _volts(supply: float | None) -> str:
-    return "" if supply is None else f", {supply:.4g} V"
 
 
 def _width(half: float | None) -> str:

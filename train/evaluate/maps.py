@@ -113,9 +113,10 @@ class MapConfig(Model):
         """
         for name, axis in (("x", self.x), ("y", self.y)):
             if axis.what != known.motion and axis.what not in scenario_fields():
-                raise ConfigurationError(
-                    f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}"
-                )
+                choices = choices_listed(axis.what, [known.motion, *scenario_fields()])
+                if axis.what in PolicyOptions.model_fields:
+                    choices += "; an option of the policies is varied by sweep, not by a map"
+                raise ConfigurationError(f"unknown axis {axis.what!r} of map.{name}; {choices}")
             for value in axis.values:
                 if axis.is_motion:
                     continue  # `references` holds and checks them
@@ -132,14 +133,6 @@ class MapConfig(Model):
             dict(zip(names, map(float, values), strict=True))
             for values in product(*(axis.values for axis in fields))
         ]
-
-
-def _choices(what: str, known: Environment) -> str:
-    """Names that an axis can have."""
-    choices = choices_listed(what, [known.motion, *scenario_fields()])
-    if what not in PolicyOptions.model_fields:
-        return choices
-    return f"{choices}; an option of the policies is varied by sweep, not by a map"
 
 
 @dataclass(frozen=True, eq=False)

@@ -152,7 +152,8 @@ def _layers(policy: Any) -> _Layers:
     posture = policy if isinstance(policy, PostureFeedback) else None
     adaptive: Any = None if posture is None else posture.policy
     inner: Any = policy
-    if isinstance(adaptive, OnlineStiffness) and _is_by_feet(adaptive.estimator):
+    estimator = adaptive.estimator if isinstance(adaptive, OnlineStiffness) else None
+    if isinstance(estimator, LegEstimator) and estimator.sensors is None:
         inner = adaptive.policy
         if not np.array_equal(policy.ramp, getattr(inner, "ramp", ())):
             raise ConfigurationError("in C, posture feedback and compensation have the same ramp")
@@ -166,11 +167,6 @@ def _layers(policy: Any) -> _Layers:
         "only input_output and adaptive_posture of a walker are there in C, with output: taylor and"
         " gravity: com or ankle"
     )
-
-
-def _is_by_feet(estimator: Any) -> bool:
-    """Whether an estimator needs no sensors of joints."""
-    return isinstance(estimator, LegEstimator) and estimator.sensors is None
 
 
 def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:

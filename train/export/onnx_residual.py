@@ -39,7 +39,10 @@ def onnx_model(layout: ResidualLayout) -> bytes:
     of_columns = graph.add("Gather", residual, graph.keep(layout.source), axis=1)
     correction = graph.add("Mul", of_columns, graph.keep(layout.bounds))
     graph.give("correction", correction, len(layout.columns), "values of the base's inputs")
-    facts = {key: _as_text(value) for key, value in layout.facts().items()}
+    facts = {
+        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for key, value in layout.facts().items()
+    }
     return graph.serialise(layout.name, facts)
 
 
@@ -76,10 +79,6 @@ def _network(graph: "_Graph", features: str, layout: ResidualLayout) -> str:
 
 _OF_LAYER = ("weight", "bias")
 _ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu"}
-
-
-def _as_text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 class _Graph:

@@ -117,8 +117,10 @@ class Training(Trainer):
         if self.config.anneal:
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
+        portion = self.config.worlds
+        if not isinstance(self.model, OffPolicyAlgorithm):  # whose n_steps are those of returns
+            portion *= self.model.n_steps
         try:
-            portion = self._portion()
             self.model.learn(portion, reset_num_timesteps=before == 0, log_interval=1)
         except ValueError:  # such as of a distribution whose parameters are nan
             self._require_finite_weights()
@@ -232,12 +234,6 @@ class Training(Trainer):
     def _statistics(self) -> tuple[Any, Any]:
         """Means and variances of the normaliser: of observations and of returns."""
         return self._normaliser.obs_rms, self._normaliser.ret_rms
-
-    def _portion(self) -> int:
-        """Decisions of one call of `learn`: a rollout of PPO; SAC goes on to its next update."""
-        if isinstance(self.model, OffPolicyAlgorithm):  # n_steps are those of returns
-            return self.config.worlds
-        return self.config.worlds * self.model.n_steps
 
     def _shrink_last_layer(self) -> None:
         """A residual begins near zero: as the base."""

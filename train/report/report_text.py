@@ -130,12 +130,14 @@ _MOST_CLAIMS = 4
 
 def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) -> list[str]:
     """Paragraphs of plain text that a macro of `sentences.j2` makes of the results."""
+    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
+    marks = {mark for row in results.changes for mark in row.marks}
     helpers = {
         "terms": terms,
         "failures": failures,
         "ranked": _ranked,
         "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),
-        "marks_of": _kinds_of_marks,
+        "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
         "verdict_words": _VERDICTS,
     }
     module = load_template("sentences.j2").make_module(helpers)
@@ -171,13 +173,6 @@ def _scores(rows: pd.DataFrame, column: Column) -> Scores:
         mean = float(known.mean()) if len(known) else float("nan")
         found[str(title)] = Estimate(mean), failures(own)
     return found
-
-
-def _kinds_of_marks(rows: Sequence[Change]) -> list[str]:
-    """Kinds of marks that some changes have."""
-    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
-    marks = {mark for row in rows for mark in row.marks}
-    return [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)]
 
 
 _VERDICTS: Mapping[Verdict, str] = {

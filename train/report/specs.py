@@ -83,10 +83,13 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
+    x: Spec = {"x": curve.x.tolist()}
+    if len(curve.x) >= 20:  # evenly spaced
+        x = {"x0": digits(float(curve.x[0])), "dx": digits(float(curve.x[1] - curve.x[0]))}
     line = {
         "type": "scatter",
         "yaxis": f"y{axis}",
-        **_abscissa(curve.x),
+        **x,
         "mode": "lines+markers" if curve.has_points else "lines",
         "y": numbers(curve.y),
         "name": chart_text(curve.name),
@@ -106,13 +109,6 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     low, high = map(numbers, curve.band)
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
     return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
-
-
-def _abscissa(x: Array) -> Spec:
-    """Points of the axis; of many that are evenly spaced the first one and the distance."""
-    if len(x) < 20:
-        return {"x": x.tolist()}
-    return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
 
 
 def _band(begin: float, end: float, colour: str, ends: tuple[float, float] = (0, 1)) -> Spec:
