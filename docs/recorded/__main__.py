@@ -1,4 +1,4 @@
-"""`python -m train.recorded FOLDER`: every figure of the page "Recorded robots"."""
+"""`python -m docs.recorded FOLDER`: every figure of the page "Recorded robots"."""
 
 import json
 from itertools import count
@@ -9,13 +9,13 @@ import tyro
 from rich import box
 from rich.console import Console
 
+from docs.recorded.justin import HandError, hand_errors, num_trials, read_poses
+from docs.recorded.pictures import draw_hand_errors
+from docs.recorded.servos import COLUMNS, num_fits, servo_figures, servo_rows
+from docs.recorded.sources import SOURCES
 from elastic_env.core.files import write_whole
 from train.commands.cli import CONSOLE, run_program
 from train.commands.entry import start as start_program
-from train.recorded.justin import HandError, hand_errors, num_trials, read_poses
-from train.recorded.pictures import draw_hand_errors
-from train.recorded.servos import COLUMNS, num_fits, servo_figures, servo_rows
-from train.recorded.sources import SOURCES
 from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
