@@ -39,19 +39,14 @@ from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import Standing, append_standings, standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
+from train.report import leaderboard
 from train.report.change_tables import print_changes, write_maps, write_statistics
-from train.report.leaderboard import (
-    find_published,
-    print_leaderboard,
-    read_leaderboard,
-    write_leaderboard,
-)
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
+from train.runs import folders
 from train.runs.console import print_files, warn_once
-from train.runs.folders import describe, installed_version, lock_run, require_run, run_folder
 from train.runs.presets import find_configuration, print_presets
 from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
@@ -156,11 +151,13 @@ class CompareConfig(CodeNamingModel):
         """Version and protocol: rows of leaderboards can stand together if these are the same."""
         others = {"name", "policies", "figure_policies", "leaderboard"}
         protocol = self.model_dump(mode="json", exclude=others)
-        known = environment(self.env)
-        played = [make_scenario(name, known.walks, self.ranges) for name in self.scenarios]
-        protocol["scenarios"] = [scenario.model_dump(mode="json") for scenario in played]
-        digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
-        versions = [f"{name} {installed_version(name)}" for name in ("elastic-env", "mujoco")]
+        walks = environment(self.env).walks
+        played = [make_scenario(name, walks, self.ranges) for name in self.scenarios]
+        protocol["scenarios"] = [own.model_dump(mode="json") for own in played]
+        text = json.dumps(protocol, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        packages = ("elastic-env", "mujoco")
+        versions = [f"{name} {folders.installed_version(name)}" for name in packages]
         return "; ".join([*versions, f"protocol {digest}"])
 
     @property
@@ -351,7 +348,7 @@ def compare(
         else:
             files += draw_figures(cells, folder, config.figure_policies, axis, figure_format)
         if board:
-            files += write_leaderboard(board, folder)
+            files += leaderboard.write_leaderboard(board, folder)
         if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
         if report:
@@ -361,7 +358,7 @@ def compare(
     print_robots(robots, console)
     print_changes(rows, console)
     if board:
-        print_leaderboard(board, console)
+        leaderboard.print_leaderboard(board, console)
     return Comparison(folder, evaluations, files)
 
 
@@ -390,12 +387,12 @@ def _open_run(config: CompareConfig, output: Path | None, resumes: bool) -> Iter
     """The folder of a run, new or gone on with, for this program alone."""
     recorded = (config.model_dump(mode="json"), config.seed)
     if not resumes or output is None:
-        with run_folder(config.name, *recorded, output) as new, lock_run(new):
+        with folders.run_folder(config.name, *recorded, output) as new, folders.lock_run(new):
             yield new
         return
-    require_run(output)
-    with lock_run(output):
-        describe(output, *recorded)
+    folders.require_run(output)
+    with folders.lock_run(output):
+        folders.describe(output, *recorded)
         yield output
 
 
@@ -552,7 +549,7 @@ class Compare(Model):
                 config = config.replace(policies=own, figure_policies=[])
         published = ()
         if self.published is not None:
-            published = read_leaderboard(find_published(self.published))
+            published = leaderboard.read_leaderboard(leaderboard.find_published(self.published))
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}

@@ -21,10 +21,10 @@ from train.figures import comparison_figures, plots
 from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
 from train.figures.identification_plots import draw_identification
+from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.specs import page_chart
-from train.report.summary import print_summary, summary_table, write_episodes, write_summary
 from train.report.table_formats import Table
 from train.report.write import require_libraries, write_page
 from train.runs.console import make_table, print_files
@@ -112,13 +112,13 @@ class Demo(Model):
             files += [
                 *write_page(page, folder),
                 folder / "identification.json",
-                write_episodes(scored, folder / "episodes.csv"),
-                write_summary(scored, folder / "summary.md"),
+                summary.write_episodes(scored, folder / "episodes.csv"),
+                summary.write_summary(scored, folder / "summary.md"),
             ]
         console.print(make_table(_TESTBED, _HEAD, _testbed_rows(result, static)), "")
-        print_summary(motion, console)
+        summary.print_summary(motion, console)
         console.print("", make_table(_WALKS, _HEAD, _walk_rows(walks)), "")
-        print_summary(walks, console)
+        summary.print_summary(walks, console)
         print_files(folder, files, console)
 
 
@@ -153,7 +153,7 @@ def _report(
 def _add_cells(page: Page, evaluations: Sequence[Evaluation]) -> None:
     """Scores of some cells, and the curves of each."""
     known = evaluations[0].condition.environment
-    page.add("table", summary_table(evaluations, known.columns))
+    page.add("table", summary.summary_table(evaluations, known.columns))
     for own in comparison_figures.cells_together(evaluations):
         first = own[0].condition
         policies = group_by(own, lambda e: e.condition.policy.title)

@@ -200,8 +200,8 @@ class Onnx(Output):
         if output.suffix != ".onnx":
             problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
             raise ConfigurationError(problem)
-        files = {output: onnx_model(layout), output.with_suffix(".npz"): played_vector(layout)}
-        self.write(files, console)
+        vector = {output.with_suffix(".npz"): played_vector(layout)}
+        self.write({output: onnx_model(layout), **vector}, console)
 
 
 def _short_name(residual: str) -> str:

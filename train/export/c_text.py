@@ -88,15 +88,22 @@ def braced(values: Any) -> str:
     return f"{{{numbers(values)}}}"
 
 
+def members(row: Any, names: str) -> str:
+    """Members of a struct, numbers and flat lists of them; their names are parted by spaces."""
+    values = [row[name] for name in names.split()]
+    return ", ".join(number(own) if np.ndim(own) == 0 else braced(own) for own in values)
+
+
 def nested(values: Array) -> str:
     """Rows of an array of two or more axes, a row of the first on a line."""
-    return ",\n".join(f"    {_nested(row)}" for row in values)
+    return ",\n".join(f"    {initialiser(row)}" for row in values)
 
 
-def _nested(values: Array) -> str:
-    if values.ndim == 1:
-        return braced(values)
-    return "{" + ", ".join(map(_nested, values)) + "}"
+def initialiser(value: Any) -> str:
+    """A number, or an array as lists within lists; whole numbers stay whole."""
+    if np.ndim(value) == 0:
+        return str(value) if isinstance(value, np.integer) else number(value)
+    return "{" + ", ".join(map(initialiser, value)) + "}"
 
 
 def enumerated(names: Iterable[str]) -> str:

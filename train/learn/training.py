@@ -135,41 +135,26 @@ class Training(Trainer):
         require_finite("the variance of the returns", returns.var)
 
     def _write(self, checkpoint: Path) -> None:
-        parameters = io.BytesIO()  # torch itself calls a full disk an internal error
-        torch.save(self._parameters(), parameters)
-        (checkpoint / "model.pt").write_bytes(parameters.getbuffer())
+        parameters = {"model": self.model.get_parameters(), "rng": torch.get_rng_state()}
+        if (entropy := self._entropy_weight) is not None:
+            parameters["log_ent_coef"] = entropy.detach()
+        content = io.BytesIO()  # torch itself calls a full disk an internal error
+        torch.save(parameters, content)
+        (checkpoint / "model.pt").write_bytes(content.getbuffer())
         write_state(checkpoint, "state", self._state())
 
     def _read(self, checkpoint: Path) -> None:
         parameters = torch.load(checkpoint / "model.pt", weights_only=True)
-        self.model.policy.load_state_dict(parameters["policy"])
-        for name, optimiser in self._optimisers().items():
-            optimiser.load_state_dict(parameters["optimisers"][name])
-        if "log_ent_coef" in parameters:
-            self.model.log_ent_coef.data.copy_(parameters["log_ent_coef"])
+        self.model.set_parameters(parameters["model"], device="cpu")
+        if (entropy := self._entropy_weight) is not None:
+            entropy.data.copy_(parameters["log_ent_coef"])
         torch.set_rng_state(parameters["rng"])
         self._load(read_state(checkpoint, "state"))
 
-    def _parameters(self) -> dict[str, Any]:
-        optimisers = self._optimisers().items()
-        parameters = {
-            "policy": self.model.policy.state_dict(),
-            "optimisers": {name: own.state_dict() for name, own in optimisers},
-            "rng": torch.get_rng_state(),
-        }
-        if getattr(self.model, "log_ent_coef", None) is not None:
-            parameters["log_ent_coef"] = self.model.log_ent_coef.detach()
-        return parameters
-
-    def _optimisers(self) -> dict[str, Any]:
-        policy = self.model.policy
-        found = {
-            "policy": getattr(policy, "optimizer", None),
-            "actor": getattr(getattr(policy, "actor", None), "optimizer", None),
-            "critic": getattr(getattr(policy, "critic", None), "optimizer", None),
-            "entropy": getattr(self.model, "ent_coef_optimizer", None),
-        }
-        return {name: own for name, own in found.items() if own is not None}
+    @property
+    def _entropy_weight(self) -> Any:
+        """Logarithm of the weight of the entropy where SAC learns it, else None."""
+        return getattr(self.model, "log_ent_coef", None)
 
     def _state(self) -> dict[str, Any]:
         model = self.model
