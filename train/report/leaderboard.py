@@ -185,7 +185,7 @@ def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
     page.add("table", board(found))
     claims = claims_table(found)
     if claims.rows:
-        page.add("text", paired_text(), "What learning adds")
+        page.add("text", TEXTS["paired"].format(signs=SIGNS_ARE), "What learning adds")
         page.add("table", claims)
     single = scenarios_board(found)
     if single is not None:
@@ -198,11 +198,6 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
     page = Page("", "")
     add_leaderboard(page, found)
     return "\n\n".join(page.sections[0].as_markdown[1:]) + "\n"
-
-
-def paired_text() -> str:
-    """The paragraph above the paired changes."""
-    return TEXTS["paired"].format(signs=SIGNS_ARE)
 
 
 def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
