@@ -344,7 +344,8 @@ def compare(
             files.append(write_robots(robots, folder / "robots.csv"))
         files.append(write_summary(cells, folder / "summary.md"))
         if maps:
-            files += [*draw_maps(maps, folder, figure_format), write_maps(maps, folder / "map.csv")]
+            files += draw_maps(maps, folder, figure_format)
+            files.append(write_maps(maps, folder / "map.csv"))
         else:
             files += draw_figures(cells, folder, config.figure_policies, axis, figure_format)
         if board:

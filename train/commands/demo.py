@@ -67,6 +67,7 @@ _PARTS = [
 ]
 """Static poses and a motion of the testbed, then walks."""
 
+Cells = Sequence[Evaluation]
 Rows = list[tuple[str, str, str]]
 """Quantity, its figure here and in the paper."""
 
@@ -133,9 +134,7 @@ _TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
 _WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
-def _report(
-    found: Rows, pictures: Sequence[Path], motion: Sequence[Evaluation], walks: Sequence[Evaluation]
-) -> Page:
+def _report(found: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
     """The tables of the demonstration, and its curves, which can be zoomed."""
     page = Page("Demonstration", f"{_PLAYED}.")
     page.section("One joint, at rest")
@@ -150,7 +149,7 @@ def _report(
     return page
 
 
-def _add_cells(page: Page, evaluations: Sequence[Evaluation]) -> None:
+def _add_cells(page: Page, evaluations: Cells) -> None:
     """Scores of some cells, and the curves of each."""
     known = evaluations[0].condition.environment
     page.add("table", summary.summary_table(evaluations, known.columns))
@@ -166,7 +165,7 @@ _POINTS = 1500
 """Points of a curve on the page, at most."""
 
 
-def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
+def _testbed_rows(result: Identification, static: Cells) -> Rows:
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     line = f"{result.line_stiffness_nm_per_rad:.1f}"
@@ -186,7 +185,7 @@ def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
     return rows
 
 
-def _walk_rows(walks: Sequence[Evaluation]) -> Rows:
+def _walk_rows(walks: Cells) -> Rows:
     rows = []
     for walk in walks:
         condition = walk.condition

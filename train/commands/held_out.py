@@ -41,10 +41,10 @@ def judge_poses(
 def show_held_out(held_out: HeldOut, console: Console) -> None:
     """Print the verdict, all errors, and how they fall with the number of poses."""
     console.print(verdict(held_out), highlight=False)
-    rows = [
-        [error.name, *(_text(value, held_out) for value in (error.rms, error.mean, error.worst))]
-        for error in held_out.errors
-    ]
+    rows = []
+    for error in held_out.errors:
+        figures = (error.rms, error.mean, error.worst)
+        rows.append([error.name, *(_text(figure, held_out) for figure in figures)])
     title = f"error of {held_out.of} at {held_out.held_out} poses that were held out"
     head = ["prediction", f"rms [{held_out.unit}]", "mean", "worst"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))

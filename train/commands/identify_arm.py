@@ -129,7 +129,8 @@ def identify_arm(
     if result.held_out is not None:
         show_held_out(result.held_out, console)
     console.print(result_table(result))
-    for line in (summed_up(fit), *remarks(result), *(f"wrote {path}" for path in files)):
+    written = [f"wrote {path}" for path in files]
+    for line in (summed_up(fit), *remarks(result), *written):
         console.print(line)
     return result
 

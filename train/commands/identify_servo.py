@@ -197,7 +197,8 @@ def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console)
         ConfigurationError: An option names one twice, or nothing is left to fit.
     """
     logs, further = (_each_once(given) for given in (paths, unfitted))
-    left_out = [path for path, keys in logs.items() if any(keys & own for own in further.values())]
+    named = set().union(*further.values())
+    left_out = [path for path, keys in logs.items() if keys & named]
     if len(left_out) == len(logs):
         raise ConfigurationError(
             f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"

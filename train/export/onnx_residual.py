@@ -129,8 +129,9 @@ class _Graph:
         parts: Sequence[Any] = (self._nodes, name, self._inputs, self._outputs)
         graph = onnx.helper.make_graph(*parts, initializer=self._constants)
         opsets = [onnx.helper.make_opsetid("", _OPSET)]
-        made = {"producer_name": "elastic-env", "producer_version": facts["elastic_env"]}
-        model = onnx.helper.make_model(graph, ir_version=_IR_VERSION, opset_imports=opsets, **made)
+        made = {"ir_version": _IR_VERSION, "opset_imports": opsets}
+        made |= {"producer_name": "elastic-env", "producer_version": facts["elastic_env"]}
+        model = onnx.helper.make_model(graph, **made)
         onnx.helper.set_model_props(model, facts)
         onnx.checker.check_model(model, full_check=True)
         return model.SerializeToString(deterministic=True)

@@ -56,12 +56,13 @@ def page_chart(chart: Chart) -> Spec:
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{last}", **ticks)
     height = round(130 + _PIXELS * total)
     strip = _STRIP / (height - 28 - 20 * legend_rows - 50) if chart.marks else 0.0
-    layout["legend"] = {"orientation": "h", "y": 1.0 + 1.5 * strip, "yanchor": "bottom", "x": 0.0}
+    above = 1.0 + 1.5 * strip
+    layout["legend"] = {"orientation": "h", "y": above, "yanchor": "bottom", "x": 0.0}
     layout["showlegend"] = True
     is_small = len({curve.name for curve in curves if curve.name}) < 7
     layout["hovermode"] = "x unified" if is_small else "closest"
     shapes = [_band(*span, SHADE) for span in chart.shaded]
-    ends = (1.0 + 0.5 * strip, 1.0 + 1.5 * strip)
+    ends = (1.0 + 0.5 * strip, above)
     shapes += [_band(*span, mark.colour, ends) for mark in chart.marks for span in mark.spans]
     layout["shapes"] = shapes
     return {"data": data, "layout": {**layout, "height": height}}
