@@ -35,7 +35,8 @@ from tests.test_arm_identification import (
     poses,
     shown,
 )
-from train.commands.identify_arm import ArmOptions, run_arm_identification
+from train.commands.identify_arm import identify_arm
+from train.commands.identify_options import ArmOptions, IdentificationRun
 from train.runs.escaping import write_records
 
 POSES = 40
@@ -73,7 +74,8 @@ def planned_poses() -> Array:
         robot=str(FOLDER / "arm.xml"), end_effector="marker", measured_by="end_effector", plan=POSES
     )
     with tempfile.TemporaryDirectory() as folder:
-        run_arm_identification(config, Console(quiet=True), output=Path(folder) / "plan")
+        run = IdentificationRun(output=Path(folder) / "plan")
+        identify_arm(config, run, Console(quiet=True))
         with (Path(folder) / "plan" / "plan.csv").open(newline="", encoding="utf-8") as file:
             return np.array(
                 [

@@ -41,9 +41,10 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
-from train.commands.held_out import HoldoutOptions, judge_poses
+from train.commands.held_out import judge_poses
 from train.commands.identify_arm import result_table
-from train.figures.arm_plots import deflections
+from train.commands.identify_options import HoldoutOptions
+from train.figures.identification_plots import deflections
 
 FOLDER = Path(__file__).parents[1] / "docs" / "identification"
 ARM = mujoco.MjModel.from_xml_path(str(FOLDER / "arm.xml"))

@@ -22,7 +22,8 @@ from tests.benchmarks.test_arm import arm as seven_joints
 from tests.test_position_compensator import ARM, JOINTS, URDF
 from tests.trees import ORDER, TREE
 from train.commands.cli import main
-from train.export.c_arm import c_example, c_header, payload_frames
+from train.export.c_arm import c_header, payload_frames
+from train.export.c_text import c_example
 
 # poses beyond limits are meant
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
@@ -273,7 +274,7 @@ def test_two_robots_fit_in_one_program_that_checks_them(compiler: str, tmp_path:
 def test_the_example_checks_and_times_the_header(compiler: str, tmp_path: Path) -> None:
     """Catches an example that does not compile, and one for another header."""
     (tmp_path / "robot.h").write_text(header := c_header(springs(), "arm"))
-    made = c_example("arm", "robot.h")
+    made = c_example("arm", "arm", "robot.h")
     assert "add_executable(arm_main arm_main.c)" in made["CMakeLists.txt"]
     program = compiled(tmp_path, header, compiler, made["arm_main.c"], RELEASED)
     said = subprocess.run([program], capture_output=True, text=True, check=True).stdout

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from train.cells.key import cell_key
 from train.cells.play import CellsFailedError, in_batches, run_conditions
-from train.cells.store import Store, UnfitCellError, _digest
+from train.cells.store import Store, UnfitCellError, _digest, cell_key
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.workers.executors import Executors

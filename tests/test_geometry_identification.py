@@ -31,7 +31,8 @@ from elastic_env.rigid.tree.links import Tree
 from tests import test_arm_identification
 from train.commands.cli import main
 from train.commands.held_out import verdict
-from train.commands.identify_geometry import GeometryOptions, pose_problem
+from train.commands.identify_geometry import pose_problem
+from train.commands.identify_options import GeometryOptions
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base" pos="0 0 0.3">
 <joint name="pan" axis="0 0 1" range="-2 2" limited="true"/>

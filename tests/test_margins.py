@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from elastic_env.world.scenario import make_scenario
 from train.commands import margins as command
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.episodes import evaluate
 from train.evaluate.margins import (
     CHECKED_SHARE,
     NO_REST,
@@ -24,13 +26,59 @@ from train.evaluate.margins import (
     bisect,
     failure_causes,
     find_margins,
-    gain_margin,
     margin_table,
-    stronger,
 )
 from train.evaluate.rollout import make_shared_env
 
 STEP = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
+GAINS = ("proportional", "integral", "derivative", "trim")
+PELVIS = "pelvis_error_rms_rad"
+
+
+def stronger(gains: PostureGains, factor: float) -> PostureGains:
+    """Posture feedback with its gains times a factor.
+
+    Args:
+        gains: Proportional, integral and derivative gain, and trim, among others.
+        factor: Of all four [1].
+    """
+    return gains.replace(**{name: factor * getattr(gains, name) for name in GAINS})
+
+
+@dataclass(frozen=True)
+class GainMargin:
+    """What stronger gains cost.
+
+    Attributes:
+        failed: Episodes that failed with the plain and with the stronger gains.
+        ratio: Mean pelvis error with the stronger gains over that with the plain ones [1]; nan
+            where an episode failed.
+    """
+
+    failed: tuple[int, int]
+    ratio: float
+
+
+def gain_margin(
+    condition: Condition, gains: PostureGains, factor: float, num_threads: int = 0
+) -> GainMargin:
+    """Play the same episodes with plain and with stronger gains of the posture feedback.
+
+    Args:
+        condition: A policy with posture feedback, and all that strains it: delay, IMU, length.
+        gains: The plain ones.
+        factor: Of the stronger ones over the plain ones [1].
+        num_threads: Threads of the physics, 0 for all cores.
+    """
+    failed = []
+    errors = []
+    for own in (1.0, factor):
+        posture = stronger(gains, own).model_dump()
+        policy = condition.policy.replace(options={**condition.policy.options, "posture": posture})
+        played = evaluate(condition.replace(policy=policy), num_threads=num_threads)
+        failed.append(played.num_failed)
+        errors.append(played.values(PELVIS).mean() if not played.num_failed else np.nan)
+    return GainMargin((failed[0], failed[1]), float(errors[1] / errors[0]))
 
 
 def walk(policy: str = "input_output", **fields: Any) -> Condition:

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from baselines.identification.geometry_fit import fit_geometry
 from docs.pages import recorded
+from docs.recorded import justin
+from docs.recorded.justin import RecordedPoses, find_rigid, justin_spec, read_poses
+from docs.recorded.servos import servo_rows
+from docs.recorded.sources import Source
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from train.recorded import justin
-from train.recorded.justin import RecordedPoses, find_rigid, justin_spec, read_poses
-from train.recorded.servos import servo_rows
-from train.recorded.sources import Source
 
 
 def craig(row: justin.Row, q: float) -> Array:

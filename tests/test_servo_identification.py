@@ -29,13 +29,13 @@ from baselines.identification.servo_problem import drive, duty_per_torque_gain
 from baselines.identification.servo_replay import NAMES, Replay
 from baselines.identification.servo_result import ServoIdentification, describe_servo
 from docs.pages.recorded import priors
+from docs.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 from elastic_env.core.errors import ConfigurationError, ElasticError, MissingExtraError
 from elastic_env.core.signals import Array
 from elastic_env.joint.joint_settings import read_joints
 from tests.servo_trials import SOUGHT, draw_servo, holds, make_logs
 from train.commands.cli import main
 from train.commands.identify_servo import fitted_logs, show_result, verdict
-from train.recorded.servos import FURTHER_SEEDS, servo_figures, servo_rows
 
 MASS_KG, LENGTH_M = 0.5, 0.1
 WEIGHT = MASS_KG * GRAVITY * LENGTH_M

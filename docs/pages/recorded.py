@@ -1,10 +1,10 @@
-"""Tables of the page of recorded robots, from what `python -m train.recorded` writes."""
+"""Tables of the page of recorded robots, from what `python -m docs.recorded` writes."""
 
 import math
 from collections.abc import Mapping, Sequence
 
 from docs.pages.cells import Rows, page_table
-from train.recorded.justin import DRAWN, GUESSED
+from docs.recorded.justin import DRAWN, GUESSED
 
 _SOURCE_MM = {
     "rigid, as given": "21.3",

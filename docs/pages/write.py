@@ -72,7 +72,7 @@ TABLES = {
     "cluster": "python -m tests.cluster_trials measures it",
     "servo_coverage": "python -m tests.servo_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
-    **dict.fromkeys(("recorded_justin", "recorded_servos"), "python -m train.recorded writes it"),
+    **dict.fromkeys(("recorded_justin", "recorded_servos"), "python -m docs.recorded writes it"),
     "margins": "copy it from runs/margins/margins.csv after `elastic margins`",
     "step": "python -m docs.pages.step writes it",
     **dict.fromkeys(

@@ -11,8 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.errors import ElasticError, SystemFailedError
-from train.cells.key import cell_key
-from train.cells.store import Store, UnfitCellError
+from train.cells.store import Store, UnfitCellError, cell_key
 from train.evaluate import rollout
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
@@ -77,13 +76,13 @@ def run_conditions(
         console.print(f"{number} of {len(conditions)} cells are kept")
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if own is None else Outcome(own) for own in kept]
-    finished = list[Evaluation]()
-    failed = dict[str, int]()
-    for condition, result in zip(conditions, results, strict=True):
-        if result is not None and result.error is None:
-            finished.append(result.value)
-        elif result is not None:
-            failed.update([_explain_failure(condition, result)])
+    ended = [result for result in results if result is not None]
+    finished = [result.value for result in ended if result.error is None]
+    failed = dict(
+        _explain_failure(condition, result)
+        for condition, result in zip(conditions, results, strict=True)
+        if result is not None and result.error is not None
+    )
     if failed:
         raise CellsFailedError(failed, finished)
     if None in results:

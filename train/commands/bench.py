@@ -201,18 +201,16 @@ def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Fig
         require_known(f"metric of the {case.env}", case.figures, known)
     for metric, accepted in case.figures.items():
         score = _score(found, metric)
-        measured = score and score.value
         own = case.margins.get(metric, margin)
-        bound = None if accepted is None else accepted + own * abs(accepted)
-        yield {
+        figure: _Figure = {
             "case": f"{case.env}, {motion}, {case.scenario}, {policy}",
             "metric": metric,
-            "measured": measured,
+            "measured": score and score.value,
             "interval": score.ends if score and score.has_interval else None,
             "accepted": accepted,
-            "bound": bound,
-            "problem": _problem(metric, measured, accepted, bound, found),
+            "bound": None if accepted is None else accepted + own * abs(accepted),
         }
+        yield {**figure, "problem": _problem(figure, found)}
 
 
 def _score(found: Evaluation, metric: str) -> Estimate | None:
@@ -222,8 +220,10 @@ def _score(found: Evaluation, metric: str) -> Estimate | None:
     return over_cells([values[None]]) if is_whole else None
 
 
-def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evaluation) -> str:
-    if ends := dict.fromkeys(own["termination"] for own in found.episodes if own["termination"]):
+def _problem(figure: _Figure, found: Evaluation) -> str:
+    metric, measured, bound = (figure[key] for key in ("metric", "measured", "bound"))
+    terminations = [own["termination"] for own in found.episodes]
+    if ends := dict.fromkeys(filter(None, terminations)):
         who = f"{found.num_failed} of {len(found.episodes)} episodes"
         who = "the episode" if len(found.episodes) == 1 else who
         return f"{metric} has no value: {who} ended as {' and '.join(map(repr, ends))}"
@@ -233,7 +233,7 @@ def _problem(metric: str, measured: Any, accepted: Any, bound: Any, found: Evalu
         return f"{metric} is {measured:.4g}, and nothing was accepted yet; --update accepts it"
     if measured <= bound:
         return ""
-    worse = f" ({_change(measured, accepted)})" if accepted else ""
+    worse = f" ({_change(measured, figure['accepted'])})" if figure["accepted"] else ""
     return f"{metric} is {measured:.4g}{worse}, at most {bound:.4g} is accepted"
 
 
@@ -256,6 +256,9 @@ def _child(node: Any, name: str) -> Any:
     return next(value for key, value in node.value if key.value == name)
 
 
+_NUMBERS = ("measured", "accepted", "bound")
+
+
 def _table(figures: list[_Figure]) -> Table:
     titles = ("rollout and figure", "measured", "accepted", "at most", "change", "")
     heads = [Head(title, is_number=0 < n < 5) for n, title in enumerate(titles)]
@@ -265,18 +268,16 @@ def _table(figures: list[_Figure]) -> Table:
     for case, own in group_by(figures, lambda figure: figure["case"]).items():
         rows.append(Row((case,), kind="heading"))
         for figure in own:
-            _, metric, measured, interval, *bounds, problem = figure.values()
-            verdict = "falls short" if problem else "kept"
-            if measured is not None and bounds[0] is not None:
-                is_better = measured < 2.0 * bounds[0] - bounds[1]
-                verdict = "better: --update keeps it" if is_better else verdict
-            if figure["bound"] is None and figure["measured"] is not None:
+            measured, accepted, bound = (figure[key] for key in _NUMBERS)
+            verdict = "falls short" if figure["problem"] else "kept"
+            if measured is not None and bound is None:
                 verdict = "new"
-            texts = ["-" if number is None else f"{number:.4g}" for number in (measured, *bounds)]
-            if interval:
-                texts[0] += " [{:.4g}, {:.4g}]".format(*interval)
-            change = _change(figure["measured"], figure["accepted"])
-            rows.append(Row((metric, *texts, change, verdict)))
+            elif measured is not None and measured < 2.0 * accepted - bound:
+                verdict = "better: --update keeps it"
+            texts = ["-" if n is None else f"{n:.4g}" for n in (measured, accepted, bound)]
+            if figure["interval"]:
+                texts[0] += " [{:.4g}, {:.4g}]".format(*figure["interval"])
+            rows.append(Row((figure["metric"], *texts, _change(measured, accepted), verdict)))
     title = "short rollouts against what was accepted"
     return Table(tuple(heads), tuple(rows), title=title)
 

@@ -39,19 +39,14 @@ from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import Standing, append_standings, standings
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
+from train.report import leaderboard
 from train.report.change_tables import print_changes, write_maps, write_statistics
-from train.report.leaderboard import (
-    find_published,
-    print_leaderboard,
-    read_leaderboard,
-    write_leaderboard,
-)
 from train.report.report_text import Results
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.report.write import require_libraries, write_report
+from train.runs import folders
 from train.runs.console import print_files, warn_once
-from train.runs.folders import describe, installed_version, lock_run, require_run, run_folder
 from train.runs.presets import find_configuration, print_presets
 from train.runs.user_code import CodeNamingModel, is_a, recorded_config
 from train.speed.step_times import step_times
@@ -156,11 +151,13 @@ class CompareConfig(CodeNamingModel):
         """Version and protocol: rows of leaderboards can stand together if these are the same."""
         others = {"name", "policies", "figure_policies", "leaderboard"}
         protocol = self.model_dump(mode="json", exclude=others)
-        known = environment(self.env)
-        played = [make_scenario(name, known.walks, self.ranges) for name in self.scenarios]
-        protocol["scenarios"] = [scenario.model_dump(mode="json") for scenario in played]
-        digest = hashlib.sha256(json.dumps(protocol, sort_keys=True).encode()).hexdigest()[:16]
-        versions = [f"{name} {installed_version(name)}" for name in ("elastic-env", "mujoco")]
+        walks = environment(self.env).walks
+        played = [make_scenario(name, walks, self.ranges) for name in self.scenarios]
+        protocol["scenarios"] = [own.model_dump(mode="json") for own in played]
+        text = json.dumps(protocol, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        packages = ("elastic-env", "mujoco")
+        versions = [f"{name} {folders.installed_version(name)}" for name in packages]
         return "; ".join([*versions, f"protocol {digest}"])
 
     @property
@@ -269,7 +266,9 @@ class CompareConfig(CodeNamingModel):
         kinds = [known.label(reference) for reference in self.references]
 
         def label(kind: str, reference: Reference) -> str | None:
-            words = dict.fromkeys([*kind.split(), *_parameters(reference, known)])
+            given = reference.items() if isinstance(reference, dict) else ()
+            others = [f"{k}={v}" for k, v in given if k not in ("kind", known.motion)]
+            words = dict.fromkeys([*kind.split(), *others])
             return " ".join(words) if kinds.count(kind) > 1 else None
 
         return list(map(label, kinds, self.references))
@@ -345,11 +344,12 @@ def compare(
             files.append(write_robots(robots, folder / "robots.csv"))
         files.append(write_summary(cells, folder / "summary.md"))
         if maps:
-            files += [*draw_maps(maps, folder, figure_format), write_maps(maps, folder / "map.csv")]
+            files += draw_maps(maps, folder, figure_format)
+            files.append(write_maps(maps, folder / "map.csv"))
         else:
             files += draw_figures(cells, folder, config.figure_policies, axis, figure_format)
         if board:
-            files += write_leaderboard(board, folder)
+            files += leaderboard.write_leaderboard(board, folder)
         if rows:
             files.append(write_statistics(rows, folder / "statistics.csv"))
         if report:
@@ -359,7 +359,7 @@ def compare(
     print_robots(robots, console)
     print_changes(rows, console)
     if board:
-        print_leaderboard(board, console)
+        leaderboard.print_leaderboard(board, console)
     return Comparison(folder, evaluations, files)
 
 
@@ -388,12 +388,12 @@ def _open_run(config: CompareConfig, output: Path | None, resumes: bool) -> Iter
     """The folder of a run, new or gone on with, for this program alone."""
     recorded = (config.model_dump(mode="json"), config.seed)
     if not resumes or output is None:
-        with run_folder(config.name, *recorded, output) as new, lock_run(new):
+        with folders.run_folder(config.name, *recorded, output) as new, folders.lock_run(new):
             yield new
         return
-    require_run(output)
-    with lock_run(output):
-        describe(output, *recorded)
+    folders.require_run(output)
+    with folders.lock_run(output):
+        folders.describe(output, *recorded)
         yield output
 
 
@@ -459,12 +459,6 @@ def _motions_of_map(axes: Any, known: Environment) -> list[Any]:
             values = axis.get("values")
             return values if isinstance(values, list) else []
     return []
-
-
-def _parameters(reference: Reference, known: Environment) -> list[str]:
-    given = reference if isinstance(reference, dict) else {}
-    others = [name for name in given if name not in ("kind", known.motion)]
-    return [f"{name}={given[name]}" for name in others]
 
 
 class Compare(Model):
@@ -557,7 +551,7 @@ class Compare(Model):
                 config = config.replace(policies=own, figure_policies=[])
         published = ()
         if self.published is not None:
-            published = read_leaderboard(find_published(self.published))
+            published = leaderboard.read_leaderboard(leaderboard.find_published(self.published))
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}

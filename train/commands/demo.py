@@ -17,13 +17,14 @@ from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.rollout import make_vector_env
-from train.figures import comparison_figures, plots, testbed_plots
+from train.figures import comparison_figures, plots
 from train.figures.chart import time_chart
 from train.figures.colours import policy_colours
+from train.figures.identification_plots import draw_identification
+from train.report import summary
 from train.report.page import TEXTS, Page
 from train.report.report_text import capital
 from train.report.specs import page_chart
-from train.report.summary import print_summary, summary_table, write_episodes, write_summary
 from train.report.table_formats import Table
 from train.report.write import require_libraries, write_page
 from train.runs.console import make_table, print_files
@@ -66,6 +67,7 @@ _PARTS = [
 ]
 """Static poses and a motion of the testbed, then walks."""
 
+Cells = Sequence[Evaluation]
 Rows = list[tuple[str, str, str]]
 """Quantity, its figure here and in the paper."""
 
@@ -101,8 +103,8 @@ class Demo(Model):
             names = ("fig5_identification", "fig6_static_errors", "sine")
             fig5, fig6, sine = (folder / f"{name}.{self.figure_format}" for name in names)
             files = [
-                testbed_plots.draw_identification(result, points, [model], fig5),
-                testbed_plots.draw_static_errors(static, model, fig6),
+                draw_identification(result, points, [model], fig5),
+                comparison_figures.draw_static_errors(static, model, fig6),
                 comparison_figures.draw_picture("time", known.curves, motion, sine),
             ]
             for walk in comparison_figures.cells_together(walks):
@@ -111,13 +113,13 @@ class Demo(Model):
             files += [
                 *write_page(page, folder),
                 folder / "identification.json",
-                write_episodes(scored, folder / "episodes.csv"),
-                write_summary(scored, folder / "summary.md"),
+                summary.write_episodes(scored, folder / "episodes.csv"),
+                summary.write_summary(scored, folder / "summary.md"),
             ]
         console.print(make_table(_TESTBED, _HEAD, _testbed_rows(result, static)), "")
-        print_summary(motion, console)
+        summary.print_summary(motion, console)
         console.print("", make_table(_WALKS, _HEAD, _walk_rows(walks)), "")
-        print_summary(walks, console)
+        summary.print_summary(walks, console)
         print_files(folder, files, console)
 
 
@@ -132,9 +134,7 @@ _TESTBED = "the paper's testbed experiments, Figs. 5 and 6"
 _WALKS = "the paper's walks, Figs. 7 and 8: largest roll and pitch"
 
 
-def _report(
-    found: Rows, pictures: Sequence[Path], motion: Sequence[Evaluation], walks: Sequence[Evaluation]
-) -> Page:
+def _report(found: Rows, pictures: Sequence[Path], motion: Cells, walks: Cells) -> Page:
     """The tables of the demonstration, and its curves, which can be zoomed."""
     page = Page("Demonstration", f"{_PLAYED}.")
     page.section("One joint, at rest")
@@ -149,10 +149,10 @@ def _report(
     return page
 
 
-def _add_cells(page: Page, evaluations: Sequence[Evaluation]) -> None:
+def _add_cells(page: Page, evaluations: Cells) -> None:
     """Scores of some cells, and the curves of each."""
     known = evaluations[0].condition.environment
-    page.add("table", summary_table(evaluations, known.columns))
+    page.add("table", summary.summary_table(evaluations, known.columns))
     for own in comparison_figures.cells_together(evaluations):
         first = own[0].condition
         policies = group_by(own, lambda e: e.condition.policy.title)
@@ -165,7 +165,7 @@ _POINTS = 1500
 """Points of a curve on the page, at most."""
 
 
-def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
+def _testbed_rows(result: Identification, static: Cells) -> Rows:
     stiffness = f"{result.stiffness_nm_per_rad:.1f}"
     interval = f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
     line = f"{result.line_stiffness_nm_per_rad:.1f}"
@@ -179,13 +179,13 @@ def _testbed_rows(result: Identification, static: Sequence[Evaluation]) -> Rows:
     ]
     ranges = ("-56.2 to +41.7", "-3.7 to +7.1")
     for evaluation, paper in zip(static, ranges, strict=True):
-        error = 1e3 * testbed_plots.static_errors(evaluation)
+        error = 1e3 * comparison_figures.static_errors(evaluation)
         name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
         rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
     return rows
 
 
-def _walk_rows(walks: Sequence[Evaluation]) -> Rows:
+def _walk_rows(walks: Cells) -> Rows:
     rows = []
     for walk in walks:
         condition = walk.condition

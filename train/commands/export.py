@@ -1,6 +1,6 @@
 """`elastic export`: compensators and residuals for other programs, SB3's models as residuals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +15,9 @@ from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, shorten
 from elastic_env.core.files import write_whole
 from elastic_env.joint.model_text import is_file, name_of, read_bytes
-from train.commands.options import StiffnessOrFile, option_name
-from train.export.c_arm import c_example, c_header
-from train.export.c_text import prefix_of, require_prefix
+from train.commands.options import StiffnessOrFile, given_options
+from train.export.c_arm import c_header
+from train.export.c_text import c_example, prefix_of, require_prefix
 
 _OF_WALKER = ("input_output", "adaptive_posture")
 """Policies of a walker that are there in C."""
@@ -106,55 +106,46 @@ class C(Output):
 
     def run(self, console: Console) -> None:
         """Export."""
-        export = self._arm
+        program = "arm"
         name = Path(self.model).stem
         if self.model.startswith(RESIDUAL):
-            export = self._residual
+            program = "residual"
             name = _short_name(self.model)
         elif self.model in _OF_WALKER:
-            export = self._walker
-            name = "walker"
-        self._refuse(["env"] if export == self._arm else _OF_ARMS)
+            program = name = "walker"
+        if unused := given_options(self, ["env"] if program == "arm" else _OF_ARMS):
+            raise ConfigurationError(
+                f"{', '.join(unused)}: without effect on {shorten(self.model)}; leave it out"
+            )
         prefix = prefix_of(name) if self.prefix is None else require_prefix(self.prefix)
         output = self.output or Path(f"{prefix}.h")
-        header, example = export(prefix, f"../{output.name}")
-        files = {output: header}
+        headers = {"arm": self._arm, "residual": self._residual, "walker": self._walker}
+        files = {output: headers[program](prefix)}
         if self.example:
             folder = output.with_name(f"{prefix}_example")
-            files |= {folder / name: text for name, text in example.items()}
+            example = c_example(program, prefix, f"../{output.name}")
+            files |= {folder / file: text for file, text in example.items()}
         self.write(files, console)
 
-    def _refuse(self, names: Sequence[str]) -> None:
-        """Refuse options that have no effect here."""
-        given = [
-            name for name in names if getattr(self, name) != type(self).model_fields[name].default
-        ]
-        if given:
-            listed = ", ".join(option_name((name,)) for name in given)
-            problem = f"{listed}: without effect on {shorten(self.model)}; leave it out"
-            raise ConfigurationError(problem)
-
-    def _residual(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
-        """Header and example of a residual."""
-        from train.export.c_residual import c_residual, c_residual_example
+    def _residual(self, prefix: str) -> str:
+        """Header of a residual."""
+        from train.export.c_residual import c_residual
         from train.export.residual_layout import ResidualLayout
 
-        layout = ResidualLayout.of(self.model, self.env)
-        return c_residual(layout, prefix), c_residual_example(prefix, header)
+        return c_residual(ResidualLayout.of(self.model, self.env), prefix)
 
-    def _walker(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
-        """Header and example of a walker's policy."""
+    def _walker(self, prefix: str) -> str:
+        """Header of a walker's policy."""
         from train.evaluate.conditions import Condition, PolicySpec
         from train.evaluate.rollout import make_vector_env
-        from train.export.c_walker import c_walker, c_walker_example
+        from train.export.c_walker import c_walker
 
         condition = Condition(env=self.env or "walker", policy=PolicySpec(name=self.model))
         with closing(make_vector_env(condition, num_envs=1, num_threads=1)) as worlds:
-            policy = baselines.make(self.model, worlds)
-        return c_walker(policy, prefix), c_walker_example(prefix, header)
+            return c_walker(baselines.make(self.model, worlds), prefix)
 
-    def _arm(self, prefix: str, header: str) -> tuple[str, dict[str, str]]:
-        """Header and example of an arm."""
+    def _arm(self, prefix: str) -> str:
+        """Header of an arm."""
         if not is_file(self.model):
             raise ConfigurationError(
                 f"no model at {name_of(self.model)}; give a file of MJCF (.xml) or URDF (.urdf)"
@@ -176,7 +167,7 @@ class C(Output):
         )
         named = [self.model, *([self.joints] if isinstance(self.joints, str) else [])]
         sources = {Path(name).name: read_bytes(Path(name)) for name in named}
-        return c_header(compensator, prefix, sources), c_example(prefix, header)
+        return c_header(compensator, prefix, sources)
 
 
 class Onnx(Output):
@@ -209,8 +200,8 @@ class Onnx(Output):
         if output.suffix != ".onnx":
             problem = f"a graph of ONNX is a file .onnx, got {shorten(output)}"
             raise ConfigurationError(problem)
-        files = {output: onnx_model(layout), output.with_suffix(".npz"): played_vector(layout)}
-        self.write(files, console)
+        vector = {output.with_suffix(".npz"): played_vector(layout)}
+        self.write({output: onnx_model(layout), **vector}, console)
 
 
 def _short_name(residual: str) -> str:

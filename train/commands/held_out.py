@@ -1,25 +1,15 @@
-"""Held-out errors of an identification from poses: their options, and how they are printed."""
+"""Held-out errors of an identification from poses, and how they are printed."""
 
-from collections.abc import Callable
+from functools import partial
 
 from rich import box
 from rich.console import Console
 
 from baselines.identification.holdout import HeldOut, Judged, judge, num_fits, split
-from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import IntArray
+from train.commands.identify_options import HoldoutOptions
 from train.runs.console import make_table
 from train.runs.progress import show_progress
-
-
-class HoldoutOptions(Model):
-    """What `elastic identify` keeps back from a fit, to judge it."""
-
-    holdout: float = quantity("1", 0.3, ge=0, lt=1)
-    """Share of the poses or logs that is not fitted, and predicted beside rivals; 0 for none."""
-    folds: int = quantity("1", 1, ge=1, le=20)
-    """Hold each pose out once, in so many folds."""
 
 
 def judge_poses(
@@ -40,26 +30,21 @@ def judge_poses(
         console.print(f"nothing is held out: {reason}", highlight=False)
         return None
     try:
-        return _judge(judged, parts, console, seed)
+        work = {"held-out fits": num_fits(judged, parts)}
+        with show_progress(console, work, transient=True) as show:
+            return judge(judged, parts, seed, partial(show, 0))
     except ElasticError as error:
         console.print(f"nothing is held out: without some poses {error}", highlight=False)
         return None
 
 
-def _judge(judged: Judged, parts: list[IntArray], console: Console, seed: int) -> HeldOut:
-    work = {"held-out fits": num_fits(judged, parts)}
-    with show_progress(console, work, transient=True) as show:
-        report: Callable[[int], None] = lambda done: show(0, done)  # noqa: E731
-        return judge(judged, parts, seed, report)
-
-
 def show_held_out(held_out: HeldOut, console: Console) -> None:
     """Print the verdict, all errors, and how they fall with the number of poses."""
     console.print(verdict(held_out), highlight=False)
-    rows = [
-        [error.name, *(_text(value, held_out) for value in (error.rms, error.mean, error.worst))]
-        for error in held_out.errors
-    ]
+    rows = []
+    for error in held_out.errors:
+        figures = (error.rms, error.mean, error.worst)
+        rows.append([error.name, *(_text(figure, held_out) for figure in figures)])
     title = f"error of {held_out.of} at {held_out.held_out} poses that were held out"
     head = ["prediction", f"rms [{held_out.unit}]", "mean", "worst"]
     console.print(make_table(title, head, rows, box=box.SIMPLE))
@@ -85,6 +70,11 @@ def verdict(held_out: HeldOut) -> str:
         f"{rival.name} is ahead: {best} rms at held-out poses, where the identification has {own}"
         f" {held_out.unit}: use that, or log more poses"
     )
+
+
+def number_or_dash(value: float | None, form: str = ".4g", scale: float = 1.0) -> str:
+    """A figure in a table; – where there is none."""
+    return "–" if value is None else format(scale * value, form)
 
 
 def _text(value: float, held_out: HeldOut) -> str:

@@ -2,13 +2,11 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import gymnasium
 import pandas as pd
 import tyro
-from pydantic import model_validator
 from rich.console import Console
 from rich.table import Table
 
@@ -17,47 +15,20 @@ from baselines.identification.arm_result import ArmIdentification
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.identify import Identification, identify
 from baselines.identification.servo_result import ServoIdentification
-from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.testbed.model import Pendulum
-from train.commands.identify_arm import ArmOptions, run_arm_identification
-from train.commands.options import OnHardware, option_name
+from train.commands.identify_arm import identify_arm
+from train.commands.identify_options import ArmOptions, IdentificationRun, OfTestbed
+from train.commands.options import OnHardware, given_options
 from train.figures import plots
-from train.figures.plots import FigureFormat
-from train.figures.testbed_plots import draw_identification
+from train.figures.identification_plots import draw_identification
 from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress, show_progress
 
 
-class OfTestbed(Model):
-    """The testbed, which is identified where no log is named."""
-
-    scenario: Title | None = None
-    """Scenario of the simulated testbed, such as nominal (default), ideal, backlash, ideal+soft."""
-    stiffness: float | None = quantity("N·m/rad", None, gt=0)
-    """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
-    second_mass: float | None = quantity("1", None, gt=0)
-    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q
-    from K; such as 0.5.
-    """
-    positions: int = quantity("1", 20, ge=5, le=200)
-    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take
-    five.
-    """
-    repeats: int = quantity("1", 1, ge=1, le=10_000)
-    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
-
-    @model_validator(mode="after")
-    def _masses_differ(self) -> Self:
-        if self.second_mass == 1.0:
-            problem = "second_mass must differ from 1: two equal masses do not separate anything"
-            raise ValueError(problem)
-        return self
-
-
-class Identify(Model):
+class Identify(IdentificationRun):
     """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
 
     Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and
@@ -75,12 +46,6 @@ class Identify(Model):
     run.csv --mass-kg 0.5 --lever-m 0.1
     """
 
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
-    """Seed of the sensor noise, and of what is held out."""
-    output: Path | None = None
-    """Folder for the results, new or empty; default runs/identify, numbered if taken."""
-    figure_format: FigureFormat = "png"
-    """Of the figures: pdf and svg have no resolution, and png has 300 dpi."""
     testbed: OfTestbed = OfTestbed()
     on: Annotated[OnHardware, tyro.conf.arg(name="hardware")] = OnHardware()
     arm: ArmOptions = ArmOptions()
@@ -105,17 +70,13 @@ class Identify(Model):
         """
         if self.arm == ArmOptions():
             return self._identify_testbed(console)
-        others = [name for name, value in OfTestbed() if value != getattr(self.testbed, name)]
-        names = [option_name((name,)) for name in others]
+        names = given_options(self.testbed, OfTestbed.model_fields)
         if self.on != OnHardware():
             names.append("--port and the like")
         if names:
-            problem = (
-                f"options of the testbed: {', '.join(names)}; leave them out beside --robot and"
-                " --log"
-            )
-            raise ConfigurationError(problem)
-        return run_arm_identification(self.arm, console, self.seed, self.output, self.figure_format)
+            problem = f"options of the testbed: {', '.join(names)}"
+            raise ConfigurationError(f"{problem}; leave them out beside --robot and --log")
+        return identify_arm(self.arm, self, console)
 
     def _identify_testbed(self, console: Console) -> list[Identification]:
         plots.require_matplotlib()

@@ -4,11 +4,9 @@ import fnmatch
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import mujoco
 import numpy as np
-import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -31,10 +29,9 @@ from baselines.identification.arm_result import (
 )
 from baselines.identification.geometry_result import GeometryIdentification
 from baselines.identification.holdout import Judged
-from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
-from baselines.identification.pose_model import Frame, PoseModel, Unknowns
+from baselines.identification.pose_log import PoseLog, read_log, write_poses
+from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import (
-    MOST_PLANNED,
     PosePlan,
     candidate_poses,
     empty_log,
@@ -43,69 +40,22 @@ from baselines.identification.pose_plan import (
 )
 from baselines.identification.servo_result import ServoIdentification
 from baselines.identification.static_arm import StaticArm
-from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, quote, unknown_name
-from elastic_env.joint.joint_settings import SOFTEST
-from elastic_env.joint.model_file import compiled_model, from_mujoco, read_model
+from elastic_env.joint.model_file import compiled_model, from_mujoco
 from elastic_env.joint.supported_models import commanded_hinges, hinges_of
-from train.commands.held_out import HoldoutOptions, judge_poses, show_held_out
-from train.commands.identify_geometry import GeometryOptions, identify_geometry
-from train.commands.identify_servo import ServoOptions, are_servo_logs, identify_servo
-from train.commands.options import option_name
+from train.commands.held_out import judge_poses, number_or_dash, show_held_out
+from train.commands.identify_geometry import identify_geometry
+from train.commands.identify_options import ArmOptions, IdentificationRun, ServoOptions
+from train.commands.identify_servo import are_servo_logs, identify_servo
+from train.commands.options import given_options
 from train.figures import plots
-from train.figures.arm_plots import draw_arm_identification
-from train.figures.plots import FigureFormat
+from train.figures.identification_plots import draw_arm_identification
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
-_STIFFEST = 1e9
-"""Largest K that can be assumed; a stiffer joint is rigid [N·m/rad]."""
-
-
-class ArmOptions(Model):
-    """An arm by a log of static poses, or a servo by logs in time, in place of the testbed."""
-
-    robot: Locator | None = None
-    """Rigid model of an arm, MJCF or URDF."""
-    log: tuple[Locator, ...] = ()
-    """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an
-    IMU or joint torques. Or logs in time of one servo with its goal: CSV, JSON or parquet.
-    """
-    joints: tuple[Title, ...] = ()
-    """Names or patterns of the joints whose stiffness is sought; default all in the log.
-
-    The others are rigid.
-    """
-    end_effector: Title | None = None
-    """Site or body whose position is measured or that carries the IMU; default the outermost
-    body.
-    """
-    payload: Title | None = None
-    """Body or site that carries a payload of unknown mass, which is estimated too."""
-    frame: Frame = "offset"
-    """Frame of tracker or IMU: known, unknown by an offset, or in pose; for an IMU the last two
-    mean its mounting.
-    """
-    measured_by: Kind | None = None
-    """Measurement to use, where the log has several or there is no log."""
-    within: float = quantity("1", 0.03, gt=0, lt=1)
-    """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this
-    share.
-    """
-    assume: float | None = quantity("N·m/rad", None, ge=SOFTEST, le=_STIFFEST)
-    """K [N·m/rad] to write for joints whose interval reaches to rigid; default each joint's own
-    estimate, or rigid.
-    """
-    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED)
-    """Propose so many further poses, within limits and without contacts, that tell the stiffness
-    best.
-    """
-    judged: Annotated[HoldoutOptions, tyro.conf.arg(name="judgement")] = HoldoutOptions()
-    markers: Annotated[GeometryOptions, tyro.conf.arg(name="geometry")] = GeometryOptions()
-    servo: ServoOptions = ServoOptions()
 
 
 @dataclass(frozen=True)
@@ -130,21 +80,15 @@ class _Setting:
         return PoseModel(self.arm, log, unknowns)
 
 
-def run_arm_identification(
-    options: ArmOptions,
-    console: Console,
-    seed: int = 0,
-    output: Path | None = None,
-    figure_format: FigureFormat = "png",
+def identify_arm(
+    options: ArmOptions, run: IdentificationRun, console: Console
 ) -> ArmIdentification | GeometryIdentification | ServoIdentification | None:
     """Identify an arm or a servo, write files and print the result; or plan poses.
 
     Args:
         options: What to do.
+        run: Seed of what is drawn, and where results go.
         console: Where progress and table go.
-        seed: Seed of the poses from which the plan chooses.
-        output: Folder for the results; default runs/identify, numbered if taken.
-        figure_format: Of the figure.
 
     Returns:
         The result; None for a plan without a log.
@@ -154,47 +98,16 @@ def run_arm_identification(
         ResultsExistError: The output folder holds results.
     """
     if are_servo_logs(options.log):
-        return _identify_servo(options, console, seed, output, figure_format)
-    if options.servo != ServoOptions():
-        if options.log and not Path(options.log[0]).is_file():
-            raise ConfigurationError(f"no log at {quote(options.log[0])[1:-1]}; name a file")
-        raise ConfigurationError(
-            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
-            " with columns time, goal and position by --log"
-        )
-    for log in options.log:
-        if Path(log).is_file() and Path(log).stat().st_size == 0:
-            raise ConfigurationError(
-                f"the log {quote(log)[1:-1]} is empty; a log in time has the columns time, goal and"
-                " position, one of poses those of docs/identification.md"
-            )
-    if options.robot is None:
-        problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
-        raise ConfigurationError(problem)
-    if not options.log and (not options.plan or options.measured_by is None):
-        raise ConfigurationError(
-            "give the CSV file of static poses by --log, or plan the first poses by --plan 40"
-            " --measured-by end_effector (or link_encoders, imu, torques)"
-        )
+        return identify_servo(options, run, console)
+    _require_poses(options)
     plots.require_matplotlib()
-    setting = _setting(options, compiled_model(options.robot), console, seed)
+    setting = _setting(options, compiled_model(str(options.robot)), console, run.seed)
     if setting.seeks_geometry:
         _require_no_plan(options, setting.log)
-        spec = read_model(options.robot).spec
-        return identify_geometry(
-            options.markers,
-            spec,
-            setting.log,
-            setting.elastic,
-            setting.arm.end_effector,
-            console,
-            held_out=options.judged,
-            seed=seed,
-            output=output,
-            figure_format=figure_format,
-        )
-    recorded = {**options.model_dump(mode="json"), "seed": seed}
-    with run_folder("identify", recorded, seed, output) as folder:
+        tool = setting.arm.end_effector
+        return identify_geometry(options, setting.log, setting.elastic, tool, run, console)
+    recorded = {**options.model_dump(mode="json"), "seed": run.seed}
+    with run_folder("identify", recorded, run.seed, run.output) as folder:
         if not options.log:
             _plan_first(setting, folder, console)
             return None
@@ -206,10 +119,10 @@ def run_arm_identification(
         if options.plan:
             plan = plan_further(fit, _candidates(setting, console), options.plan)
         information = None if plan is None else plan.information
-        held_out = judge_poses(Judged.of_poses(model), options.judged, console, seed)
+        held_out = judge_poses(Judged.of_poses(model), options.judged, console, run.seed)
         result = describe_fit(fit, options.within, options.assume, information, held_out)
         files = result.save(folder)
-        picture = folder / f"identification.{figure_format}"
+        picture = folder / f"identification.{run.figure_format}"
         files.append(draw_arm_identification(fit, result, picture))
         if plan is not None:
             files.append(_write_plan(setting.arm, plan, folder / "plan.csv"))
@@ -222,63 +135,53 @@ def run_arm_identification(
     return result
 
 
-def _identify_servo(
-    options: ArmOptions,
-    console: Console,
-    seed: int,
-    output: Path | None,
-    figure_format: FigureFormat,
-) -> ServoIdentification:
-    """Identify a servo from logs in time.
-
-    Raises:
-        ConfigurationError: An option is for poses only, or several joints are named.
-    """
-    taken = {"log", "robot", "joints", "servo", "markers", "judged"}
-    unused = [
-        option_name((name,))
-        for name in ArmOptions.model_fields
-        if name not in taken and getattr(options, name) != getattr(ArmOptions(), name)
-    ]
-    if options.markers != GeometryOptions():
-        unused.append("those of --geometry")
-    if options.judged.folds != HoldoutOptions().folds:
-        unused.append("--folds")
-    if unused:
+def _require_poses(options: ArmOptions) -> None:
+    """Refuse options that do not name static poses of an arm, or the first plan of them."""
+    logs = [Path(log) for log in options.log]
+    if options.servo != ServoOptions():
+        if logs and not logs[0].is_file():
+            raise ConfigurationError(f"no log at {quote(options.log[0])[1:-1]}; name a file")
         raise ConfigurationError(
-            f"{', '.join(unused)}: not for logs in time; leave it out beside {options.log[0]}"
+            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
+            " with columns time, goal and position by --log"
         )
-    if len(options.joints) > 1:
+    for log in logs:
+        if log.is_file() and log.stat().st_size == 0:
+            raise ConfigurationError(
+                f"the log {quote(str(log))[1:-1]} is empty; a log in time has the columns time,"
+                " goal and position, one of poses those of docs/identification.md"
+            )
+    if options.robot is None:
+        problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
+        raise ConfigurationError(problem)
+    if not logs and (not options.plan or options.measured_by is None):
         raise ConfigurationError(
-            f"logs in time are of one joint, got --joints {' '.join(options.joints)}; name one"
+            "give the CSV file of static poses by --log, or plan the first poses by --plan 40"
+            " --measured-by end_effector (or link_encoders, imu, torques)"
         )
-    return identify_servo(
-        options.servo,
-        options.log,
-        console,
-        robot=options.robot,
-        joint=options.joints[0] if options.joints else None,
-        holdout=options.judged.holdout,
-        seed=seed,
-        output=output,
-        figure_format=figure_format,
-    )
+    if len(logs) > 1:
+        raise ConfigurationError(
+            f"static poses must be in one file, got {len(logs)}; write one table"
+        )
 
 
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
     joints = result.joints
+    intervals = [_interval(joint) for joint in joints]
+    stiffness = [number_or_dash(joint.stiffness_nm_per_rad) for joint in joints]
+    told = zip(stiffness, intervals, strict=True)
     columns: dict[str, Sequence[str]] = {
         "joint": [joint.joint for joint in joints],
-        "K": [_number(_stiffness(joint), ".4g") for joint in joints],
-        "95 % interval": [_interval(joint) for joint in joints],
+        "K": [interval if interval == "–" else own for own, interval in told],
+        "95 % interval": intervals,
         "±": [_percent(joint.half_width) for joint in joints],
     }
     if joints[0].planned_half_width is not None:
         columns["planned ±"] = [_percent(joint.planned_half_width) for joint in joints]
     if not result.friction_is_noise:
-        columns["F [N·m]"] = [_number(joint.friction_nm) for joint in joints]
-    columns["o [mrad]"] = [_number(joint.offset_rad, ".2f", 1e3) for joint in joints]
+        columns["F [N·m]"] = [number_or_dash(joint.friction_nm, ".2f") for joint in joints]
+    columns["o [mrad]"] = [number_or_dash(joint.offset_rad, ".2f", 1e3) for joint in joints]
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
     rows = zip(*columns.values(), strict=True)
     table = make_table(title, list(columns), rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
@@ -378,13 +281,8 @@ def _require_no_plan(options: ArmOptions, log: PoseLog) -> None:
     Raises:
         ConfigurationError: One of them is given.
     """
-    given = {
-        "--plan": bool(options.plan),
-        "--payload": options.payload is not None,
-        "--assume": options.assume is not None,
-        "--end-effector": options.end_effector is not None and log.kind == "markers",
-    }
-    if unused := [name for name, is_given in given.items() if is_given]:
+    of_site = ["end_effector"] if log.kind == "markers" else []
+    if unused := given_options(options, ["plan", "payload", "assume", *of_site]):
         raise ConfigurationError(
             f"{', '.join(unused)} {'is' if len(unused) == 1 else 'are'} not for a fit of the"
             " geometry from markers; leave it out"
@@ -395,10 +293,6 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
-    if len(options.log) > 1:
-        raise ConfigurationError(
-            f"static poses must be in one file, got {len(options.log)}; write one table"
-        )
     log = None
     if options.log:
         log = read_log(Path(options.log[0]), ranges, options.measured_by)
@@ -466,18 +360,10 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
     return write_poses(path, columns)
 
 
-def _stiffness(joint: JointStiffness) -> float | None:
-    return None if _interval(joint) == "–" else joint.stiffness_nm_per_rad
-
-
 def _interval(joint: JointStiffness) -> str:
-    low = _number(joint.stiffness_low_nm_per_rad, ".4g")
-    high = _number(joint.stiffness_high_nm_per_rad, ".4g")
+    low = number_or_dash(joint.stiffness_low_nm_per_rad)
+    high = number_or_dash(joint.stiffness_high_nm_per_rad)
     return "–" if "–" in (low, high) else f"{low} to {high}"
-
-
-def _number(value: float | None, form: str = ".2f", scale: float = 1.0) -> str:
-    return "–" if value is None else format(scale * value, form)
 
 
 def _percent(half: float | None) -> str:

@@ -1,20 +1,14 @@
 """`elastic identify --geometry`: encoders, geometry and stiffness of an arm from markers."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import mujoco
 import numpy as np
 from rich import box
 from rich.console import Console
 
-from baselines.identification.geometry_fit import (
-    GeometryPriors,
-    GeometryProblem,
-    align_tracker,
-    fit_geometry,
-)
-from baselines.identification.geometry_model import AxialTorques, Geometry, GeometryModel
+from baselines.identification.geometry_fit import GeometryProblem, align_tracker, fit_geometry
+from baselines.identification.geometry_model import AxialTorques, GeometryModel
 from baselines.identification.geometry_result import (
     GeometryIdentification,
     correct_model,
@@ -23,73 +17,51 @@ from baselines.identification.geometry_result import (
 from baselines.identification.holdout import Judged
 from baselines.identification.pose_log import PoseLog
 from baselines.identification.static_arm import place_of
-from elastic_env.core.config import Model, Title
 from elastic_env.core.errors import list_names, unknown_name
+from elastic_env.joint.model_file import read_model
 from elastic_env.rigid.tree.links import Tree
-from train.commands.held_out import HoldoutOptions, judge_poses, show_held_out
-from train.figures.geometry_plots import draw_geometry
-from train.figures.plots import FigureFormat
+from train.commands.held_out import judge_poses, number_or_dash, show_held_out
+from train.commands.identify_options import ArmOptions, GeometryOptions, IdentificationRun
+from train.figures.identification_plots import draw_geometry
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
 
-class GeometryOptions(Model):
-    """Poses with markers: what of the geometry is sought together with K."""
-
-    geometry: Geometry | None = None
-    """Seek encoder offsets, the parameters of Denavit and Hartenberg (dh), or all lengths and
-    angles (full), together with K; default offsets for a log of markers.
-    """
-    lateral: bool = False
-    """Seek the compliance of bearings and links across the axes too."""
-    free: tuple[Title, ...] = ()
-    """Joints whose frame the model only guesses: it may be off by a metre and a radian."""
-    priors: GeometryPriors = GeometryPriors()
-
-
 def identify_geometry(
-    options: GeometryOptions,
-    spec: mujoco.MjSpec,
+    options: ArmOptions,
     log: PoseLog,
     elastic: Sequence[str],
     end_effector: str,
+    run: IdentificationRun,
     console: Console,
-    *,
-    held_out: HoldoutOptions,
-    seed: int = 0,
-    output: Path | None = None,
-    figure_format: FigureFormat = "png",
 ) -> GeometryIdentification:
     """Identify geometry and stiffness, write files and figure, print tables.
 
     Args:
-        options: What is sought.
-        spec: Specification of the rigid model.
+        options: The arm, and what is sought.
         log: Poses with places of markers.
         elastic: Joints whose stiffness is sought.
         end_effector: Site or body that is measured, where the log names no markers.
+        run: Seed of the poses that are held out, and where results go.
         console: Where progress and tables go.
-        held_out: What is kept back from the fit.
-        seed: Seed of the poses that are held out.
-        output: Folder for the results; default runs/identify, numbered if taken.
-        figure_format: Of the figure.
 
     Raises:
         ConfigurationError: A name does not exist, or there are too few poses.
         ElasticError: The poses do not fit the arm.
     """
-    model = spec.compile()
-    problem, tree = pose_problem(options, model, log, elastic, end_effector)
-    recorded = {**options.model_dump(mode="json"), **held_out.model_dump(), "seed": seed}
-    with run_folder("identify", recorded, seed, output) as folder:
+    spec = read_model(str(options.robot)).spec
+    problem, tree = pose_problem(options.markers, spec.compile(), log, elastic, end_effector)
+    recorded = options.markers.model_dump(mode="json") | options.judged.model_dump()
+    recorded["seed"] = run.seed
+    with run_folder("identify", recorded, run.seed, run.output) as folder:
         with show_progress(console, {"fits": 1}, transient=True) as show:
             fit = fit_geometry(problem)
             show(0, 1)
-        judged = judge_poses(Judged.of_geometry(problem), held_out, console, seed)
+        judged = judge_poses(Judged.of_geometry(problem), options.judged, console, run.seed)
         result = describe_geometry(fit, judged)
         files = result.save(folder, correct_model(spec, tree, fit))
-        files.append(draw_geometry(result, folder / f"identification.{figure_format}"))
+        files.append(draw_geometry(result, folder / f"identification.{run.figure_format}"))
     show_result(result, console)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -152,12 +124,12 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
     rows = []
     friction = {one.name: one for one in result.parameters if one.kind == "friction"}
     for joint in result.joints:
-        stiffness = _number(joint.stiffness_nm_per_rad).replace("inf", "rigid")
+        stiffness = number_or_dash(joint.stiffness_nm_per_rad).replace("inf", "rigid")
         ends = (joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad)
-        rows.append([joint.joint, stiffness, *map(_number, ends)])
+        rows.append([joint.joint, stiffness, *map(number_or_dash, ends)])
         if friction:
             own = friction.get(joint.joint)
-            rows[-1].append(_number(own.value if own is not None and own.is_told else None))
+            rows[-1].append(number_or_dash(own.value if own is not None and own.is_told else None))
     noise = f"{result.noise_mm:.2f} mm"
     console.print(f"unexplained: {noise} in each coordinate of a marker")
     title = f"K [N·m/rad] from {result.poses} poses"
@@ -174,7 +146,3 @@ def show_result(result: GeometryIdentification, console: Console) -> None:
             f" poses do not tell them: {list_names(result.kept)}",
             highlight=False,
         )
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"

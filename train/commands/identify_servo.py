@@ -3,41 +3,33 @@
 import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from rich import box
 from rich.console import Console
 
-from baselines.identification.servo_file import AngleUnit, is_servo_log
+from baselines.identification.servo_file import is_servo_log
 from baselines.identification.servo_fit import STAGES, fit_servo
 from baselines.identification.servo_holdout import ServoHoldout, judge_servo, split_logs
 from baselines.identification.servo_load import Load
 from baselines.identification.servo_log import ServoLog, read_servo_log
 from baselines.identification.servo_result import ServoIdentification, describe_servo
-from elastic_env.core.config import Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.model_file import compiled_model
+from train.commands.held_out import number_or_dash
+from train.commands.identify_options import (
+    ArmOptions,
+    GeometryOptions,
+    IdentificationRun,
+    ServoOptions,
+)
+from train.commands.options import given_options
 from train.figures import plots
-from train.figures.plots import FigureFormat
-from train.figures.servo_plots import draw_servo
+from train.figures.identification_plots import draw_servo
 from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
-
-
-class ServoOptions(Model):
-    """Logs in time of one servo: its load, and what the logs do not say."""
-
-    mass_kg: float | None = quantity("kg", None, gt=0)
-    """Mass of a pendulum on the servo, whose logs have time, goal and position [kg]."""
-    lever_m: float | None = quantity("m", None, gt=0)
-    """Distance of its mass from the axis [m]."""
-    gain: float | None = quantity("1", None, gt=0)
-    """Value of the servo's gain register, where the logs do not say it [1]."""
-    angles: AngleUnit | None = None
-    """Unit of angles in the logs in time; default what they say, or radians."""
-    unfitted: tuple[Locator, ...] = ()
-    """Logs in time to replay without a fit; default a share of --log, by --holdout."""
 
 
 def are_servo_logs(paths: Sequence[str]) -> bool:
@@ -46,59 +38,72 @@ def are_servo_logs(paths: Sequence[str]) -> bool:
 
 
 def identify_servo(
-    options: ServoOptions,
-    paths: Sequence[str],
-    console: Console,
-    *,
-    robot: str | None = None,
-    joint: str | None = None,
-    holdout: float = 0.3,
-    seed: int = 0,
-    output: Path | None = None,
-    figure_format: FigureFormat = "png",
+    options: ArmOptions, run: IdentificationRun, console: Console
 ) -> ServoIdentification:
-    """Identify a servo, write files and picture, print tables.
+    """Identify a servo from logs in time, write files and picture, print tables.
 
     Args:
-        options: Load, gain and units.
-        paths: Logs of one servo.
+        options: Logs of one servo, and its load: robot and joint, or a pendulum.
+        run: Seed of the draw of logs that are not fitted, and where results go.
         console: Where progress and tables go.
-        robot: Model whose links load the joint; None for a pendulum or a known torque.
-        joint: Name of the joint in model and files.
-        holdout: Share of the logs that is replayed without a fit; 0 for none.
-        seed: Seed of the draw of these logs.
-        output: Folder for the results; default runs/identify, numbered if taken.
-        figure_format: Of the picture.
 
     Raises:
-        ConfigurationError: A log or an option cannot be used.
+        ConfigurationError: A log or an option cannot be used, or is for poses only.
         ElasticError: The joint hardly moves.
     """
+    _require_no_poses(options)
     plots.require_matplotlib()
-    load = known_load(options, robot, joint)
-    paths = fitted_logs(paths, options.unfitted, console)
-    logs = [_read(options, path, load, joint) for path in paths]
-    further = [_read(options, path, load, joint) for path in options.unfitted]
+    servo = options.servo
+    joint = options.joints[0] if options.joints else None
+    load = known_load(servo, options.robot, joint)
+    paths = fitted_logs(options.log, servo.unfitted, console)
+
+    def read(path: str) -> ServoLog:
+        return read_servo_log(Path(path), load, servo.gain, servo.angles, joint)
+
+    logs = list(map(read, paths))
+    further = list(map(read, servo.unfitted))
     _require_one_supply([*logs, *further])
-    inner, outer = (logs, further) if further or not holdout else split_logs(logs, holdout, seed)
-    recorded = {**options.model_dump(mode="json"), "log": list(paths), "seed": seed}
-    with run_folder("identify", recorded, seed, output) as folder:
+    inner = logs
+    outer = further
+    if not further and options.judged.holdout:
+        inner, outer = split_logs(logs, options.judged.holdout, run.seed)
+    recorded = {**servo.model_dump(mode="json"), "log": paths, "seed": run.seed}
+    with run_folder("identify", recorded, run.seed, run.output) as folder:
         fits = 1 if inner is logs else 2
         with show_progress(console, {"fits, stages": fits * STAGES}, transient=True) as show:
-            fit = fit_servo(inner, lambda done: show(0, done), seed)
+            fit = fit_servo(inner, partial(show, 0), run.seed)
             held_out = judge_servo(fit, outer) if outer else None
             shown = outer or logs
             played = [fit.replay(log) for log in shown]
             if inner is not logs:
-                fit = fit_servo(logs, lambda done: show(0, STAGES + done), seed)
+                fit = fit_servo(logs, lambda done: show(0, STAGES + done), run.seed)
         result = describe_servo(fit, joint or "*", held_out)
         files = result.save(folder)
-        picture = folder / f"identification.{figure_format}"
+        picture = folder / f"identification.{run.figure_format}"
         files.append(draw_servo(shown, played, picture, is_held_out=bool(outer)))
     show_result(result, console)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)
     return result
+
+
+def _require_no_poses(options: ArmOptions) -> None:
+    """Refuse options that are for poses only, and several joints."""
+    known = ("log", "robot", "joints", "servo", "markers", "judged")
+    others = [name for name in ArmOptions.model_fields if name not in known]
+    unused = given_options(options, others)
+    if options.markers != GeometryOptions():
+        unused.append("those of --geometry")
+    unused += given_options(options.judged, ["folds"])
+    if unused:
+        raise ConfigurationError(
+            f"{', '.join(unused)}: not for logs in time; leave it out beside {options.log[0]}"
+        )
+    if len(options.joints) > 1:
+        raise ConfigurationError(
+            f"logs in time are of one joint, got --joints {' '.join(options.joints)}; name one"
+        )
 
 
 def known_load(options: ServoOptions, robot: str | None, joint: str | None) -> Load | None:
@@ -126,7 +131,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
     if result.held_out is not None:
         console.print(verdict(result.held_out), highlight=False)
         rows = [
-            [error.name, f"{error.rms_mrad:.1f}", _number(error.slow_mrad, ".1f")]
+            [error.name, f"{error.rms_mrad:.1f}", number_or_dash(error.slow_mrad, ".1f")]
             for error in result.held_out.errors
         ]
         head = ["prediction", "torque on", "slow motion"]
@@ -138,16 +143,12 @@ def show_result(result: ServoIdentification, console: Console) -> None:
             f"error of the angle at {len(result.held_out.logs)} logs that were not fitted [mrad]"
         )
         console.print(make_table(title, head, rows, box=box.SIMPLE))
-    rows = [
-        [
-            f"k_p at gain {one.register_value:g}{_volts(one.supply_v)}",
-            f"{one.position_gain_nm_per_rad:.4g}",
-            _width(one.half_width),
-            "N·m/rad",
-            "",
-        ]
-        for one in result.gains
-    ]
+    rows = []
+    for one in result.gains:
+        supply = "" if one.supply_v is None else f", {one.supply_v:.4g} V"
+        name = f"k_p at gain {one.register_value:g}{supply}"
+        gain = f"{one.position_gain_nm_per_rad:.4g}"
+        rows.append([name, gain, _width(one.half_width), "N·m/rad", ""])
     for one in result.parameters:
         if one.name != "position_gain" and one.value is not None:
             width = _width(one.half_width)
@@ -196,7 +197,8 @@ def fitted_logs(paths: Sequence[str], unfitted: Sequence[str], console: Console)
         ConfigurationError: An option names one twice, or nothing is left to fit.
     """
     logs, further = (_each_once(given) for given in (paths, unfitted))
-    left_out = [path for path, keys in logs.items() if any(keys & own for own in further.values())]
+    named = set().union(*further.values())
+    left_out = [path for path, keys in logs.items() if keys & named]
     if len(left_out) == len(logs):
         raise ConfigurationError(
             f"--unfitted names all logs of --log, {', '.join(left_out)}: leave one to fit"
@@ -227,10 +229,6 @@ def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
     return seen
 
 
-def _read(options: ServoOptions, path: str, load: Load | None, joint: str | None) -> ServoLog:
-    return read_servo_log(Path(path), load, options.gain, options.angles, joint)
-
-
 def _require_one_supply(logs: Sequence[ServoLog]) -> None:
     known = {log.supply != 1.0 for log in logs}
     if len(known) > 1:
@@ -239,13 +237,5 @@ def _require_one_supply(logs: Sequence[ServoLog]) -> None:
         )
 
 
-def _volts(supply: float | None) -> str:
-    return "" if supply is None else f", {supply:.4g} V"
-
-
 def _width(half: float | None) -> str:
     return "–" if half is None else f"± {half:.2g}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)

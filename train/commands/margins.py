@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from rich.console import Console
 
@@ -46,13 +46,7 @@ class Margins(Model):
 
     policies: Entries[Locator] = ["input_output", "adaptive_posture", "foothold", "thormang"]
     """Baselines, residual:PATH, "FILE.py:function" or "module:function"."""
-    quantities: Entries[Field] = [
-        "push_n",
-        "stiffness",
-        "slope_rad",
-        "load_kg",
-        "floor_friction",
-    ]
+    quantities: Entries[Field] = list(get_args(Field))
     """Fields of the scenario that are varied, one at a time."""
     scenario: Title = "spread"
     """Scenario of the robots, without ranges such as those of drawn."""
@@ -95,8 +89,10 @@ class Margins(Model):
                     before = itertools.count(0, steps[number])
                     play = partial(self._play, before, partial(show, number))
                     records += find_margins(condition, chosen, self.robots, self.halvings, play)
-                    plain = [{k: v for k, v in own.items() if k != "edges"} for own in records]
-                    write_records(plain, files[0])
+                    rows = [{**own} for own in records]
+                    for row in rows:
+                        del row["edges"]
+                    write_records(rows, files[0])
                     write_whole(files[1], json.dumps(records, indent=2) + "\n")
         title = f"worst / median edge of {self.robots} robots, {conditions[0].reference_name}"
         console.print(make_table(title, *margin_table(records)))

@@ -1,6 +1,6 @@
 """Options that several commands share, and how the text of an option becomes a value."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
@@ -156,6 +156,13 @@ def option_name(path: ParameterPath) -> str:
     """A parameter as the option that sets it."""
     name = str(path[0]) if path else ""
     return f"--{_OF_ONE.get(name, name).replace('_', '-')}" if path else ""
+
+
+def given_options(options: Model, names: Iterable[str]) -> list[str]:
+    """Options that differ from their defaults, as they are spelt."""
+    fields = type(options).model_fields
+    given = [name for name in names if getattr(options, name) != fields[name].default]
+    return [option_name((name,)) for name in given]
 
 
 @contextmanager

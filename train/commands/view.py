@@ -285,13 +285,10 @@ class View(WatchedEpisode):
                 what = "sees the page and moves its sliders; nothing on the way is encrypted"
                 console.print(f"who has this address {what}")
             console.print("Ctrl-C ends it")
-            _open_tab(page.access.address)
+            # opens a tab of the browser, where there is a display
+            has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            if has_display or not sys.platform.startswith("linux"):
+                arguments = (page.access.address, 2)
+                threading.Thread(target=webbrowser.open, args=arguments, daemon=True).start()
             while page.handle.is_running():
                 page.handle.sync()
-
-
-def _open_tab(address: str) -> None:
-    """Open a tab of the browser, where there is a display."""
-    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if has_display or not sys.platform.startswith("linux"):
-        threading.Thread(target=webbrowser.open, args=(address, 2), daemon=True).start()

@@ -283,9 +283,10 @@ def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
         if isinstance(field.annotation, type) and issubclass(field.annotation, Model):
             found |= _numbers_of(field.annotation, f"{before}{name}.")
         elif isinstance(extra, dict):
-            known = meaning_of(field) or name, str(extra["unit"])
-            found[f"{before}{name}"] = known
+            meaning = meaning_of(field) or name
+            unit = str(extra["unit"])
+            found[f"{before}{name}"] = meaning, unit
             bounds: Any = extra.get("bounds", (0.0, 1.0))
             if bounds[0] == -bounds[1]:
-                found[f"{before}{name}.{HALF_WIDTH}"] = f"half-width: {known[0]}", known[1]
+                found[f"{before}{name}.{HALF_WIDTH}"] = f"half-width: {meaning}", unit
     return found

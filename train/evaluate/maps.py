@@ -3,6 +3,7 @@
 An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -112,9 +113,10 @@ class MapConfig(Model):
         """
         for name, axis in (("x", self.x), ("y", self.y)):
             if axis.what != known.motion and axis.what not in scenario_fields():
-                raise ConfigurationError(
-                    f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}"
-                )
+                choices = choices_listed(axis.what, [known.motion, *scenario_fields()])
+                if axis.what in PolicyOptions.model_fields:
+                    choices += "; an option of the policies is varied by sweep, not by a map"
+                raise ConfigurationError(f"unknown axis {axis.what!r} of map.{name}; {choices}")
             for value in axis.values:
                 if axis.is_motion:
                     continue  # `references` holds and checks them
@@ -131,14 +133,6 @@ class MapConfig(Model):
             dict(zip(names, map(float, values), strict=True))
             for values in product(*(axis.values for axis in fields))
         ]
-
-
-def _choices(what: str, known: Environment) -> str:
-    """Names that an axis can have."""
-    choices = choices_listed(what, [known.motion, *scenario_fields()])
-    if what not in PolicyOptions.model_fields:
-        return choices
-    return f"{choices}; an option of the policies is varied by sweep, not by a map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +183,17 @@ class HeatMap:
     def flat(self) -> list[MapCell]:
         """All cells."""
         return [cell for row in self.cells for cell in row]
+
+    @property
+    def wins(self) -> dict[str, int]:
+        """Cells in which a policy is the best, of those that are somewhere, most first."""
+        wins = Counter(cell.best for cell in self.flat)
+        ranked = sorted(self.table.policies, key=lambda title: -wins[title])
+        return {title: wins[title] for title in ranked if wins[title]}
+
+    def changes_of(self, title: str) -> list[Change]:
+        """Changes of a residual in all cells that have one."""
+        return [cell.learned[title] for cell in self.flat if title in cell.learned]
 
 
 def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[HeatMap]:

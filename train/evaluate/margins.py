@@ -15,11 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 
-from baselines.walking.posture import PostureGains
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from train.evaluate.conditions import SCENARIO, Condition
-from train.evaluate.episodes import evaluate
 from train.evaluate.rollout import (
     can_share_worlds,
     control_steps,
@@ -30,8 +28,6 @@ from train.evaluate.rollout import (
 Causes = npt.NDArray[np.str_]
 """Why episodes failed: empty for those that did not."""
 
-_GAINS = ("proportional", "integral", "derivative", "trim")
-_PELVIS = "pelvis_error_rms_rad"
 CHECKED_SHARE = 0.9
 """Share of the way to the worst edge where all robots are played once more."""
 NO_REST = "no rest"
@@ -236,49 +232,3 @@ def _cell(record: Mapping[str, Any], quantity: Quantity) -> str:
     median += " *" if 2 * no_rest > robots else ""
     before = f" ({failed} of {robots} fail before)" if failed else ""
     return f"{worst} / {median}{before}"
-
-
-def stronger(gains: PostureGains, factor: float) -> PostureGains:
-    """Posture feedback with its gains times a factor.
-
-    Args:
-        gains: Proportional, integral and derivative gain, and trim, among others.
-        factor: Of all four [1].
-    """
-    return gains.replace(**{name: factor * getattr(gains, name) for name in _GAINS})
-
-
-@dataclass(frozen=True)
-class GainMargin:
-    """What stronger gains cost.
-
-    Attributes:
-        failed: Episodes that failed with the plain and with the stronger gains.
-        ratio: Mean pelvis error with the stronger gains over that with the plain ones [1]; nan
-            where an episode failed.
-    """
-
-    failed: tuple[int, int]
-    ratio: float
-
-
-def gain_margin(
-    condition: Condition, gains: PostureGains, factor: float, num_threads: int = 0
-) -> GainMargin:
-    """Play the same episodes with plain and with stronger gains of the posture feedback.
-
-    Args:
-        condition: A policy with posture feedback, and all that strains it: delay, IMU, length.
-        gains: The plain ones.
-        factor: Of the stronger ones over the plain ones [1].
-        num_threads: Threads of the physics, 0 for all cores.
-    """
-    failed = []
-    errors = []
-    for own in (1.0, factor):
-        posture = stronger(gains, own).model_dump()
-        policy = condition.policy.replace(options={**condition.policy.options, "posture": posture})
-        played = evaluate(condition.replace(policy=policy), num_threads=num_threads)
-        failed.append(played.num_failed)
-        errors.append(played.values(_PELVIS).mean() if not played.num_failed else np.nan)
-    return GainMargin((failed[0], failed[1]), float(errors[1] / errors[0]))

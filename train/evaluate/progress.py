@@ -89,13 +89,13 @@ def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves
     decisions = sorted(set.intersection(*reached))
     if not decisions:
         return None
-    ratios = {}
-    for metric in metrics:
-        found = [[_ratio(table, at, metric) for at in decisions] for table in tables]
-        ratios[metric] = np.array(found)
+
+    def ratio(table: Sequence[dict[str, Any]], at: float, metric: str) -> float:
+        rows = [row for row in table if row["decisions"] == at]
+        return float(np.mean([row[metric] / row[f"base_{metric}"] for row in rows]))
+
+    ratios = {
+        metric: np.array([[ratio(table, at, metric) for at in decisions] for table in tables])
+        for metric in metrics
+    }
     return Curves(np.array(decisions), ratios)
-
-
-def _ratio(table: Sequence[dict[str, Any]], decisions: float, metric: str) -> float:
-    rows = [row for row in table if row["decisions"] == decisions]
-    return float(np.mean([row[metric] / row[f"base_{metric}"] for row in rows]))

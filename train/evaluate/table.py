@@ -213,13 +213,11 @@ class EpisodeTable:
         return dict(iter(parts))
 
 
-def per_seed(
-    rows: pd.DataFrame, metric: str, statistic: Callable[[Array], float] = np.mean
-) -> Array:
-    """A statistic for each training seed and cell, (seeds, cells); nan without a figure."""
+def per_seed(rows: pd.DataFrame, metric: str) -> Array:
+    """A mean for each training seed and cell, (seeds, cells); nan without a figure."""
     parts: Any = rows.groupby(["member", "cell"])[metric]
     known = {key: own.dropna().to_numpy() for key, own in parts}
-    found = {key: float(statistic(own)) for key, own in known.items() if len(own)}
+    found = {key: float(np.mean(own)) for key, own in known.items() if len(own)}
     cells = rows["cell"].unique()
     members = rows["member"].unique()
     return np.array([[found.get((m, c), np.nan) for c in cells] for m in members])

@@ -26,6 +26,7 @@ from train.export.c_text import (
     enumerated,
     fill,
     identifier,
+    members,
     nested,
     number,
     numbers,
@@ -96,19 +97,6 @@ def c_header(
     )
 
 
-def c_example(prefix: str, header: str) -> dict[str, str]:
-    """Contents of a program that checks the header and times it, and of its CMakeLists, by name.
-
-    Args:
-        prefix: Of the header's names.
-        header: Its file, as the program includes it.
-    """
-    return {
-        f"{prefix}_main.c": fill("arm_main.c.in", prefix, header=header),
-        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
-    }
-
-
 def payload_frames(constants: CompensatorConstants) -> list[Frame]:
     """Bodies and sites with names that joints move; the body of the last joint first."""
     model = constants.model
@@ -140,23 +128,14 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
     n = len(constants.compliance)
     none = np.zeros(n)
     friction = constants.friction or FrictionCompensation(none, none, none, none)
-    rows = {
-        "gravity": constants.model.opt.gravity,
-        "compliance": constants.compliance,
-        "of_command": constants.of_command,
-        "lowest": constants.lowest,
-        "highest": constants.highest,
-        "spring": body.spring,
-        "spring_rest": body.spring_rest,
-        "viscous": constants.viscous,
-        "lag_s": constants.lag_s,
-        "rotor_s2": constants.rotor_s2,
-        "coulomb": friction.coulomb,
-        "load_ratio": friction.load_ratio,
-        "static": friction.static,
-        "stribeck_speed": friction.stribeck_speed,
-        "dead_zone": friction.dead_zone,
-    }
+    rows = {"gravity": constants.model.opt.gravity}
+    for owner, names in (
+        (constants, "compliance of_command lowest highest"),
+        (body, "spring spring_rest"),
+        (constants, "viscous lag_s rotor_s2"),
+        (friction, "coulomb load_ratio static stribeck_speed dead_zone"),
+    ):
+        rows |= {name: getattr(owner, name) for name in names.split()}
     return {
         "n": str(n),
         "num_frames": str(len(frames)),
@@ -175,17 +154,9 @@ def _tables(constants: CompensatorConstants, frames: Sequence[Frame]) -> dict[st
 
 
 def _link(row: Any) -> str:
-    masses = ", ".join(
-        [
-            number(row["mass"]),
-            braced(row["mass_moment"]),
-            braced(row["inertia"]),
-            number(row["weight"]),
-            braced(row["weight_moment"]),
-        ]
-    )
-    place = f"{row['parent']}, {row['column']}, {number(row['zero'])}"
-    return f"    {{{place}, {braced(row['R'])}, {braced(row['anchor'])},\n     {{{masses}}}}}"
+    masses = members(row, "mass mass_moment inertia weight weight_moment")
+    place = f"{row['parent']}, {row['column']}, {members(row, 'zero R anchor')}"
+    return f"    {{{place},\n     {{{masses}}}}}"
 
 
 def _origin_lines(sources: Mapping[str, bytes]) -> Iterator[str]:

@@ -54,6 +54,20 @@ def fill(template: str, prefix: str, **parts: Any) -> str:
     return Template(text).substitute(parts)
 
 
+def c_example(program: str, prefix: str, header: str) -> dict[str, str]:
+    """Contents of a program that checks a header and times it, and of its CMakeLists, by name.
+
+    Args:
+        program: What the header has: arm, residual or walker.
+        prefix: Of the header's names.
+        header: Its file, as the program includes it.
+    """
+    return {
+        f"{prefix}_main.c": fill(f"{program}_main.c.in", prefix, header=header),
+        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
+    }
+
+
 def number(value: Any) -> str:
     """A double, or a float of NumPy as one, read back bit for bit."""
     if np.isnan(value):
@@ -74,15 +88,22 @@ def braced(values: Any) -> str:
     return f"{{{numbers(values)}}}"
 
 
+def members(row: Any, names: str) -> str:
+    """Members of a struct, numbers and flat lists of them; their names are parted by spaces."""
+    values = [row[name] for name in names.split()]
+    return ", ".join(number(own) if np.ndim(own) == 0 else braced(own) for own in values)
+
+
 def nested(values: Array) -> str:
     """Rows of an array of two or more axes, a row of the first on a line."""
-    return ",\n".join(f"    {_nested(row)}" for row in values)
+    return ",\n".join(f"    {initialiser(row)}" for row in values)
 
 
-def _nested(values: Array) -> str:
-    if values.ndim == 1:
-        return braced(values)
-    return "{" + ", ".join(map(_nested, values)) + "}"
+def initialiser(value: Any) -> str:
+    """A number, or an array as lists within lists; whole numbers stay whole."""
+    if np.ndim(value) == 0:
+        return str(value) if isinstance(value, np.integer) else number(value)
+    return "{" + ", ".join(map(initialiser, value)) + "}"
 
 
 def enumerated(names: Iterable[str]) -> str:

@@ -6,7 +6,6 @@ The plan stays outside: a planner hands the header a row of it in every control 
 torque sensors, `adaptive_posture` estimates from rolls alone: pitches are left out here.
 """
 
-from collections.abc import Iterator
 from hashlib import sha256
 from typing import Any, NamedTuple
 
@@ -29,7 +28,17 @@ from baselines.walking.posture import PostureFeedback
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.world.robot_model import WalkerModel
-from train.export.c_text import braced, comment, fill, nested, number, numbers, plain
+from train.export.c_text import (
+    braced,
+    comment,
+    fill,
+    initialiser,
+    members,
+    nested,
+    number,
+    numbers,
+    plain,
+)
 
 _TEST_STEPS = 12
 _NOISE_RAD = 0.02
@@ -38,13 +47,11 @@ _NOISE_M = 0.01
 """Spread of encoders, attitude, forces, moments [N·m], rates [rad/s] and ZMP of the test vector
 about the plan."""
 _OF_CONTROLLER = (
-    *("thigh", "shank", "weight", "weight_of_feet", "omega"),
-    *("velocity_share", "zmp_share", "weight_share"),
-    *("force_difference", "force_difference_decay_s", "force_difference_limit_m"),
-    *("dcm", "zmp_limit_m", "friction_rate_rad_s"),
+    "thigh shank weight weight_of_feet omega velocity_share zmp_share weight_share"
+    " force_difference force_difference_decay_s force_difference_limit_m dcm zmp_limit_m"
+    " friction_rate_rad_s"
 )
-_OF_POSTURE = ("proportional", "integral", "derivative", "leak_s", "trim", "integral_limit")
-_SHARES_OF_POSTURE = ("filter_share", "swing_share")
+_OF_POSTURE = "proportional integral derivative leak_s trim integral_limit filter_share swing_share"
 
 
 class PlayedSteps(NamedTuple):
@@ -104,19 +111,6 @@ def c_walker(policy: Any, prefix: str) -> str:
     )
 
 
-def c_walker_example(prefix: str, header: str) -> dict[str, str]:
-    """Contents of a program that checks the header and times it, and of its CMakeLists, by name.
-
-    Args:
-        prefix: Of the header's names.
-        header: Its file, as the program includes it.
-    """
-    return {
-        f"{prefix}_main.c": fill("walker_main.c.in", prefix, header=header),
-        "CMakeLists.txt": fill("arm_CMakeLists.txt.in", prefix),
-    }
-
-
 def play_steps(policy: Any, count: int, seed: int = 0) -> PlayedSteps:
     """Random sensors about rows of the plan, and what a policy makes of them, from its begin.
 
@@ -165,7 +159,8 @@ def _layers(policy: Any) -> _Layers:
     posture = policy if isinstance(policy, PostureFeedback) else None
     adaptive: Any = None if posture is None else posture.policy
     inner: Any = policy
-    if isinstance(adaptive, OnlineStiffness) and _is_by_feet(adaptive.estimator):
+    estimator = adaptive.estimator if isinstance(adaptive, OnlineStiffness) else None
+    if isinstance(estimator, LegEstimator) and estimator.sensors is None:
         inner = adaptive.policy
         if not np.array_equal(policy.ramp, getattr(inner, "ramp", ())):
             raise ConfigurationError("in C, posture feedback and compensation have the same ramp")
@@ -181,11 +176,6 @@ def _layers(policy: Any) -> _Layers:
     )
 
 
-def _is_by_feet(estimator: Any) -> bool:
-    """Whether an estimator needs no sensors of joints."""
-    return isinstance(estimator, LegEstimator) and estimator.sensors is None
-
-
 def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
     """All that is computed with, as text in C."""
     controller: Any = policy.policy
@@ -197,7 +187,7 @@ def _tables(policy: Compensated, model: WalkerModel) -> dict[str, str]:
     feet = links[[int(np.flatnonzero(links["tip"] == foot)[0]) for foot in range(2)]]
     of_command = 1.0 / model.stiffness + compensator.servo_compliance
     return {
-        **{name: number(constants[name]) for name in _OF_CONTROLLER},
+        **{name: number(constants[name]) for name in _OF_CONTROLLER.split()},
         "control_period_s": number(constants["period_s"]),
         "is_com_fed_back": str(int(constants["is_com_fed_back"])),
         "is_at_zmp": str(int(contact["is_at_zmp"])),
@@ -225,7 +215,7 @@ def _tables_of_layers(layers: _Layers) -> dict[str, str]:
     carried = adaptive.estimator.observer.carried
     mass, point = _below_sensors(layers.model)
     given = {
-        **{name: gains[name] for name in (*_OF_POSTURE, *_SHARES_OF_POSTURE)},
+        **{name: gains[name] for name in _OF_POSTURE.split()},
         "turn_limit": gains["limit_rad"],
         "correction_limit": adaptive.limit,
         "correction_share": adaptive.share,
@@ -260,9 +250,8 @@ def _below_sensors(model: WalkerModel) -> tuple[Array, Array]:
 
 
 def _link(row: Any) -> str:
-    place = f"{row['parent']}, {row['column']}, {row['tip']}, {number(row['zero'])}"
-    weight = f"{number(row['weight'])}, {braced(row['weight_moment'])}"
-    return f"    {{{place}, {braced(row['R'])}, {braced(row['anchor'])}, {weight}}}"
+    place = f"{row['parent']}, {row['column']}, {row['tip']}"
+    return f"    {{{place}, {members(row, 'zero R anchor weight weight_moment')}}}"
 
 
 def _test_vector(policy: Any, prefix: str) -> str:
@@ -271,23 +260,17 @@ def _test_vector(policy: Any, prefix: str) -> str:
         "walker_test.h.in",
         prefix,
         count=_TEST_STEPS,
-        shown=",\n".join(_structs(played.shown)),
-        plan=",\n".join(_structs(played.plan)),
+        shown=_structs(played.shown),
+        plan=_structs(played.plan),
         offset=nested(played.offset),
         links=nested(played.links),
     )
 
 
-def _structs(fields: list[Array]) -> Iterator[str]:
+def _structs(fields: list[Array]) -> str:
     """Rows of fields as initialisers of structs."""
-    for row in zip(*fields, strict=True):
-        yield "    {" + ", ".join(map(_field, row)) + "}"
-
-
-def _field(value: Any) -> str:
-    if np.ndim(value) == 0:
-        return str(value) if isinstance(value, np.integer) else number(value)
-    return "{" + ", ".join(map(_field, value)) + "}"
+    rows = [", ".join(map(initialiser, row)) for row in zip(*fields, strict=True)]
+    return ",\n".join(f"    {{{row}}}" for row in rows)
 
 
 def _observations(model: WalkerModel, row: IntArray, generator: np.random.Generator) -> Array:

@@ -145,19 +145,9 @@ def pull_residual(
     hub = _hub()
     with _one_sentence(repository, revision):
         if not offline:
-            _require_small(repository, _sizes(hub, repository, revision))
-        paths = [
-            Path(
-                hub.hf_hub_download(
-                    repository,
-                    name,
-                    revision=revision,
-                    local_files_only=offline,
-                    endpoint=_endpoint(),
-                )
-            )
-            for name in _MOST_BYTES
-        ]
+            _require_small(hub, repository, revision)
+        asked = {"revision": revision, "local_files_only": offline, "endpoint": _endpoint()}
+        paths = [Path(hub.hf_hub_download(repository, name, **asked)) for name in _MOST_BYTES]
     commits = {path.parent.name for path in paths}
     if len(commits) > 1:
         raise SystemFailedError(f"{repository} changed while it was pulled; pull it again")
@@ -184,15 +174,12 @@ def _endpoint() -> str | None:
     return os.environ.get(_ENDPOINT)
 
 
-def _sizes(hub: Any, repository: str, revision: str) -> dict[str, int | None]:
-    """Sizes of a repository's files by their names."""
-    api = hub.HfApi(endpoint=_endpoint())
-    found = api.model_info(repository, revision=revision, files_metadata=True, timeout=_PATIENCE_S)
-    return {file.rfilename: file.size for file in found.siblings or []}
-
-
-def _require_small(repository: str, sizes: dict[str, int | None]) -> None:
+def _require_small(hub: Any, repository: str, revision: str) -> None:
     """Refuse a repository without the files of a residual, or with files that are too large."""
+    api = hub.HfApi(endpoint=_endpoint())
+    asked = {"revision": revision, "files_metadata": True, "timeout": _PATIENCE_S}
+    found = api.model_info(repository, **asked)
+    sizes = {file.rfilename: file.size for file in found.siblings or []}
     for name, most in _MOST_BYTES.items():
         if name not in sizes:
             raise ConfigurationError(
@@ -243,25 +230,21 @@ def _one_sentence(repository: str, revision: str | None) -> Iterator[None]:
     from huggingface_hub import errors
 
     name = shorten(repository)
+    refused = {
+        errors.HFValidationError: "a repository is OWNER/NAME, in letters, digits, and . _ -, got"
+        f" {quote(repository)}",
+        errors.RevisionNotFoundError: f"{name} has no revision {quote(revision)}; give a branch, a"
+        " tag or a commit",
+        errors.RepositoryNotFoundError: f"no repository {name} that you may use; check its name, or"
+        " log in by: hf auth login",
+        errors.LocalEntryNotFoundError: f"{name} at {revision} is not in the cache of this"
+        " computer, and the hub was not reached; pull it once with a network",
+    }
     try:
         yield
-    except errors.HFValidationError:
-        raise ConfigurationError(
-            f"a repository is OWNER/NAME, in letters, digits, and . _ -, got {quote(repository)}"
-        ) from None
-    except errors.RevisionNotFoundError:
-        raise ConfigurationError(
-            f"{name} has no revision {quote(revision)}; give a branch, a tag or a commit"
-        ) from None
-    except errors.RepositoryNotFoundError:
-        raise ConfigurationError(
-            f"no repository {name} that you may use; check its name, or log in by: hf auth login"
-        ) from None
-    except errors.LocalEntryNotFoundError:
-        raise ConfigurationError(
-            f"{name} at {revision} is not in the cache of this computer, and the hub was not"
-            " reached; pull it once with a network"
-        ) from None
+    except tuple(refused) as error:
+        said = next(text for kind, text in refused.items() if isinstance(error, kind))
+        raise ConfigurationError(said) from None
     except errors.HfHubHTTPError as error:
         status = getattr(error.response, "status_code", None)
         if status in (401, 403):

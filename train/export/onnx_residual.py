@@ -39,7 +39,10 @@ def onnx_model(layout: ResidualLayout) -> bytes:
     of_columns = graph.add("Gather", residual, graph.keep(layout.source), axis=1)
     correction = graph.add("Mul", of_columns, graph.keep(layout.bounds))
     graph.give("correction", correction, len(layout.columns), "values of the base's inputs")
-    facts = {key: _as_text(value) for key, value in layout.facts().items()}
+    facts = {
+        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for key, value in layout.facts().items()
+    }
     return graph.serialise(layout.name, facts)
 
 
@@ -76,10 +79,6 @@ def _network(graph: "_Graph", features: str, layout: ResidualLayout) -> str:
 
 _OF_LAYER = ("weight", "bias")
 _ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu"}
-
-
-def _as_text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 class _Graph:
@@ -130,8 +129,9 @@ class _Graph:
         parts: Sequence[Any] = (self._nodes, name, self._inputs, self._outputs)
         graph = onnx.helper.make_graph(*parts, initializer=self._constants)
         opsets = [onnx.helper.make_opsetid("", _OPSET)]
-        made = {"producer_name": "elastic-env", "producer_version": facts["elastic_env"]}
-        model = onnx.helper.make_model(graph, ir_version=_IR_VERSION, opset_imports=opsets, **made)
+        made = {"ir_version": _IR_VERSION, "opset_imports": opsets}
+        made |= {"producer_name": "elastic-env", "producer_version": facts["elastic_env"]}
+        model = onnx.helper.make_model(graph, **made)
         onnx.helper.set_model_props(model, facts)
         onnx.checker.check_model(model, full_check=True)
         return model.SerializeToString(deterministic=True)

@@ -186,7 +186,9 @@ def _rms(own: Evaluations, signal: TracedSignal) -> float:
         wanted = 0.0 if signal.reference is None else e.trace[signal.reference]
         parts.append((e.trace[signal.name] - wanted)[e.is_steady])
     values = np.concatenate(parts)
-    return float(np.sqrt(np.nanmean(values**2))) if np.isfinite(values).any() else float("nan")
+    if not np.isfinite(values).any():
+        return float("nan")
+    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def _marks(trace: Mapping[str, Array]) -> list[Mark]:

@@ -9,6 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from baselines.compensation.gravity_torque import make_gravity
+from baselines.identification.static_points import link_torque
+from elastic_env.core.signals import Array
+from elastic_env.world.robot_model import RobotModel
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation, group_by
@@ -17,8 +21,16 @@ from train.evaluate.rollout import make_vector_env
 from train.figures.chart import Cells, Curve, Panel, median, sweep_chart, time_chart
 from train.figures.colours import policy_colours
 from train.figures.map_plots import draw_map
-from train.figures.plots import Evaluations, FigureFormat, draw_chart, draw_overview
-from train.figures.testbed_plots import draw_static_errors
+from train.figures.plots import (
+    MRAD,
+    Evaluations,
+    FigureFormat,
+    draw_chart,
+    draw_overview,
+    label_text,
+    new_figure,
+    save,
+)
 
 _MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
@@ -30,6 +42,8 @@ _PAPER_FIGURES = {"pelvis": {"24 s": 7, "3 s": 8}, "zmp": {"24 s": 9, "3 s": 10}
 _PAPER_SCENARIOS = ("ideal", "nominal")
 _SUBJECTS = {"pelvis": "Pelvis error. ", "zmp": "Zero moment point. "}
 """Beginnings of the titles of pictures of a walk."""
+_PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
+"""Fig. 6 of the paper."""
 
 
 def draw_figures(
@@ -219,3 +233,46 @@ def _stem(evaluation: Evaluation) -> str:
 
 def _safe(text: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", text)
+
+
+def draw_static_errors(evaluations: Evaluations, model: RobotModel, path: Path) -> Path:
+    """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
+    figure, (axis,) = new_figure(1, 1, (7.6, 5.2))
+    gravity = [make_gravity(model)]
+    shades = policy_colours([e.condition.policy.title for e in evaluations])
+    for index, evaluation in enumerate(evaluations):
+        policy = evaluation.condition.policy.title
+        points = evaluation.points
+        if points is None:
+            continue
+        error = MRAD * static_errors(evaluation)
+        shade = shades[policy]
+        style = {"marker": "xosDv^"[index % 6], "linewidths": 1.3, "zorder": 3}
+        open_dots = {"facecolors": "none", "edgecolors": shade}
+        style |= open_dots if index else {"color": shade}
+        low = error.min()
+        high = error.max()
+        label = f"{label_text(policy)}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}"
+        torque = link_torque(points, gravity, points.q)
+        axis.scatter(torque, error, s=34, label=label, **style)
+        axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
+        for bound in _PAPER_RANGES_MRAD.get(policy, ()):
+            axis.axhline(bound, color=shade, lw=0.9, ls=":")
+    axis.set_title(f"Link error at rest, scenario {evaluations[0].condition.scenario}")
+    axis.set_xlabel("gravity torque at the link angle [N·m]")
+    axis.set_ylabel("q_ref − q by the link's IMU [mrad]")
+    axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=9)
+    return save(figure, path)
+
+
+def static_errors(evaluation: Evaluation) -> Array:
+    """Link error by the IMU, averaged over each window at rest, (visits,) [rad]."""
+    assert evaluation.points is not None
+    return evaluation.rest_references - evaluation.points.q
+
+
+def _paper(policy: str) -> str:
+    if policy not in _PAPER_RANGES_MRAD:
+        return ""
+    low, high = _PAPER_RANGES_MRAD[policy]
+    return f" (paper, dotted: {low:+.1f} to {high:+.1f})"

@@ -53,6 +53,8 @@ class _Options(Model):
     """Step of the optimiser."""
     gamma: float = quantity("1", 0.95, ge=0, le=1)
     """Discount of the reward per decision."""
+    stats_window_size: int = quantity("1", 100, ge=1, le=10**6)
+    """Episodes in a mean of TensorBoard's."""
 
     @model_validator(mode="before")
     @classmethod
@@ -99,14 +101,7 @@ class _SACNetwork(_NetworkOptions):
     """Critics."""
 
 
-class _StableBaselines(_Options):
-    """Options of the classes of stable_baselines3."""
-
-    stats_window_size: int = quantity("1", 100, ge=1, le=10**6)
-    """Episodes in a mean of TensorBoard's."""
-
-
-class _OnPolicy(_StableBaselines):
+class _OnPolicy(_Options):
     """Options of PPO and A2C."""
 
     n_steps: int = quantity("1", 32, ge=1, le=100_000)
@@ -149,7 +144,7 @@ class _A2C(_OnPolicy):
     use_rms_prop: bool = True
 
 
-class _SAC(_StableBaselines):
+class _SAC(_Options):
     """Options of SAC."""
 
     ent_coef: _Auto | Annotated[float, Field(ge=0, le=_LARGEST_WEIGHT)] = "auto"

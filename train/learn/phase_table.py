@@ -16,6 +16,7 @@ learning control, with a damped inverse of G as the learning gain [Bristow2006],
 
 from collections.abc import Sequence
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeAlias
 
@@ -26,7 +27,6 @@ import tyro
 from rich.console import Console
 
 import baselines
-import elastic_env  # noqa: F401  registers the environments
 from baselines.walking.phase_table import (
     CHANNELS,
     FOLDER,
@@ -39,6 +39,7 @@ from baselines.walking.phase_table import (
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
+from train.evaluate.rollout import control_steps
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 _PLANES = ((("zmp_x", "hip_pitch"), False), (("zmp_y", "hip_roll"), True))
@@ -159,18 +160,13 @@ class Walks:
         """Harmonics of the mean error, and its rms by channel: of robots that did not fall."""
         model = self.env.unwrapped.assumed_model
         policy = PhaseFeedforward(baselines.make("foothold", self.env), model, table)
-        shown, _ = self.env.reset(seed=list(range(self._search.robots)))
         stands = np.ones(self._search.robots, dtype=np.bool_)
-        start = stands.copy()
-        state = None
         logs: dict[str, list[Array]] = {name: [] for name in CHANNELS}
-        for _ in range(int(self._rows[-1])):
-            action, state = policy.predict(shown, state, start)
-            start[:] = False
-            shown, _, terminated, _, info = self.env.step(action)
-            stands &= ~terminated
+        steps = control_steps(self.env, policy, list(range(self._search.robots)))
+        for step in islice(steps, int(self._rows[-1])):
+            stands &= ~step.terminated
             for name, log in logs.items():
-                log.append(np.nan_to_num(info[_ERRORS[name]]))
+                log.append(np.nan_to_num(step.info[_ERRORS[name]]))
         columns = {}
         rms = {}
         for name, log in logs.items():

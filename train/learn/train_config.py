@@ -206,7 +206,8 @@ def training_worlds(
     """
     require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
-    apart = environment(config.env).learned_from | config.env_options | config.training_options
+    known = environment(config.env)
+    apart = known.learned_from | config.env_options | config.training_options
     conditions = [condition.replace(env_options=apart) for condition in conditions]
     weights = [config.weights.get(scenario, 1.0) for scenario, _ in shares]
     sizes = [count for _, count in shares]

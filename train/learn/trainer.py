@@ -24,7 +24,7 @@ from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.progress import MOST_BYTES, PROGRESS
 from train.evaluate.rollout import control_steps, make_policy
-from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
+from train.learn import checkpoint as checkpoints
 from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
@@ -116,7 +116,7 @@ class Trainer(ABC):
 
     def checkpoint(self) -> None:
         """Keep everything that the rest depends on."""
-        with write_checkpoint(self.folder / CHECKPOINT) as fresh:
+        with checkpoints.write_checkpoint(self.folder / CHECKPOINT) as fresh:
             self._write(fresh)
         self._kept = self.done
 
@@ -127,12 +127,12 @@ class Trainer(ABC):
             ElasticError: The checkpoint is not what was written.
         """
         path = self.folder / CHECKPOINT
-        if recover_checkpoint(path):
-            require_whole(path)
+        if checkpoints.recover_checkpoint(path):
+            checkpoints.require_whole(path)
             try:
                 self._read(path)
             except (LookupError, TypeError, ValueError, RuntimeError) as error:
-                raise damage_error(path, f"{type(error).__name__}: {error}") from error
+                raise checkpoints.damage_error(path, f"{type(error).__name__}: {error}") from error
             self._kept = self.done
         self._forget_later_scores()
 

@@ -117,8 +117,10 @@ class Training(Trainer):
         if self.config.anneal:
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
+        portion = self.config.worlds
+        if not isinstance(self.model, OffPolicyAlgorithm):  # whose n_steps are those of returns
+            portion *= self.model.n_steps
         try:
-            portion = self._portion()
             self.model.learn(portion, reset_num_timesteps=before == 0, log_interval=1)
         except ValueError:  # such as of a distribution whose parameters are nan
             self._require_finite_weights()
@@ -133,41 +135,26 @@ class Training(Trainer):
         require_finite("the variance of the returns", returns.var)
 
     def _write(self, checkpoint: Path) -> None:
-        parameters = io.BytesIO()  # torch itself calls a full disk an internal error
-        torch.save(self._parameters(), parameters)
-        (checkpoint / "model.pt").write_bytes(parameters.getbuffer())
+        parameters = {"model": self.model.get_parameters(), "rng": torch.get_rng_state()}
+        if (entropy := self._entropy_weight) is not None:
+            parameters["log_ent_coef"] = entropy.detach()
+        content = io.BytesIO()  # torch itself calls a full disk an internal error
+        torch.save(parameters, content)
+        (checkpoint / "model.pt").write_bytes(content.getbuffer())
         write_state(checkpoint, "state", self._state())
 
     def _read(self, checkpoint: Path) -> None:
         parameters = torch.load(checkpoint / "model.pt", weights_only=True)
-        self.model.policy.load_state_dict(parameters["policy"])
-        for name, optimiser in self._optimisers().items():
-            optimiser.load_state_dict(parameters["optimisers"][name])
-        if "log_ent_coef" in parameters:
-            self.model.log_ent_coef.data.copy_(parameters["log_ent_coef"])
+        self.model.set_parameters(parameters["model"], device="cpu")
+        if (entropy := self._entropy_weight) is not None:
+            entropy.data.copy_(parameters["log_ent_coef"])
         torch.set_rng_state(parameters["rng"])
         self._load(read_state(checkpoint, "state"))
 
-    def _parameters(self) -> dict[str, Any]:
-        optimisers = self._optimisers().items()
-        parameters = {
-            "policy": self.model.policy.state_dict(),
-            "optimisers": {name: own.state_dict() for name, own in optimisers},
-            "rng": torch.get_rng_state(),
-        }
-        if getattr(self.model, "log_ent_coef", None) is not None:
-            parameters["log_ent_coef"] = self.model.log_ent_coef.detach()
-        return parameters
-
-    def _optimisers(self) -> dict[str, Any]:
-        policy = self.model.policy
-        found = {
-            "policy": getattr(policy, "optimizer", None),
-            "actor": getattr(getattr(policy, "actor", None), "optimizer", None),
-            "critic": getattr(getattr(policy, "critic", None), "optimizer", None),
-            "entropy": getattr(self.model, "ent_coef_optimizer", None),
-        }
-        return {name: own for name, own in found.items() if own is not None}
+    @property
+    def _entropy_weight(self) -> Any:
+        """Logarithm of the weight of the entropy where SAC learns it, else None."""
+        return getattr(self.model, "log_ent_coef", None)
 
     def _state(self) -> dict[str, Any]:
         model = self.model
@@ -232,12 +219,6 @@ class Training(Trainer):
     def _statistics(self) -> tuple[Any, Any]:
         """Means and variances of the normaliser: of observations and of returns."""
         return self._normaliser.obs_rms, self._normaliser.ret_rms
-
-    def _portion(self) -> int:
-        """Decisions of one call of `learn`: a rollout of PPO; SAC goes on to its next update."""
-        if isinstance(self.model, OffPolicyAlgorithm):  # n_steps are those of returns
-            return self.config.worlds
-        return self.config.worlds * self.model.n_steps
 
     def _shrink_last_layer(self) -> None:
         """A residual begins near zero: as the base."""

@@ -25,8 +25,12 @@ _SIGNS = {
 def print_changes(rows: Sequence[Change], console: Console) -> None:
     """Print the changes, a line per cell: residuals against bases, against rivals, then others."""
     judged = [row for row in rows if row.is_judged]
-    kinds = group_by(judged, lambda row: (not row.is_family, row.is_rival, *_alone(row)))
-    for _, own in sorted(kinds.items()):
+
+    def kind(row: Change) -> tuple[bool, bool, str]:
+        # residuals against each their own base share a table
+        return not row.is_family, row.is_rival, "" if row.is_family else row.base
+
+    for _, own in sorted(group_by(judged, kind).items()):
         lines = len(own) // len({row.column for row in own})
         if own[0].is_family or lines <= _MOST_LINES:
             print_table(cells_table(own), console, "statistics.csv")
@@ -37,11 +41,6 @@ def print_changes(rows: Sequence[Change], console: Console) -> None:
 
 _MOST_LINES = 40
 """Changes of policies without training that a terminal shows."""
-
-
-def _alone(row: Change) -> tuple[str, ...]:
-    """The base that a table is for: residuals against each their own share one."""
-    return () if row.is_family else (row.base,)
 
 
 def cells_table(rows: Sequence[Change]) -> Table:

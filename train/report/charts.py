@@ -129,7 +129,9 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
         for (row, policy, episodes), level in zip(rungs, levels, strict=True):
             shown = level.times(column.scale)
             figure = number_interval(level, column) if level.is_known else ""
-            text = f"{figure}{_failure_text(failure, *failures(episodes))}"
+            failed, played = failures(episodes)
+            mark = f'  <b style="color:{VERDICTS["higher"]}">✕ {failure} {failed}/{played}</b>'
+            text = f"{figure}{mark if failed else ''}"
             text_x = shown.ends[1] if level.is_known else left
             symbol = "diamond" if policy in table.members else "circle"
             dots.append(Dot(row, shown, text, text_x, policy, colours[policy], symbol))
@@ -143,13 +145,11 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> S
     )
     layout = chart["layout"]
     layout["annotations"] = [_heading(*heading) for heading in headings.items()]
-    layout["shapes"] = [_rule(place - 0.6) for place in list(headings.values())[1:]]
+    line = {"color": LINE, "width": 1}
+    rule = {"type": "line", "xref": "paper", "x0": 0, "x1": 1}
+    places = [place - 0.6 for place in list(headings.values())[1:]]
+    layout["shapes"] = [{**rule, "y0": y, "y1": y, "line": line} for y in places]
     return chart
-
-
-def _failure_text(failure: str, failed: int, played: int) -> str:
-    mark = f'  <b style="color:{VERDICTS["higher"]}">✕ {failure} {failed}/{played}</b>'
-    return mark if failed else ""
 
 
 def _level_axis(column: Column, levels: Sequence[Estimate]) -> Spec:
@@ -183,11 +183,6 @@ def _heading(text: str, place: float) -> Spec:
         "showarrow": False,
         "font": {"size": 13, "color": INK},
     }
-
-
-def _rule(place: float) -> Spec:
-    where = {"xref": "paper", "x0": 0, "x1": 1, "y0": place, "y1": place}
-    return {"type": "line", **where, "line": {"color": LINE, "width": 1}}
 
 
 def forest(rows: Sequence[Change]) -> Spec:

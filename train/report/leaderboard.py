@@ -65,9 +65,11 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
         for key, some in entries.items():
             scores = {s.policy: (s.score, (s.failed, s.episodes)) for s in some}
             best[key] = best_of(scores)
-        first = (*columns[0], metrics[0])
-        order = {s.policy: _order(places.get((s.policy, *first))) for s in own}
-        for policy in sorted(order, key=lambda policy: order[policy]):
+        order = dict.fromkeys((s.policy for s in own), math.inf)
+        for s in own:
+            if (s.scope, s.reference, s.metric) == (*columns[0], metrics[0]) and s.score.is_known:
+                order[s.policy] = s.score.value
+        for policy in sorted(order, key=order.__getitem__):
             entries = []
             for column in columns:
                 found = [places.get((policy, *column, metric)) for metric in metrics]
@@ -85,12 +87,6 @@ def _board(shown: Sequence[Standing], everything: Sequence[Standing]) -> Table:
 def _meaning(shown: Sequence[Standing]) -> str:
     """Metrics that a cell of the leaderboard holds."""
     return " / ".join(dict.fromkeys(f"{s.title} [{_column(s).unit}]" for s in shown))
-
-
-def _order(standing: Standing | None) -> float:
-    if standing is None or not standing.score.is_known:
-        return math.inf
-    return standing.score.value
 
 
 def _totals(policy: str, everything: Sequence[Standing]) -> list[str]:
@@ -189,7 +185,7 @@ def add_leaderboard(page: Page, found: Sequence[Standing]) -> None:
     page.add("table", board(found))
     claims = claims_table(found)
     if claims.rows:
-        page.add("text", paired_text(), "What learning adds")
+        page.add("text", TEXTS["paired"].format(signs=SIGNS_ARE), "What learning adds")
         page.add("table", claims)
     single = scenarios_board(found)
     if single is not None:
@@ -202,11 +198,6 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
     page = Page("", "")
     add_leaderboard(page, found)
     return "\n\n".join(page.sections[0].as_markdown[1:]) + "\n"
-
-
-def paired_text() -> str:
-    """The paragraph above the paired changes."""
-    return TEXTS["paired"].format(signs=SIGNS_ARE)
 
 
 def print_leaderboard(found: Sequence[Standing], console: Console) -> None:

@@ -1,25 +1,18 @@
 """The results of a comparison, and the sentences of a report, whatever it is written in."""
 
 import json
-from collections import Counter
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from train.evaluate import changes as terms
-from train.evaluate.changes import (
-    BEST_ANALYTIC,
-    FEWEST_SEEDS,
-    Change,
-    Verdict,
-    percent,
-    percent_interval,
-)
+from train.evaluate.changes import BEST_ANALYTIC, Change, Verdict
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap, Scores, best_of, ranking
@@ -101,44 +94,74 @@ class Results:
         return [row for row in self.changes if row.is_family and row.is_judged]
 
     @property
+    def compared_pairs(self) -> list[list[Change]]:
+        """These, by residual and kind of opponent."""
+        pairs = group_by(self.judged_changes, lambda row: (row.policy, row.is_rival))
+        return list(pairs.values())
+
+    @property
+    def with_rival(self) -> set[str]:
+        """Residuals that are compared with the best policy without learning."""
+        return {row.policy for row in self.changes if row.is_rival}
+
+    @property
+    def claims(self) -> list[tuple[Change, Change]]:
+        """Changes against the best policy without learning, each with that against the base.
+
+        Of the groups; without groups of the scenarios, where there are few.
+        """
+        rivals = [row for row in self.judged_changes if row.is_rival]
+        others = [row for row in self.judged_changes if not row.is_rival]
+        bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
+        shown = [row for row in rivals if row.is_group]
+        if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
+            shown = rivals
+        return [(row, bases[row.policy, row.place, row.column]) for row in shown]
+
+    @property
     def has_conditions(self) -> bool:
         """True if its cells are conditions of their own, and not points of a curve or a map."""
         return self.swept is None and not self.maps
 
 
-def headline(results: Results) -> str:
-    """Three sentences: what was played, who is best, and what learning adds or who is last."""
-    table = results.table
-    failed, played = failures(table.rows)
-    of_these = f"of which {failed} failed" if failed else "none of which failed"
-    policies = _count(len(table.policies), "policy", "policies")
-    episodes = _count(played, "episode")
-    scenarios = _count(len(table.scenarios), "scenario")
-    first = f"{policies} played {episodes} in {scenarios}, {of_these}."
-    best, worst = _best_and_worst(table)
-    return " ".join([first, best, _learning_sentence(results) or worst])
+_MOST_CLAIMS = 4
+"""Scopes and metrics of which each has a sentence, without groups."""
 
 
-def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
-    """Sentences on the best and the worst policy by the first judged metric."""
+def sentences(kind: Literal["headline", "in_short", "notes"], results: Results) -> list[str]:
+    """Paragraphs of plain text that a macro of `sentences.j2` makes of the results."""
+    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
+    marks = {mark for row in results.changes for mark in row.marks}
+    helpers = {
+        "terms": terms,
+        "failures": failures,
+        "ranked": _ranked,
+        "by_metric": lambda rows: group_by(rows, lambda row: row.column).values(),
+        "marks": [kind for kind in kinds if any(mark.startswith(kind) for mark in marks)],
+        "verdict_words": _VERDICTS,
+    }
+    module = load_template("sentences.j2").make_module(helpers)
+    text = getattr(module, kind)(results)
+    parts = [re.sub(r"[ \n]+", " ", part).strip() for part in text.split("\n\n")]
+    return list(filter(None, parts))
+
+
+def _ranked(table: EpisodeTable) -> list[dict[str, Any]]:
+    """Policies from the best to the worst by the first judged metric.
+
+    With their scores as they are shown, and whether each is ahead in every cell.
+    """
     column = table.environment.judged[0]
     scores = _scores(table.rows, column)
-    known = ranking(scores)
-    if not known:
-        return f"No policy has a {column.title}.", "No episode reached its end."
-    best = known[0]
-    shown = {
-        title: f"{column.scale * scores[title][0].value:.{column.decimals}f} {column.unit}"
-        for title in known
-    }
-    found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}"
-    if len(known) == 1:
-        return f"{found}.", "No other policy was played."
     cells = [_scores(rows, column) for _, rows in table.rows.groupby("cell")]
-    ahead = [best_of(cell) == best for cell in cells]
-    if len(ahead) > 1:
-        found = f"{found}; it is ahead in {sum(ahead)} of {len(ahead)} cells"
-    return f"{found}.", f"{known[-1]} comes last, with {shown[known[-1]]}."
+    return [
+        {
+            "policy": title,
+            "score": f"{column.scale * scores[title][0].value:.{column.decimals}f} {column.unit}",
+            "is_ahead": [best_of(cell) == title for cell in cells],
+        }
+        for title in ranking(scores)
+    ]
 
 
 def _scores(rows: pd.DataFrame, column: Column) -> Scores:
@@ -152,23 +175,12 @@ def _scores(rows: pd.DataFrame, column: Column) -> Scores:
     return found
 
 
-def _learning_sentence(results: Results) -> str:
-    """Change by learning in the first judged metric, or that there are too few training seeds."""
-    rows = [row for row in results.judged_changes if not row.is_rival]
-    if not rows:
-        return ""
-    row = next((row for row in rows if row.is_group), rows[0])
-    metric = f"the {row.column.title} of {row.base}"
-    subject = f"{row.policy} changes {metric} in {row.scope}"
-    if row.num_seeds >= FEWEST_SEEDS:
-        return f"{subject} by {percent_interval(row.relative)}."
-    few = f"{_count(row.num_seeds, 'training seed')} cannot tell that from chance"
-    change = percent(row.relative.value)
-    return f"{subject} by {change}; {few}, {FEWEST_SEEDS} are needed."
-
-
-def _count(number: int, one: str, several: str = "") -> str:
-    return f"{number} {one if number == 1 else several or f'{one}s'}"
+_VERDICTS: Mapping[Verdict, str] = {
+    "lower": "lower",
+    "higher": "higher",
+    "none": "no difference shown (the interval includes zero)",
+    "unclear": "too few training seeds to tell",
+}
 
 
 def facts(results: Results) -> list[tuple[str, str]]:
@@ -194,159 +206,12 @@ def facts(results: Results) -> list[tuple[str, str]]:
 
 def _training_text(origin: Origin) -> str:
     number = len(origin.folders)
+    seeds = f"{number} training seed{'s' * (number != 1)}"
     where = " to ".join(dict.fromkeys([origin.folders[0], origin.folders[-1]]))
     on = ", ".join(origin.scenarios or ["an unknown condition"])
     motion = "" if origin.reference is None else f" ({origin.reference})"
     commits = ", ".join(commit[:12] for commit in origin.commits)
-    return f"{_count(number, 'training seed')}, trained on {on}{motion}; {where}; commit {commits}"
-
-
-def in_short(results: Results) -> list[str]:
-    """Gains by learning in a sentence each; then how many cells are better or worse."""
-    found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)]
-    found += claims(results)
-    pairs = group_by(results.judged_changes, lambda row: (row.policy, row.is_rival))
-    for rows in pairs.values():
-        for own in group_by(rows, lambda row: row.column).values():
-            found += _of_a_metric(results, own)
-        worse = [row for row in rows if row.falls_more and not row.is_group]
-        if worse:
-            places = [f"{row.scope}{_at(results, row)}" for row in worse]
-            than = f"more {rows[0].failure} than {rows[0].base}"
-            where = ", ".join(dict.fromkeys(places))
-            found.append(f"{rows[0].policy}: {than} in {where}.")
-    return found or [
-        "No residual takes part: there are no training seeds, and differences are differences of"
-        " means."
-    ]
-
-
-def of_a_map(heat_map: HeatMap) -> list[str]:
-    """Who is best in how many cells of a map, and in how many learning is ahead."""
-    where = f"{heat_map.column.title}, {heat_map.title}"
-    cells = heat_map.flat
-    wins = Counter(cell.best for cell in cells)
-    ranked = sorted(heat_map.table.policies, key=lambda title: -wins[title])
-    best = ", ".join(f"{title} in {wins[title]}" for title in ranked if wins[title])
-    found = [f"{where}: best of {len(cells)} cells: {best}."]
-    for title in heat_map.table.members:
-        rows = [cell.learned[title] for cell in cells if title in cell.learned]
-        values = [row.relative.value for row in rows if row.relative.is_known]
-        if values:
-            against = f"{title} against the {BEST_ANALYTIC} of each cell"
-            span = f"from {percent(min(values))} to {percent(max(values))}"
-            found.append(f"{where}: {against}: {_tally(rows)}; {span}.")
-    return found
-
-
-def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
-    """Lines of a residual in one metric against one policy: pooled figures, and counts of cells."""
-    policy = own[0].policy
-    title = f"{policy} against {own[0].base}, {own[0].column.title}"
-    has_rival = any(row.is_rival and row.policy == policy for row in results.changes)
-    found = []
-    for row in own:
-        if row.is_group and not has_rival:
-            figure = f"{percent_interval(row.relative)}{marks_text(row)}{_besides(row)}"
-            where = f"{row.scope}{_at(results, row)}"
-            found.append(f"{title}, pooled over {where}: {figure}.")
-    cells = [row for row in own if not row.is_group]
-    return [*found, f"{title}: {_tally(cells)}."] if cells else found
-
-
-def claims(results: Results) -> list[str]:
-    """Gains by learning over the base and to the best policy without learning, one per scope.
-
-    Scopes are the groups; without groups the scenarios, where there are few.
-    """
-    rivals = [row for row in results.judged_changes if row.is_rival]
-    others = [row for row in results.judged_changes if not row.is_rival]
-    bases = {(row.policy, row.place, row.column): row for row in others[::-1]}
-    shown = [row for row in rivals if row.is_group]
-    if not shown and len({(row.policy, row.place) for row in rivals}) <= _MOST_CLAIMS:
-        shown = rivals
-    found = []
-    for rival in shown:
-        base = bases[rival.policy, rival.place, rival.column]
-        pooled = "pooled over " if rival.is_group else ""
-        where = f"{pooled}{rival.scope}{_at(results, rival)}{marks_text(rival)}"
-        subject = f"{rival.policy}, {rival.column.title}, {where}"
-        to_base = f"{_comparison(base)} than {base.base}, its base{_bounds(base)}"
-        best = f"{rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}"
-        found.append(f"{subject}: {to_base}; {_comparison(rival)} than {best}.")
-    return found
-
-
-_MOST_CLAIMS = 4
-"""Scopes and metrics of which each has a sentence, without groups."""
-
-
-def _bounds(row: Change) -> str:
-    """The interval of a change."""
-    text = percent_interval(row.relative)
-    return text[text.index(" [") :] if row.relative.has_interval else ""
-
-
-def _comparison(row: Change) -> str:
-    """How much lower or higher, before "than"."""
-    value = row.relative.value
-    if not np.isfinite(value):
-        return "not comparable (no episode in which both stayed up), neither lower nor higher"
-    size = f"{percent(abs(value), signed=False)} {'higher' if value > 0.0 else 'lower'}"
-    return {
-        "lower": size,
-        "higher": size,
-        "none": "not shown to be lower or higher",
-        "unclear": f"{size} (too few training seeds to tell)",
-    }[row.verdict]
-
-
-def _besides(row: Change) -> str:
-    """The part of a row's sentence that its figures do not say."""
-    is_plain = row.verdict in ("lower", "higher") and ";" not in row.sentence
-    return "" if is_plain else f": {row.sentence}"
-
-
-def _tally(cells: Sequence[Change]) -> str:
-    counts = Counter(row.verdict for row in cells)
-    shown = {verdict: words for verdict, words in _VERDICTS.items() if counts[verdict]}
-    found = [f"{words} in {counts[verdict]}" for verdict, words in shown.items()]
-    return f"of {len(cells)} cells {', '.join(found)}"
-
-
-_VERDICTS: Mapping[Verdict, str] = {
-    "lower": "lower",
-    "higher": "higher",
-    "none": "no difference shown (the interval includes zero)",
-    "unclear": "too few training seeds to tell",
-}
-
-
-def _at(results: Results, row: Change) -> str:
-    parts = [row.reference] if len(results.table.references) > 1 else []
-    parts += [f"{name}={value:g}" for name, value in row.swept.items()]
-    return "".join(f", {part}" for part in parts)
-
-
-def marks_text(row: Change) -> str:
-    """Marks of a row in brackets."""
-    return f" ({'; '.join(row.marks)})" if row.marks else ""
-
-
-def notes(results: Results) -> list[str]:
-    """Notes that a reader of this comparison needs."""
-    marks = {mark for row in results.changes for mark in row.marks}
-    kinds = (terms.HELD_OUT, terms.PARTLY, terms.CEILING, terms.SAME_ROBOT)
-    text = load_template("notes.html.j2").render(
-        failures=results.environment.failures,
-        walks=results.environment.walks,
-        families=results.table.families,
-        maps=results.maps,
-        has_rivals=any(row.is_rival for row in results.changes),
-        marks={kind for kind in kinds if any(mark.startswith(kind) for mark in marks)},
-        terms=terms,
-    )
-    return [" ".join(note.split()) for note in text.split("\n\n") if note.strip()]
+    return f"{seeds}, trained on {on}{motion}; {where}; commit {commits}"
 
 
 def _span(numbers: Sequence[int]) -> str:

@@ -1,6 +1,7 @@
 """Scores as tables: of cells, over drawn robots, and on the way of a training."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 
 from rich.console import Console
@@ -20,19 +21,18 @@ from train.runs.escaping import write_records
 def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> Table:
     """Mean of every policy in every cell, with intervals."""
     rows = []
-    for reference in table.references:
-        for scenario in table.scenarios:
-            for policy in table.policies:
-                for cell in table.cells_of(policy, reference, scenario):
-                    condition = table.conditions[policy, cell]
-                    values = condition.swept_values(table.swept)
-                    own = table.of(policy, cell)
-                    own = by_episode(own) if condition.member is None else own
-                    units = ([len(set(own["robot"]))], [condition.draws_robots])
-                    scores = {column: of_units(score(own, column), *units) for column in columns}
-                    figures = [number_interval(found, column) for column, found in scores.items()]
-                    over = next((found.over for found in scores.values() if found.over), "-")
-                    rows.append([reference, scenario, policy, *values, *figures, over])
+    places = product(table.references, table.scenarios, table.policies)
+    for reference, scenario, policy in places:
+        for cell in table.cells_of(policy, reference, scenario):
+            condition = table.conditions[policy, cell]
+            own = table.of(policy, cell)
+            own = by_episode(own) if condition.member is None else own
+            units = ([len(set(own["robot"]))], [condition.draws_robots])
+            scores = [of_units(score(own, column), *units) for column in columns]
+            figures = map(number_interval, scores, columns)
+            over = next((found.over for found in scores if found.over), "-")
+            values = condition.swept_values(table.swept)
+            rows.append([reference, scenario, policy, *values, *figures, over])
     labels = [column.label for column in columns]
     head = ["reference", "scenario", "policy", *table.swept, *labels, "95 % over"]
     return Table.plain(head, rows, words=3 + len(table.swept))

@@ -56,12 +56,13 @@ def page_chart(chart: Chart) -> Spec:
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{last}", **ticks)
     height = round(130 + _PIXELS * total)
     strip = _STRIP / (height - 28 - 20 * legend_rows - 50) if chart.marks else 0.0
-    layout["legend"] = {"orientation": "h", "y": 1.0 + 1.5 * strip, "yanchor": "bottom", "x": 0.0}
+    above = 1.0 + 1.5 * strip
+    layout["legend"] = {"orientation": "h", "y": above, "yanchor": "bottom", "x": 0.0}
     layout["showlegend"] = True
     is_small = len({curve.name for curve in curves if curve.name}) < 7
     layout["hovermode"] = "x unified" if is_small else "closest"
     shapes = [_band(*span, SHADE) for span in chart.shaded]
-    ends = (1.0 + 0.5 * strip, 1.0 + 1.5 * strip)
+    ends = (1.0 + 0.5 * strip, above)
     shapes += [_band(*span, mark.colour, ends) for mark in chart.marks for span in mark.spans]
     layout["shapes"] = shapes
     return {"data": data, "layout": {**layout, "height": height}}
@@ -83,10 +84,13 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
+    x: Spec = {"x": curve.x.tolist()}
+    if len(curve.x) >= 20:  # evenly spaced
+        x = {"x0": digits(float(curve.x[0])), "dx": digits(float(curve.x[1] - curve.x[0]))}
     line = {
         "type": "scatter",
         "yaxis": f"y{axis}",
-        **_abscissa(curve.x),
+        **x,
         "mode": "lines+markers" if curve.has_points else "lines",
         "y": numbers(curve.y),
         "name": chart_text(curve.name),
@@ -106,13 +110,6 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     low, high = map(numbers, curve.band)
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
     return [{**hidden, "y": low}, {**hidden, "y": high, **filled}, line]
-
-
-def _abscissa(x: Array) -> Spec:
-    """Points of the axis; of many that are evenly spaced the first one and the distance."""
-    if len(x) < 20:
-        return {"x": x.tolist()}
-    return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
 
 
 def _band(begin: float, end: float, colour: str, ends: tuple[float, float] = (0, 1)) -> Spec:

@@ -21,7 +21,7 @@ from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
 from train.figures.colours import NIGHT, VERDICTS
 from train.report.specs import FONT
-from train.runs.escaping import markdown_text, script_json, template_value
+from train.runs.escaping import line_value, markdown_text, script_json, template_value
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -309,7 +309,7 @@ _MARKDOWN = {
 
 
 def load_template(name: str = "page.html.j2") -> "Template":
-    """A template, by default that of a page; it escapes all that is put into it.
+    """A template, by default that of a page; one of HTML escapes all that is put into it.
 
     Raises:
         MissingExtraError: Jinja2 is not installed.
@@ -318,12 +318,13 @@ def load_template(name: str = "page.html.j2") -> "Template":
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError:
         raise missing_extra("jinja2", "report", "writing a report") from None
+    is_html = name.endswith(".html.j2")
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
+        autoescape=is_html,
         undefined=StrictUndefined,
         trim_blocks=True,
-        finalize=template_value,
+        finalize=template_value if is_html else line_value,
     )
     environment.filters.update(script_json=script_json)
     environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)

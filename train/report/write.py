@@ -17,7 +17,7 @@ from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
 from train.report.leaderboard import add_leaderboard
 from train.report.page import TEXTS, Page
-from train.report.report_text import Results, capital, facts, headline, in_short, notes
+from train.report.report_text import Results, capital, facts, sentences
 from train.report.score_tables import learning_table, robots_table, scores_table
 from train.report.specs import page_chart
 from train.report.table_formats import Table, load_template
@@ -72,9 +72,9 @@ def _page(results: Results) -> Page:
     subject = capital(results.environment.subject)
     under = f"{subject}; made {results.metadata['created'][:10]}"
     page = Page(f"Comparison: {results.name}", under)
-    page.section("What was compared", headline(results))
+    page.section("What was compared", *sentences("headline", results))
     page.add("definitions", facts(results))
-    page.add("bullets", in_short(results), "In short")
+    page.add("bullets", sentences("in_short", results), "In short")
     if results.standings:
         add_leaderboard(page, results.standings)
     if results.maps:
@@ -100,7 +100,7 @@ def _page(results: Results) -> Page:
         table = learning_table(results.learning, columns)
         page.add("table", table, "Table of learning curves", is_folded=True)
     page.section("Notes")
-    page.add("bullets", notes(results))
+    page.add("bullets", sentences("notes", results))
     return page
 
 

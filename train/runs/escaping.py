@@ -104,6 +104,11 @@ def template_value(value: Any) -> Any:
     return visible(value) if type(value) is str else value
 
 
+def line_value(value: Any) -> Any:
+    """A value for sentences, of which a blank line ends one: text is visible and in one line."""
+    return visible(value).replace("\n", " ") if isinstance(value, str) else value
+
+
 def chart_text(text: str) -> str:
     """Plain text in a chart, whose texts are HTML."""
     return html.escape(visible(text), quote=False)

@@ -118,7 +118,10 @@ def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     """
     with _open_lock(folder / _LOCK) as file:
         last = time.monotonic() + patience_s
-        while not _take_lock(file):
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
             if time.monotonic() >= last:
                 holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
                 problem = f"another program, process {holder}, works on {folder}"
@@ -155,15 +158,6 @@ def _no_lock(path: Path) -> ConfigurationError:
     return ConfigurationError(
         f"{path} must be a plain file with one name, it is a link or something else; remove it"
     )
-
-
-def _take_lock(lock: TextIO) -> bool:
-    """Try to take a lock for this program; true if that worked."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 @contextmanager

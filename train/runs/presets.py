@@ -79,4 +79,5 @@ def first_sentence(file: Path) -> str:
 
 def _of_kind(kind: str) -> dict[str, Path]:
     """The presets of a kind, by name."""
-    return {name: file for name, file in presets().items() if kind_of(read_mapping(file)) == kind}
+    known = presets().items()
+    return {name: file for name, file in known if kind_of(read_mapping(file)) == kind}

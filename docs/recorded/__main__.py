@@ -1,4 +1,4 @@
-"""`python -m train.recorded FOLDER`: every figure of the page "Recorded robots"."""
+"""`python -m docs.recorded FOLDER`: every figure of the page "Recorded robots"."""
 
 import json
 from itertools import count
@@ -9,13 +9,13 @@ import tyro
 from rich import box
 from rich.console import Console
 
+from docs.recorded.justin import HandError, hand_errors, num_trials, read_poses
+from docs.recorded.pictures import draw_hand_errors
+from docs.recorded.servos import COLUMNS, num_fits, servo_figures, servo_rows
+from docs.recorded.sources import SOURCES
 from elastic_env.core.files import write_whole
 from train.commands.cli import CONSOLE, run_program
 from train.commands.entry import start as start_program
-from train.recorded.justin import HandError, hand_errors, num_trials, read_poses
-from train.recorded.pictures import draw_hand_errors
-from train.recorded.servos import num_fits, servo_figures, servo_rows
-from train.recorded.sources import JUSTIN, SOURCES, STS3250, XL330
 from train.runs.console import make_table, print_files
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
@@ -35,7 +35,7 @@ def main(
         fetch: Fetch what the folder does not have from github.com.
         output: Folder for tables and figures; default runs/recorded, numbered if taken.
     """
-    for source in SOURCES:
+    for source in SOURCES.values():
         CONSOLE.print(
             f"{source.name}: {source.what}\n  {source.repository}, commit {source.commit};"
             f" licence: {source.licence}",
@@ -44,9 +44,12 @@ def main(
         )
         if fetch:
             source.fetch(folder, lambda address: CONSOLE.print(f"fetching {address}"))
-    (path,) = (JUSTIN.file(folder, path) for path in JUSTIN.files)
-    poses = read_poses(path)
-    logs = [source.file(folder, path) for source in (XL330, STS3250) for path in source.files]
+    files = {
+        name: [source.file(folder, path) for path in source.files]
+        for name, source in SOURCES.items()
+    }
+    poses = read_poses(files["agile_justin"][0])
+    logs = [*files["xl330"], *files["sts3250"]]
     totals = {"servos": num_fits(), "humanoid": num_trials(len(poses.theta))}
     with (
         run_folder("recorded", {"folder": str(folder)}, None, output) as results,
@@ -67,7 +70,7 @@ def main(
 
 def _print_servos(rows: list[dict[str, Any]], console: Console) -> None:
     """Errors of the servos' logs that were not fitted."""
-    keys = ("goal_mrad", "offset_mrad", "line_mrad", "replay_mrad", "replay_all_mrad")
+    keys = (*COLUMNS, "replay_all_mrad")
     lines = []
     for row in rows:
         shown = [f"{row[key]:.1f}" if key in row else "–" for key in keys]

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from docs.recorded.justin import GUESSED, VARIANTS, HandError
 from train.figures.plots import require_matplotlib, save
-from train.recorded.justin import GUESSED, VARIANTS, HandError
 
 _OWN = "#2a6f97"
 _OTHER = "#9aa5b1"

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from baselines.identification.geometry_fit import GeometryFit, GeometryProblem, fit_geometry
+from baselines.identification.geometry_fit import GeometryProblem, fit_geometry
 from baselines.identification.geometry_model import Geometry, GeometryModel
 from baselines.identification.geometry_result import correct_model
 from baselines.identification.holdout import RIGID, rival_errors
@@ -320,13 +320,11 @@ def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factors: Array) 
         other = replace(problem, theta=outer.theta, measured=outer.measured)
         if not errors:
             rigid = fit_geometry(problem.as_rigid())
-            errors = {RIGID: rigid.errors(other), **_rivals(rigid, problem, other)}
+            missed = (rigid.missed(problem), rigid.missed(other))
+            rivals = rival_errors(problem.theta, missed[0], other.theta, missed[1])
+            errors = {RIGID: rigid.errors(other), **rivals}
         errors[variant.name] = fit_geometry(problem).errors(other)
     return errors
-
-
-def _rivals(rigid: GeometryFit, inner: GeometryProblem, outer: GeometryProblem) -> dict[str, Array]:
-    return rival_errors(inner.theta, rigid.missed(inner), outer.theta, rigid.missed(outer))
 
 
 def _summary(key: tuple[str, int, str], errors: list[Array], held_out: int) -> HandError:
