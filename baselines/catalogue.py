@@ -32,16 +32,11 @@ from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
 from baselines.walking.dcm_observer import DcmObserver
-from baselines.walking.foot_balance import FootBalance
-from baselines.walking.foot_tare import FootTare
-from baselines.walking.foothold import FootholdCorrection
-from baselines.walking.hip_torque import HipTorque
+from baselines.walking.foothold import FootholdCorrection, FootTare, RefinedWalk, refined
+from baselines.walking.mean_zmp import StandingEstimate, ZmpOffset, ZmpOffsetGains
 from baselines.walking.phase_table import PhaseFeedforward, load_phase_table
 from baselines.walking.posture import PostureFeedback, PostureGains
-from baselines.walking.refined_walk import RefinedWalk, refined
-from baselines.walking.stance_roll import StanceRoll
-from baselines.walking.standing_estimate import StandingEstimate
-from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
+from baselines.walking.published import FootBalance, HipTorque, StanceRoll
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 

@@ -10,14 +10,10 @@ from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
 from baselines.walking.controller import WalkingGains
 from baselines.walking.dcm_observer import DcmObserverGains
-from baselines.walking.foot_balance import FootBalanceGains
-from baselines.walking.foot_tare import FootTareGains
-from baselines.walking.foothold import FootholdGains
-from baselines.walking.hip_torque import HipTorqueGains
+from baselines.walking.foothold import FootholdGains, FootTareGains
+from baselines.walking.mean_zmp import StandingGains, ZmpOffsetGains
 from baselines.walking.posture import PostureGains
-from baselines.walking.stance_roll import StanceRollGains
-from baselines.walking.standing_estimate import StandingGains
-from baselines.walking.zmp_offset import ZmpOffsetGains
+from baselines.walking.published import FootBalanceGains, HipTorqueGains, StanceRollGains
 from elastic_env.core.config import Model, quantity
 from elastic_env.motion.trajectory import STAND_S
 

@@ -45,7 +45,7 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -142,8 +142,8 @@ class DisturbanceObserver(PolicyAround):
         self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
         self._body = make_dynamics(model, self._static.gravity)
-        self._follow_share = 1.0 - float(np.exp(-self._dt / gains.time_constant_s))
-        self._smooth_share = 1.0 - float(np.exp(-self._dt / gains.rate_filter_s))
+        self._follow_share = filter_share(self._dt, gains.time_constant_s)
+        self._smooth_share = filter_share(self._dt, gains.rate_filter_s)
         self._zero_steps = round(gains.zero_s / self._dt)
         model.require_constant_friction("the disturbance observer")
         self._coulomb = gains.friction * model.coulomb_friction

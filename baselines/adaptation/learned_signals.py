@@ -20,7 +20,7 @@ from typing_extensions import override
 
 from baselines.adaptation.iterative_learning import ChannelGains
 from baselines.compensation.measured import LINK_ENCODER
-from baselines.walking.flat_feet import FlatFeet
+from baselines.walking.mean_zmp import FlatFeet
 from baselines.walking.posture import hip_offsets
 from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity

@@ -33,19 +33,6 @@ class GravityModel(Protocol):
         ...
 
 
-class FixedTorque:
-    """Torques of a robot on a fixed base, whose loads are the same at every control step."""
-
-    def __init__(self, torque: "HingeTorque | RigidBody") -> None:
-        self.gravity_torque = torque.gravity_torque
-        self.gravity_gradient = torque.gravity_gradient
-        self.inverse_dynamics = torque.inverse_dynamics
-
-    def at(self, rows: Array, gravity: Any = None) -> "FixedTorque":  # noqa: ARG002  a walker's
-        """Itself."""
-        return self
-
-
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     """The gravity torque of a robot by a chosen method; a `GravityModel` after `at(observations)`.
 
@@ -65,13 +52,13 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     chosen = method or ("hinge" if is_plain_hinge else "tree")
     require_known("gravity method", [chosen], ("hinge", "tree"))
     if chosen == "tree":
-        return FixedTorque(RigidBody(model.rigid, model.joint_names))
+        return RigidBody(model.rigid, model.joint_names)
     if is_more_than_gravity:
         raise ConfigurationError(
             "gravity method 'hinge' knows gravity alone, and this model has springs of joints"
             " or gravcomp; choose tree"
         )
-    return FixedTorque(HingeTorque(model))
+    return HingeTorque(model)
 
 
 def make_dynamics(model: RobotModel, gravity: Any) -> Any:

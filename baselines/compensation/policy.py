@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
+from elastic_env.core.compiled import record_type
 from elastic_env.core.errors import ElasticError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
@@ -347,6 +348,11 @@ def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> An
     return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
 
 
+def filter_share(period_s: float, time_constant_s: float) -> float:
+    """Share of its way that a first-order filter goes in a period [1]."""
+    return 1.0 - float(np.exp(-period_s / time_constant_s))
+
+
 class Motion(NamedTuple):
     """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
 
@@ -364,7 +370,6 @@ class ObservationView:
         self._period_s = model.control_period_s
         self._clock: Any = table.group("clock") if "clock.time" in table.names else None
         self._theta = table.group("encoder_angle")
-        self._theta_dot = table.group("encoder_rate")
         self._q = table.group("reference_angle")
         self._q_dot = table.group("reference_rate")
         self._q_ddot = table.group("reference_acceleration")
@@ -375,10 +380,6 @@ class ObservationView:
         """Encoder angles, (num_worlds, n) [rad]."""
         return rows[:, self._theta]
 
-    def theta_dot(self, rows: Array) -> Array:
-        """Encoder rates, (num_worlds, n) [rad/s]."""
-        return rows[:, self._theta_dot]
-
     def plan_row(self, rows: Array) -> IntArray:
         """Row of a walk's plan at the end of the coming control period, (num_worlds,)."""
         return np.rint(rows[:, self._clock.start] / self._period_s).astype(np.int64)
@@ -386,14 +387,6 @@ class ObservationView:
     def motion(self, rows: Array) -> Motion:
         """Reference motion for the coming control period, (num_worlds, n) each."""
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
-
-    def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
-        """A copy with link angles in the encoders' place, and rates if they are given."""
-        seen = rows.copy()
-        seen[:, self._theta] = q
-        if q_dot is not None:
-            seen[:, self._theta_dot] = q_dot
-        return seen
 
     def rows(self, observation: Array) -> Array:
         """The observation with one row per world, (num_worlds, m).
@@ -483,3 +476,22 @@ class WalkView:
         """Observations, (num_worlds, m), as rows with fields, (num_worlds,), in the same memory."""
         rows = np.ascontiguousarray(rows)
         return np.ndarray(len(rows), self._type, rows, 0, rows.strides[:1])
+
+
+def record_rows(**fields: Any) -> Any:
+    """Rows with named fields for compiled kernels, such as a plan.
+
+    Args:
+        **fields: Numbers of each field, (rows, ...).
+    """
+    columns = {name: np.asarray(values, dtype=np.float64) for name, values in fields.items()}
+    row_type = record_type(**{name: values.shape[1:] for name, values in columns.items()})
+    rows = np.empty(len(next(iter(columns.values()))), row_type)
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def record_row(**fields: Any) -> Any:
+    """One row of constants for compiled kernels, (1,), from the numbers of each field."""
+    return record_rows(**{name: np.asarray(value)[None] for name, value in fields.items()})

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from baselines.compensation.policy import filter_share
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
@@ -80,7 +81,7 @@ class GroundLevel:
         self._least_n = LOADED_SHARE * model.biped.weight
         self._period_s = period_s
         self._gravity = model.biped.gravity
-        self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
+        self._least_gain = filter_share(period_s, mean_s)
 
     def begin(self, num_worlds: int) -> GroundMemory:
         """Memory before the first measurement."""

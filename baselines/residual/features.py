@@ -28,7 +28,7 @@ from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from baselines.residual.true_robot import TrueRobot
-from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from baselines.walking.mean_zmp import LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import (
