@@ -13,7 +13,6 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import (
-    LegTorque,
     WrenchTorque,
     planned_feet,
     shift_plan,
@@ -43,6 +42,7 @@ from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint import elasticity
 from elastic_env.motion.trajectory import STAND_S
+from elastic_env.rigid.leg_chains import LegTorque
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]

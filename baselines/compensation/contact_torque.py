@@ -20,9 +20,8 @@ import numpy as np
 from baselines.compensation.policy import WalkView, record_row, record_rows
 from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_chains import LegTorque
 from elastic_env.rigid.tree.kernels import Vector, loads_type
 from elastic_env.world.robot_model import WalkerModel
 
@@ -49,53 +48,6 @@ def planned_feet(plan: WalkPlan) -> Any:
 def cosine_and_sine(angles: Array) -> Array:
     """Both of angles, (...) [rad] to (..., 2) [1]."""
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-
-
-class LegTorque(NamedTuple):
-    """Torques of legs under loads that go with any posture: a `GravityModel`, (num_worlds, 12)."""
-
-    chains: LegChains
-    loads: Any
-    """Rows of `LOADS`, (num_worlds,)."""
-
-    def gravity_torque(self, q: Array) -> Array:
-        """Torque that holds the legs, (num_worlds, 12) [rad] to [N·m]."""
-        return self.chains.torque(self.loads, q)
-
-    def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad].
-
-        It is not symmetric under a wrench, which turns with its foot.
-        """
-        return self.chains.gradient(self.loads, q)
-
-    def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
-        """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
-
-        Args:
-            q: (num_worlds, 12) [rad].
-            stiffness: K, (12,) [N·m/rad].
-            torque: τ, (num_worlds, 12) [N·m]; None for τ_g.
-
-        Returns:
-            (num_worlds, 12) [rad].
-
-        Raises:
-            ElasticError: The matrix is singular.
-        """
-        x, is_small = self.chains.solve(self.loads, q, stiffness, torque)
-        if not is_small:
-            torque = self.gravity_torque(q) if torque is None else torque
-            # says so if it is singular
-            K = np.broadcast_to(stiffness, q.shape)
-            solve_stiffness(K, self.gravity_gradient(q), torque)
-        return x
-
-    def solve_beyond(self, other: "LegTorque", q: Array, stiffness: Array) -> Array:
-        """What `solve` gives beyond other loads of the same legs, (num_worlds, 12) [rad]."""
-        both = LegTorque(self.chains, np.concatenate([self.loads, other.loads]))
-        found = both.solve(np.concatenate([q, q]), stiffness)
-        return found[: len(q)] - found[len(q) :]
 
 
 LOADS = loads_type(2)
