@@ -71,28 +71,33 @@ class GeometryPriors(Model):
     """Dry friction of a joint over its largest torque, where sides of approach are logged."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One estimate.
+UNITS = {
+    "translation": "m",
+    "rotation": "rad",
+    "marker": "m",
+    "offset": "rad",
+    "length": "m",
+    "angle": "rad",
+    "compliance": "rad/(N·m)",
+    "friction": "N·m",
+}
+"""Units of the kinds of parameters."""
 
-    Attributes:
-        kind: Kind of parameter, a field of `Parameters`.
-        name: Joint or marker and axis, such as `elbow.x`.
-        value: Estimate.
-        deviation: Its standard deviation.
-        prior: Standard deviation of its prior.
-    """
+
+class GeometryEstimate(Model):
+    """One parameter and its 95 % interval."""
 
     kind: str
+    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance,
+    friction."""
     name: str
+    """Joint or marker, with the axis of the joint's frame where it has several."""
     value: float
-    deviation: float
-    prior: float
-
-    @property
-    def is_told(self) -> bool:
-        """True if the poses narrow its deviation to less than half of the prior's."""
-        return self.deviation < _TOLD * self.prior
+    half_width: float
+    """Half of the 95 % interval."""
+    unit: str
+    is_told: bool
+    """Whether the poses narrow it to less than half of its prior's deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,30 +279,26 @@ class GeometryFit:
         return self.problem.parameters(self.x)
 
     @cached_property
-    def estimates(self) -> tuple[Estimate, ...]:
+    def estimates(self) -> tuple[GeometryEstimate, ...]:
         """The unknowns with their intervals."""
         own = self.problem.unknowns
-        deviations = np.sqrt(np.diag(self.covariance))
+        deviation = np.sqrt(np.diag(self.covariance))
         return tuple(
-            Estimate(*row)
-            for row in zip(
-                own.kinds,
-                own.names,
-                self.x.tolist(),
-                deviations.tolist(),
-                own.prior.tolist(),
-                strict=True,
+            GeometryEstimate(
+                kind=own.kinds[i],
+                name=own.names[i],
+                value=self.x[i],
+                half_width=QUANTILE * deviation[i],
+                unit=UNITS[own.kinds[i]],
+                is_told=bool(deviation[i] < _TOLD * own.prior[i]),
             )
+            for i in range(len(self.x))
         )
 
     def missed(self, problem: GeometryProblem) -> Array:
         """Places of the markers less those that this fit predicts, (N, k, 3) [m]."""
         shown = self.problem.model.measured(self.parameters, problem.theta, problem.axial)
         return problem.measured - shown
-
-    def errors(self, problem: GeometryProblem) -> Array:
-        """Distances of the markers from where they were measured, (N, k) [m]."""
-        return np.linalg.norm(self.missed(problem), axis=-1)
 
 
 def fit_geometry(problem: GeometryProblem) -> GeometryFit:
