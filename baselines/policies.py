@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.iterative import LearnedOffsets
-from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.iterative import LearnedOffsets, learned_signals
 from baselines.adaptation.offset_table import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
@@ -13,11 +12,11 @@ from baselines.catalogue import (
     ON_JOINTS,
     ON_THE_WALKER,
     NamedPolicy,
+    PolicyOptions,
     Track,
     policies_of,
 )
 from baselines.compensation.policy import Policy
-from baselines.options import PolicyOptions
 from baselines.residual.correction import Corrected
 from baselines.residual.residual_policy import ResidualPolicy, load_residual
 from baselines.residual.settings import RESIDUAL

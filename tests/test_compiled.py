@@ -45,7 +45,7 @@ KERNELS = (
     "baselines.walking.mean_zmp",
     "baselines.walking.zmp_shift",
     "baselines.estimation.bending",
-    "baselines.residual.network",
+    "baselines.residual.residual_policy",
     "baselines.identification.servo_replay",
 )
 

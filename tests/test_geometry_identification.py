@@ -21,10 +21,12 @@ from baselines.identification.holdout import (
     HeldOutError,
     Judged,
     judge,
+    predict_by_kernel,
+    predict_constant,
+    predict_linear,
     split,
 )
 from baselines.identification.pose_log import read_log, write_poses
-from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.links import Tree

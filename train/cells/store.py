@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from baselines.identification.static_points import StaticPoints
+from baselines.identification.identify import StaticPoints
 from elastic_env.core.errors import ElasticError, quote
 from elastic_env.core.files import read_bounded, write_whole
 from train.cells.key import cell_key

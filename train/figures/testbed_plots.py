@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from baselines.compensation.gravity_torque import make_gravity
-from baselines.identification.identify import Identification
-from baselines.identification.static_points import StaticPoints, link_torque
+from baselines.identification.identify import Identification, StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import RobotModel
 from train.evaluate.episodes import Evaluation
