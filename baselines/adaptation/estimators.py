@@ -36,7 +36,7 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
-from baselines.compensation.gravity_torque import make_dynamics
+from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
@@ -187,7 +187,7 @@ class EncoderEstimator(Estimator):
 
     def _compensator_of(self, model: RobotModel) -> Any:
         """Says which deflection to expect."""
-        return make_dynamics(model, GravityCompensator(model).gravity)
+        return make_gravity(model)
 
     @override
     def begin(self, num_worlds: int) -> Any:

@@ -382,7 +382,7 @@ class IterativeLearner(LearnedOffsets):
             told: Called with each `Trial`.
         """
         stage = Stage(env, seed)
-        shape = (stage.num_worlds, stage.num_steps + 1, len(self._signals.names))
+        shape = (stage.num_worlds, stage.num_steps + 1, len(self.names))
         tables = np.zeros(shape)
         before = np.full(shape, np.inf)
         for number in range(self.trials):
@@ -402,8 +402,7 @@ class IterativeLearner(LearnedOffsets):
         errors = limit_surprise(trial.error, known, surprise)
         following = np.empty_like(tables)
         for world, table in enumerate(tables):
-            own = (table, errors[world], gains, self._period_s)
-            following[world] = update(*own, trial.number)
+            following[world] = update(table, errors[world], gains, self._period_s, trial.number)
         failed = trial.failed[:, None, None]
         tables = np.where(failed, _RETREAT * tables, following)
         return tables, np.where(failed, before, errors)
@@ -432,7 +431,13 @@ class Stage:
         """
         n = self.num_worlds
         is_scalar = self._is_scalar
-        seen = self._reset([_seed_of_noise(robot, number) for robot in self._robots])
+        seeds: Any = [_seed_of_noise(robot, number) for robot in self._robots]
+        robots: Any = self._robots
+        if is_scalar:
+            seeds = seeds[0]
+            robots = robots[0]
+        seen, _ = self._env.reset(seed=seeds, options={"robot_seed": robots})
+        seen = np.atleast_2d(seen)
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
         over = np.zeros(n, dtype=np.bool_)
         failed = np.zeros(n, dtype=np.bool_)
@@ -442,7 +447,10 @@ class Stage:
         for step in range(1, self.num_steps + 1):
             action, state = policy.predict(seen, state, start, deterministic=True)
             asked = seen
-            seen, terminated, truncated, info = self._step(action)
+            command = action[0] if is_scalar else action
+            seen, _, terminated, truncated, info = self._env.step(command)
+            seen = np.atleast_2d(seen)
+            terminated = np.atleast_1d(terminated)
             start = terminated | truncated
             running = ~over & ~terminated
             error[running, step] = signals.error(asked, seen, info)[running]
@@ -455,18 +463,6 @@ class Stage:
             if over.all():
                 break
         return Trial(number, error, failed, metrics)
-
-    def _reset(self, seeds: list[int]) -> Array:
-        seed: Any = seeds[0] if self._is_scalar else seeds
-        robots: Any = self._robots[0] if self._is_scalar else self._robots
-        seen, _ = self._env.reset(seed=seed, options={"robot_seed": robots})
-        return np.atleast_2d(seen)
-
-    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Any]:
-        command = action[0] if self._is_scalar else action
-        seen, _, terminated, truncated, info = self._env.step(command)
-        ends = (np.atleast_1d(terminated), np.atleast_1d(truncated))
-        return np.atleast_2d(seen), *ends, info
 
 
 def _seed_of_noise(robot: int, number: int) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import (
+    PlannedTorque,
     WrenchTorque,
     planned_feet,
     shift_plan,
@@ -21,7 +22,6 @@ from baselines.compensation.dry_friction import FrictionCompensation, FrictionMe
 from baselines.compensation.gravity_torque import (
     GravityMethod,
     GravityModel,
-    make_dynamics,
     make_gravity,
 )
 from baselines.compensation.inputs import DEFLECTION
@@ -271,7 +271,9 @@ class DynamicCompensator(Compensator):
     ) -> None:
         self.model = model
         self._static = GravityCompensator(model, output, method)
-        self._body = make_dynamics(model, self._static.gravity)
+        is_walker = isinstance(model, WalkerModel)  # whose planned motion alone is known
+        gravity = self._static.gravity
+        self._body: Any = PlannedTorque(model, gravity) if is_walker else make_gravity(model)
         self._measures = output == "wrench"
         self._dt = model.control_period_s
         self._stiffness = model.stiffness[None]

@@ -40,7 +40,7 @@ def planned_feet(plan: WalkPlan) -> Any:
         soles=plan.ankles[..., :2],  # their middles in the plan's world frame [m]
         yaw=cosine_and_sine(plan.foot_yaw),
         heading=cosine_and_sine(plan.heading),  # of the pelvis
-        across=between / spacing[:, None],  # unit vector from the right sole to the left one [1]
+        across=between / spacing[:, None],  # direction from the right sole to the left one
         spacing=spacing,  # distance of the soles [m]
     )
 

@@ -11,7 +11,6 @@ import numpy as np
 from baselines.compensation.contact_torque import (
     ContactGravity,
     ContactMethod,
-    PlannedTorque,
 )
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
@@ -59,13 +58,6 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
             " or gravcomp; choose tree"
         )
     return HingeTorque(model)
-
-
-def make_dynamics(model: RobotModel, gravity: Any) -> Any:
-    """Inverse dynamics: of any motion on a fixed base, of the planned one for a walker."""
-    if isinstance(model, WalkerModel):
-        return PlannedTorque(model, gravity)
-    return make_gravity(model)
 
 
 class HingeTorque:

@@ -185,13 +185,17 @@ class PolicyAround(BatchPolicy):
         self.inputs = self.policy.inputs
         self.estimates = self.policy.estimates
 
+    def inner_memory(self, memory: Any) -> Any:
+        """Memory of the policy inside."""
+        return memory.inner
+
     @override
     def estimate(self, name: str, rows: Array, memory: Any) -> Array:
-        return self.policy.estimate(name, rows, memory.inner)
+        return self.policy.estimate(name, rows, self.inner_memory(memory))
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory.inner)
+        return self.policy.link_angles(rows, self.inner_memory(memory))
 
 
 class PassingMemory(PolicyAround):
@@ -202,12 +206,8 @@ class PassingMemory(PolicyAround):
         return self.policy.begin(rows)
 
     @override
-    def estimate(self, name: str, rows: Array, memory: Any) -> Array:
-        return self.policy.estimate(name, rows, memory)
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)
+    def inner_memory(self, memory: Any) -> Any:
+        return memory
 
 
 class Zero(BatchPolicy):

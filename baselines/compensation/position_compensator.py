@@ -293,12 +293,14 @@ class PositionCompensator:
             self._carrier = carrier
             self._place = place
         self._load_wanted = payload.mass_kg
-        self._load_step = abs(payload.mass_kg - self._load) / max(self.constants.ramp_steps, 1)
-        if self.constants.ramp_steps == 0:
+        steps = self.constants.ramp_steps
+        self._load_step = abs(payload.mass_kg - self._load) / max(steps, 1)
+        if steps == 0:
             self._load = payload.mass_kg
         self.constants.body.set_load(self._carrier, self._load, self._place)
         if asked is not None and before is not None:
-            self._warn_of_jump(self.constants.of_command * (self._passed_along(asked) - before))
+            jump = self._passed_along(asked) - before
+            self._warn_of_jump(self.constants.of_command * jump)
 
     def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
@@ -326,12 +328,13 @@ class PositionCompensator:
             self._count += 1
             offset *= minimum_jerk(np.array(self._count / known.ramp_steps))
         wanted = offset + motion[0]
-        within = np.minimum(np.maximum(offset, -known.limit_rad), known.limit_rad) + motion[0]
+        limit = known.limit_rad
+        within = np.minimum(np.maximum(offset, -limit), limit) + motion[0]
         command = np.minimum(np.maximum(within, known.lowest), known.highest)
         self.clipped = command != wanted
         self._asked = motion
         if self.clipped.any():
-            if np.abs(offset).max() > known.limit_rad:
+            if np.abs(offset).max() > limit:
                 self._warn_of_offset(np.abs(offset), "now")
             self._warn_of_range(wanted)
         return command
@@ -353,7 +356,8 @@ class PositionCompensator:
                 leads to, or there are several.
         """
         shown_angle = self._checked("theta", theta, "rad")
-        gradient = self.constants.compliance[:, None] * self._passed_gradient(shown_angle)
+        compliance = self.constants.compliance
+        gradient = compliance[:, None] * self._passed_gradient(shown_angle)
         size = gradient.ravel()
         # by the Frobenius norm, which is fast: there may be other equilibria
         is_soft = size.dot(size) >= 1.0
@@ -366,7 +370,7 @@ class PositionCompensator:
             return self._soft_link_angle(shown_angle, None)
         q = shown_angle
         for _ in range(_MOST_ITERATIONS):
-            residual = q - shown_angle + self.constants.compliance * self._passed_at_rest(q)
+            residual = q - shown_angle + compliance * self._passed_at_rest(q)
             step, _ = _solved(factors, pivots, residual)
             q = q - step
             missing = residual.dot(residual)
@@ -432,11 +436,17 @@ class PositionCompensator:
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
         """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
-        ends = (self.constants.lowest, self.constants.highest)
-        springs = (self.constants.compliance, self._passed_at_rest, self._passed_gradient)
-        found = follow_load(theta, *springs, tolerance=_LAST_RESIDUAL_RAD, within=ends)
+        known = self.constants
+        found = follow_load(
+            theta,
+            known.compliance,
+            self._passed_at_rest,
+            self._passed_gradient,
+            tolerance=_LAST_RESIDUAL_RAD,
+            within=(known.lowest, known.highest),
+        )
         if found.lost.any():
-            reason = found.reason(self.constants.compliance, self.joints)
+            reason = found.reason(known.compliance, self.joints)
             raise ElasticError(f"no link angles for {theta} rad: {reason}")
         if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD:
             return guess
@@ -444,17 +454,18 @@ class PositionCompensator:
 
     def _heaviest(self) -> Array:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
-        lowest = np.where(np.isfinite(self.constants.lowest), self.constants.lowest, -np.pi)
-        highest = np.where(np.isfinite(self.constants.highest), self.constants.highest, np.pi)
+        known = self.constants
+        lowest = np.where(np.isfinite(known.lowest), known.lowest, -np.pi)
+        highest = np.where(np.isfinite(known.highest), known.highest, np.pi)
         generator = np.random.default_rng(0)
         poses = generator.uniform(lowest, highest, (_POSES, len(self.joints)))
-        torque = np.abs(self.constants.body.gravity_torque(poses))
+        torque = np.abs(known.body.gravity_torque(poses))
         found = torque.max(axis=0)
         for joint, pose in enumerate(poses[torque.argmax(axis=0)]):
             for i in range(len(pose)):  # by one joint after the other, uphill
                 tried = np.repeat(pose[None], _TRIES, axis=0)
                 tried[:, i] = np.linspace(lowest[i], highest[i], _TRIES)
-                there = np.abs(self.constants.body.gravity_torque(tried)[:, joint])
+                there = np.abs(known.body.gravity_torque(tried)[:, joint])
                 if there.max() > found[joint]:
                     found[joint] = there.max()
                     pose = tried[there.argmax()]
@@ -462,10 +473,11 @@ class PositionCompensator:
 
     def _warn_of_range(self, wanted: Array) -> None:
         """Say once that a command, (n,) [rad], met a joint range."""
-        over = np.maximum(self.constants.lowest - wanted, wanted - self.constants.highest)
+        known = self.constants
+        over = np.maximum(known.lowest - wanted, wanted - known.highest)
         if over.max() > 0.0:
             worst = int(over.argmax())
-            ends = f"{self.constants.lowest[worst]:.4g} to {self.constants.highest[worst]:.4g} rad"
+            ends = f"{known.lowest[worst]:.4g} to {known.highest[worst]:.4g} rad"
             self._warn_once(
                 "range",
                 f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond"

@@ -113,18 +113,15 @@ class GroundLevel:
         moment = wrench[:, :, 1]
         over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
         mean, number = self._mean(force.sum(axis=1), velocity, memory)
-        lean = mean * self._certainty(number)[:, None]
+        change = self._gravity * TILT_RAD * self._period_s * number
+        certainty = change**2 / (change**2 + VELOCITY_M_PER_S**2)
+        lean = mean * certainty[:, None]
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
         x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
         turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
-
-    def _certainty(self, number: Array) -> Array:
-        """How much of the mean the estimate is, 0 to 1."""
-        change = self._gravity * TILT_RAD * self._period_s * number
-        return change**2 / (change**2 + VELOCITY_M_PER_S**2)
 
     def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
         """The mean after a measurement, about x and y [rad], and of how many it is."""

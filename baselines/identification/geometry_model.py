@@ -434,10 +434,13 @@ class GeometryModel:
     def _marker_change(self, posture: Posture, twists: Twists) -> Array:
         """Velocities of the markers in the base, (N, k, 3, P)."""
         changes = []
+        anchor = np.moveaxis(posture.anchor, 0, 1)[:, twists.joint]
         for i, marker in enumerate(self.markers):
-            arm = posture.marker[:, i, None] - np.moveaxis(posture.anchor, 0, 1)[:, twists.joint]
-            carried = self.is_beyond[twists.joint, marker.joint] if marker.joint >= 0 else 0.0
+            arm = posture.marker[:, i, None] - anchor
             moved = np.cross(twists.axis, arm) + twists.velocity
+            carried = 0.0
+            if marker.joint >= 0:
+                carried = self.is_beyond[twists.joint, marker.joint]
             changes.append(moved * np.reshape(carried, (-1, 1)))
         return np.stack(changes, axis=1).transpose(0, 1, 3, 2)
 
@@ -450,8 +453,9 @@ class GeometryModel:
         own_weight = (self.is_beyond @ self.weight)[twists.joint, None]
         of_outer = np.cross(twists.axis, own_lever) + own_weight * twists.velocity
         for j in range(self.num_joints):
-            carries = self.is_beyond[twists.joint, j][:, None]  # the twist moves joint j itself
-            is_inner = self.is_beyond[j, twists.joint][:, None]  # it moves weight beyond joint j
+            # the twist moves joint j itself, or weight beyond it
+            carries = self.is_beyond[twists.joint, j][:, None]
+            is_inner = self.is_beyond[j, twists.joint][:, None]
             of_inner = np.cross(twists.axis, lever[:, j, None])
             change = np.where(carries, of_inner, np.where(is_inner, of_outer, 0.0))
             moment = np.cross(change, self.down)

@@ -60,13 +60,13 @@ def predict_by_kernel(angles: Array, errors: Array, others: Array) -> Array:
                 inner = fold != k
                 matrix = kernel[np.ix_(inner, inner)] + ridge * np.eye(int(inner.sum()))
                 weights = np.linalg.solve(matrix, errors[inner] - mean)
-                missed += float(
-                    np.sum((errors[~inner] - mean - kernel[np.ix_(~inner, inner)] @ weights) ** 2)
-                )
+                found = kernel[np.ix_(~inner, inner)] @ weights
+                missed += float(np.sum((errors[~inner] - mean - found) ** 2))
             chosen = min(chosen, (missed, width, ridge))
     _, width, ridge = chosen
     scale = 2.0 * width**2 * own.shape[1]
-    weights = np.linalg.solve(np.exp(-between / scale) + ridge * np.eye(len(own)), errors - mean)
+    matrix = np.exp(-between / scale) + ridge * np.eye(len(own))
+    weights = np.linalg.solve(matrix, errors - mean)
     return mean + np.exp(-_squared_distances(new, own) / scale) @ weights
 
 

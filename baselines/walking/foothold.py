@@ -250,19 +250,20 @@ FOOTHOLDS = record_type(
 """Memory of the foothold correction."""
 
 
-_OF_FEET: dict[str, Mirrored | None] = {
+OF_FEET: dict[str, Mirrored | None] = {
     "l_x": "same",
     "l_y": "opposite",
     "r_x": "same",
     "r_y": "opposite",
 }
+"""Vectors of both feet in the plane, and what they are in the mirror."""
 # the mirror changes left and right: of their difference x turns round, and y stays
 _OF_BOTH: dict[str, Mirrored | None] = {"x": "opposite", "y": "same"}
 _KNOWN = {
     name: SignalGroup.of(name, "m", meaning, parts, kind=None).signals
     for name, meaning, parts in (
-        ("feet", "displacement {part} of a foot against the plan", _OF_FEET),
-        ("landing", "error {part} of a foot's last landing", _OF_FEET),
+        ("feet", "displacement {part} of a foot against the plan", OF_FEET),
+        ("landing", "error {part} of a foot's last landing", OF_FEET),
         ("shear", "{part} of the landing error by the shear of both feet so far", _OF_BOTH),
     )
 }

@@ -45,7 +45,7 @@ from baselines.compensation.policy import (
 )
 from elastic_env.core.compiled import compiled
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, IntArray, Signal, SignalGroup
+from elastic_env.core.signals import Array, IntArray, Mirrored, Signal, SignalGroup
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
@@ -166,12 +166,13 @@ class ZmpOffsetMemory(NamedTuple):
     inner: Any
 
 
+IN_PLANE: dict[str, Mirrored | None] = {"x": "same", "y": "opposite"}
 _SHIFT = SignalGroup.of(
     "zmp_offset",
     "m",
     "shift of the planned ZMP along {part} against its mean error",
-    {"x": "same", "y": "opposite"},
-    kind=None,
+    IN_PLANE,
+    None,
 ).signals
 
 
@@ -292,10 +293,10 @@ class StandingEstimate(PolicyAround):
         self._attitude = table.group("imu_attitude")
         self._samples = max(round(gains.duration_s / model.control_period_s), 1)
         steps = round(STAND_S / model.control_period_s) - self._samples
-        waiting = np.zeros(self._samples)
-        self._ramp = np.concatenate([waiting, minimum_jerk(np.arange(steps + 1) / steps)])
-        per_mean = np.array([[gains.zmp_x, gains.pitch_m_rad], [gains.zmp_y, gains.roll_m_rad]])
-        self._per_total = per_mean / self._samples
+        growing = minimum_jerk(np.arange(steps + 1) / steps)
+        self._ramp = np.concatenate([np.zeros(self._samples), growing])
+        of_walk = [gains.zmp_x, gains.pitch_m_rad, gains.zmp_y, gains.roll_m_rad]
+        self._per_total = np.reshape(of_walk, (2, 2)) / self._samples
         self._constant = np.array([gains.constant_m, 0.0])
         self._limit = gains.limit_m
         self._wrench = table.group("wrench")

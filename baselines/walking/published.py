@@ -241,7 +241,9 @@ class FootBalance(BatchPolicy):
         periods = np.round(rows[:, self._clock][:, 0] / self._dt)
         row = np.clip(periods.astype(np.int64) - 1, 0, self._plan.num_steps)
         yaw = self._local.foot_yaw[row]
-        force, moment = (turn(part, yaw) for part in np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0))
+        wrench = wrench.reshape(-1, 2, 2, 3)
+        force = turn(wrench[:, :, 0], yaw)
+        moment = turn(wrench[:, :, 1], yaw)
         together = gains.attitude * imu[:, :2] + gains.gyro_s * imu[:, 2:]
         horizontal = gains.force_horizontal
         gain = np.array([horizontal, horizontal, gains.force_vertical])
