@@ -484,14 +484,13 @@ def record_rows(**fields: Any) -> Any:
     Args:
         **fields: Numbers of each field, (rows, ...).
     """
-    columns = {name: np.asarray(values, dtype=np.float64) for name, values in fields.items()}
-    row_type = record_type(**{name: values.shape[1:] for name, values in columns.items()})
-    rows = np.empty(len(next(iter(columns.values()))), row_type)
-    for name, values in columns.items():
+    shapes = {name: np.shape(values)[1:] for name, values in fields.items()}
+    rows = np.empty(len(next(iter(fields.values()))), record_type(**shapes))
+    for name, values in fields.items():
         rows[name] = values
     return rows
 
 
 def record_row(**fields: Any) -> Any:
     """One row of constants for compiled kernels, (1,), from the numbers of each field."""
-    return record_rows(**{name: np.asarray(value)[None] for name, value in fields.items()})
+    return record_rows(**{name: [value] for name, value in fields.items()})

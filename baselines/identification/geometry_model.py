@@ -316,11 +316,12 @@ class GeometryModel:
         n = self.num_joints
         k = len(self.markers)
         loads = self._loads(parameters, posture, axial)
+        compliance = parameters.compliance
         # deflections φ of all joints: 1 − c ∂m/∂φ, and the markers by them
         housings = np.moveaxis(posture.housing, 0, 1)
-        axes = housings @ _left_jacobian(parameters.compliance * loads)
+        axes = housings @ _left_jacobian(compliance * loads)
         bending = self._about(axes, turns_housing=False)
-        stiff = np.eye(3 * n) - self._moment_change(posture, bending, parameters.compliance)
+        stiff = np.eye(3 * n) - self._moment_change(posture, bending, compliance)
         by_bending = self._marker_change(posture, bending)
 
         def by_turns(turns: Array, direct: Array | float = 0.0) -> Array:
@@ -333,7 +334,7 @@ class GeometryModel:
 
         def by(twists: Twists) -> Array:
             """Derivatives of the measurement by twists, (N, k, 3, P)."""
-            turns = self._moment_change(posture, twists, parameters.compliance)
+            turns = self._moment_change(posture, twists, compliance)
             return by_turns(turns, self._marker_change(posture, twists))
 
         turning = Twists(
@@ -350,7 +351,7 @@ class GeometryModel:
         own[:, np.arange(3 * n), np.arange(3 * n)] = loads.reshape(count, 3 * n)
         held = np.zeros((count, 3 * n, n))
         if axial is not None:
-            by_friction = -parameters.compliance[:, 2] * axial.direction
+            by_friction = -compliance[:, 2] * axial.direction
             held[:, np.arange(2, 3 * n, 3), np.arange(n)] = by_friction
         of_marker = np.zeros((count, k, 3, k, 3))
         for i, marker in enumerate(self.markers):

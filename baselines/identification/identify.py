@@ -65,7 +65,8 @@ class StaticPoints:
             numbered.append(own)
         names = [field.name for field in fields(StaticPoints)]
         columns = {name: [getattr(part, name) for part in numbered] for name in names}
-        return StaticPoints(**{name: np.concatenate(own) for name, own in columns.items()})
+        joined = {name: np.concatenate(own) for name, own in columns.items()}
+        return StaticPoints(**joined)
 
 
 class HoldRecorder:
@@ -141,7 +142,8 @@ def record_points(
     env.reset(seed=seed)
     for step in range(task.num_steps):
         observation, _, terminated, _, info = env.step(zero)
-        recorder.take(observation[..., encoder], info["link_angle_imu"], int(np.max(info["rest"])))
+        window = int(np.max(info["rest"]))
+        recorder.take(observation[..., encoder], info["link_angle_imu"], window)
         if progress is not None and (step + 1) % _PROGRESS_STEPS == 0:
             progress((step + 1) / task.num_steps)
         if np.any(terminated):
@@ -204,7 +206,8 @@ class Identification(Model):
 
     def link_angles(self, points: StaticPoints) -> Array:
         """Link angles of static points in the encoder's zero, (len(points),) [rad]."""
-        return corrected_angles(points.q, self.offset_rad, self.imu_sine_error_rad or 0.0)
+        sine_error = self.imu_sine_error_rad or 0.0
+        return corrected_angles(points.q, self.offset_rad, sine_error)
 
     def save(self, path: Path) -> None:
         """Write the JSON file."""
@@ -272,9 +275,8 @@ def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: b
         scaled, _, rank, _ = np.linalg.lstsq(design / scale, deflection, rcond=_SINGULAR)
         coefficients = scaled / scale
         friction = coefficients[1] / coefficients[0]
-    return Fit(
-        coefficients, deflection - design @ coefficients, is_determined=rank == design.shape[1]
-    )
+    residuals = deflection - design @ coefficients
+    return Fit(coefficients, residuals, is_determined=rank == design.shape[1])
 
 
 def fit_link_angles(

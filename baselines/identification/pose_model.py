@@ -148,7 +148,8 @@ class PoseModel:
         """Unknowns to begin with, (p,): a deflection under each largest torque, and zeros."""
         values = np.zeros(self.unknowns.size)
         compliance = self.unknowns.slices["compliance"]
-        values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
+        scale = self.scale[compliance]
+        values[compliance] = scale * deflection_rad / LARGEST_DEFLECTION_RAD
         return values
 
     @cached_property

@@ -130,8 +130,9 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
     at = [recording.motors.index(name) for name in arm.motors]
     goal = arm.units.angle(recording.goal[:, at])
     position = arm.units.angle(recording.position[:, at])
+    is_known = np.ones(len(recording.time), dtype=np.bool_)
     rates = [
-        ServoLog("", recording.time, *both, np.ones(len(recording.time), bool)).derivatives()
+        ServoLog("", recording.time, *both, is_known).derivatives()
         for both in zip(goal.T, position.T, strict=True)
     ]
     q_dot, q_ddot = np.moveaxis(np.array(rates), 0, -1)
@@ -172,8 +173,10 @@ def _info(folder: Path) -> Mapping[str, Any]:
             f" data/ ({why})"
         ),
     )
-    if not isinstance(content, Mapping) or not isinstance(content.get("features"), Mapping):
-        raise ConfigurationError(f"{shorten(path)} describes no features; record the data set anew")
+    features = content.get("features") if isinstance(content, Mapping) else None
+    if not isinstance(features, Mapping):
+        problem = f"{shorten(path)} describes no features; record the data set anew"
+        raise ConfigurationError(problem)
     return content
 
 

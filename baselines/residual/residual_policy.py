@@ -198,7 +198,8 @@ class ResidualPolicy(policies.BatchPolicy):
         n = len(rows)
         wait = np.full(n, _UNDECIDED)
         residual = np.zeros((n, self.corrected.num_residuals))
-        return ResidualMemory(wait, residual, self.features.begin(n), self.corrected.begin(rows))
+        seen = self.features.begin(n)
+        return ResidualMemory(wait, residual, seen, self.corrected.begin(rows))
 
     @override
     def act(self, rows: Array, memory: ResidualMemory, inputs: Any) -> policies.Step:

@@ -194,6 +194,11 @@ class WalkingController(BatchPolicy):
         theta = rows[:, self._theta]
         attitude = rows[:, self._attitude]
         com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
+        shares = _NO_SHARES
+        if (shift := inputs.zmp_shift) is not None:
+            shares = np.empty(len(rows))
+            shift = np.ascontiguousarray(shift)
+            shifted_shares(observed, shift, self._feet, self._period_s, shares)
         action = np.empty((len(rows), 12))
         now = np.empty(len(rows), MEMORY)
         coming = np.empty(len(rows), dtype=np.int64)
@@ -205,7 +210,7 @@ class WalkingController(BatchPolicy):
             observed=observed,
             com=com,
             soles=soles,
-            shares=self._shares(observed, inputs.zmp_shift),
+            shares=shares,
             inputs=_dense(inputs, len(rows)),
             before=memory,
             now=now,
@@ -217,20 +222,9 @@ class WalkingController(BatchPolicy):
             move_pelvis(*self._stances, coming, pelvis, action)
         return action.astype(np.float32), now
 
-    def _shares(self, observed: Records, shift: Array | None) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1].
-
-        (0,) for those of the plan.
-        """
-        if shift is None:
-            return _NO_SHARES
-        shares = np.empty(len(observed))
-        shift = np.ascontiguousarray(shift)
-        shifted_shares(observed, shift, self._feet, self._period_s, shares)
-        return shares
-
 
 _NO_SHARES: Array = np.empty(0)
+"""Load shares of a plan that nothing shifts."""
 
 
 def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> Any:

@@ -100,9 +100,12 @@ class PostureFeedback(policies.PolicyAround):
         self._walk_view = policies.WalkView(model.observation_table)
         self.ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
+        integral_limit = np.inf
+        if gains.integral > 0.0:
+            integral_limit = gains.limit_rad / gains.integral
         self.gains = policies.record_row(
             period_s=period_s,
-            integral_limit=gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf,
+            integral_limit=integral_limit,
             filter_share=policies.filter_share(period_s, gains.filter_s),
             swing_share=period_s / max(gains.swing_s, period_s),
             **gains.model_dump(exclude={"filter_s", "swing_s"}),
