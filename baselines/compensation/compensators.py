@@ -216,7 +216,8 @@ class GravityCompensator(Compensator):
         """What the measured tilt of a walker's pelvis adds to Eq. 12, (num_worlds, n) [rad]."""
         if self._load is self.gravity or self.output == "wrench":
             return 0.0
-        return self._load.solve_beyond(self.gravity, theta, self.stiffness)
+        tilted = self._load.solve(theta, self.stiffness)
+        return tilted - self.gravity.solve(theta, self.stiffness)
 
     @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:

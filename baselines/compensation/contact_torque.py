@@ -90,7 +90,8 @@ class ContactGravity:
 
     def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
         """The gravity torques of `at` for a level pelvis, and for one tilted as the IMU says."""
-        level, tilted = np.empty((2, len(rows)), LOADS)
+        level = np.empty(len(rows), LOADS)
+        tilted = np.empty(len(rows), LOADS)
         planned_loads(self._view.fields(rows), self.contact, self._feet, level, tilted)
         return LegTorque(self.chains, level), LegTorque(self.chains, tilted)
 

@@ -11,6 +11,7 @@ per world; the memory of the policy inside it is one of its fields.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -484,11 +485,17 @@ def record_rows(**fields: Any) -> Any:
     Args:
         **fields: Numbers of each field, (rows, ...).
     """
-    shapes = {name: np.shape(values)[1:] for name, values in fields.items()}
-    rows = np.empty(len(next(iter(fields.values()))), record_type(**shapes))
+    shapes = [(name, np.shape(values)[1:]) for name, values in fields.items()]
+    rows = np.empty(len(next(iter(fields.values()))), _row_type(*shapes))
     for name, values in fields.items():
         rows[name] = values
     return rows
+
+
+@cache
+def _row_type(*shapes: tuple[str, tuple[int, ...]]) -> np.dtype[Any]:
+    """Type of rows, one object for all of a kind: Numba compares others at every call."""
+    return record_type(**dict(shapes))
 
 
 def record_row(**fields: Any) -> Any:

@@ -198,12 +198,6 @@ class LegTorque(NamedTuple):
             solve_stiffness(K, self.gravity_gradient(q), torque)
         return x
 
-    def solve_beyond(self, other: "LegTorque", q: Array, stiffness: Array) -> Array:
-        """What `solve` gives beyond other loads of the same legs, (num_worlds, n) [rad]."""
-        both = LegTorque(self.chains, np.concatenate([self.loads, other.loads]))
-        found = both.solve(np.concatenate([q, q]), stiffness)
-        return found[: len(q)] - found[len(q) :]
-
 
 def _dense(values: Array) -> Array:
     """An array in one piece, so that one kernel fits all."""
