@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from baselines.adaptation.iterative import LearnedOffsets
-from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.iterative import LearnedOffsets, learned_signals
 from baselines.adaptation.offset_table import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
@@ -12,12 +11,11 @@ from baselines.catalogue import (
     BEST_ON_THE_WALKER,
     ON_JOINTS,
     ON_THE_WALKER,
-    NamedPolicy,
+    PolicyOptions,
     Track,
     policies_of,
 )
 from baselines.compensation.policy import Policy
-from baselines.options import PolicyOptions
 from baselines.residual.correction import Corrected
 from baselines.residual.residual_policy import ResidualPolicy, load_residual
 from baselines.residual.settings import RESIDUAL
@@ -39,21 +37,13 @@ def policy_names() -> list[str]:
     return list({**ON_THE_WALKER, **ON_JOINTS})
 
 
-def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """A baseline by its name, on a walker or on another robot.
-
-    None for a policy that is no baseline.
-    """
-    return policies_of(is_walker).get(name)
-
-
 def track(name: str, is_walker: bool = True) -> Track:
     """Track of a policy by its name; a user's own policy reads the standard sensors."""
     if name.startswith(RESIDUAL):
         return Track.TRAINING
     if name.startswith(ITERATIVE):
         return Track.WALKS
-    known = named_policy(name, is_walker)
+    known = policies_of(is_walker).get(name)
     return Track.STANDARD if known is None else known.track
 
 
@@ -67,7 +57,7 @@ def best_analytic(is_walker: bool = True) -> str | None:
 
 def sensors_needed(name: str, is_walker: bool = True) -> tuple[str, ...]:
     """Sensors beyond the standard set that a policy reads, for the argument `sensors`."""
-    known = named_policy(name, is_walker)
+    known = policies_of(is_walker).get(name)
     return () if known is None else known.sensors
 
 
@@ -132,7 +122,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     given = {option: value for option, value in options.items() if value is not None}
     chosen = PolicyOptions(**given)
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
-    known = named_policy(name, is_walker)
+    known = policies_of(is_walker).get(name)
     if known is None:
         names = [*policies_of(is_walker), f"{RESIDUAL}PATH"]
         raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, names)

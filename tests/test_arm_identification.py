@@ -25,14 +25,12 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from baselines import PositionCompensator
-from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
+from baselines.identification.arm_fit import ArmFit, fit_arm, information_of, turn_joint
 from baselines.identification.arm_result import JointStiffness, bounded_compliance, describe_fit
-from baselines.identification.holdout import FITTED, RIGID, HeldOut, Judged, judge, split
-from baselines.identification.log_signs import turn_joint
+from baselines.identification.holdout import FITTED, RIGID, RIVALS, HeldOut, Judged, judge, split
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
-from baselines.identification.rivals import RIVALS
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array

@@ -1,16 +1,12 @@
 """The disturbance observer of the walker: against a pendulum, at rest, and on a slope."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 import baselines
-from baselines.compensation.policy import PolicyInputs
+from baselines.compensation.policy import PolicyInputs, record_row
 from baselines.walking.dcm_observer import (
     OBSERVED,
-    OBSERVER,
-    PLANNED,
     DcmObserver,
     DcmObserverGains,
     observe,
@@ -30,17 +26,18 @@ FOLLOW_S = 2.0
 
 def test_the_place_of_a_pendulum_is_found_though_its_sensors_are_off() -> None:
     """Catches a wrong sign, a mean of sensors that lie, and a rate that is not that of the DCM."""
-    constants: Any = np.zeros(1, OBSERVER)
-    constants["period_s"] = PERIOD_S
-    constants["omega"] = OMEGA
-    constants["smooth_share"] = 1.0 - np.exp(-PERIOD_S / FILTER_S)
-    constants["follow_share"] = 1.0 - np.exp(-PERIOD_S / FOLLOW_S)
+    constants = record_row(
+        period_s=PERIOD_S,
+        omega=OMEGA,
+        smooth_share=1.0 - np.exp(-PERIOD_S / FILTER_S),
+        follow_share=1.0 - np.exp(-PERIOD_S / FOLLOW_S),
+        limit_m=0.0,
+    )
     observed = np.zeros(1, [("clock", float, 3), ("load_share", float)]).view(np.recarray)
     observed["load_share"] = 0.3
     soles = np.array([[[0.0, 0.1, -0.7], [0.0, -0.1, -0.7]]])
     memory = np.zeros(1, OBSERVED)
-    planned: Any = np.zeros(1, PLANNED)
-    planned["soles"] = [[0.0, 0.1], [0.0, -0.1]]
+    planned = record_row(com=[0.0, 0.0], soles=[[0.0, 0.1], [0.0, -0.1]])
     found = []
     times = np.arange(0.0, 24.0, PERIOD_S)
     for time in times:

@@ -21,10 +21,12 @@ from baselines.identification.holdout import (
     HeldOutError,
     Judged,
     judge,
+    predict_by_kernel,
+    predict_constant,
+    predict_linear,
     split,
 )
 from baselines.identification.pose_log import read_log, write_poses
-from baselines.identification.rivals import predict_by_kernel, predict_constant, predict_linear
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.tree.links import Tree
@@ -261,8 +263,8 @@ def test_friction_of_known_sides_is_told_apart_from_stiffness() -> None:
             for joint, value in zip(fit.problem.joints, truth, strict=True):
                 own = found[kind, joint]
                 if own.is_told:
-                    held.append(abs(own.value - value) < QUANTILE * own.deviation)
-                    off.append((own.value - value) / own.deviation)
+                    held.append(abs(own.value - value) < own.half_width)
+                    off.append(QUANTILE * (own.value - value) / own.half_width)
     assert len(held) > 60
     assert np.mean(held) > 0.9
     assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off))
@@ -276,7 +278,7 @@ def test_sides_of_approach_lower_the_noise() -> None:
     assert fit.noise_m < 0.6 * blind.noise_m
     found = {own.name: own for own in fit.estimates if own.kind == "friction"}
     for joint, truth in zip(problem.joints, test_arm_identification.FRICTION, strict=True):
-        assert abs(found[joint].value - truth) < 4.0 * found[joint].deviation
+        assert abs(found[joint].value - truth) < 4.0 * found[joint].half_width / QUANTILE
     assert found["elbow"].is_told
 
 

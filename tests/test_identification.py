@@ -11,8 +11,14 @@ import pytest
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.identification.identify import Identification, identify, identify_points
-from baselines.identification.static_points import HoldRecorder, StaticPoints, record_points
+from baselines.identification.identify import (
+    HoldRecorder,
+    Identification,
+    StaticPoints,
+    identify,
+    identify_points,
+    record_points,
+)
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R

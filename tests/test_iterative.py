@@ -13,15 +13,17 @@ from safetensors.numpy import save
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.adaptation.iterative import IterativeLearner, Trial
-from baselines.adaptation.iterative_learning import (
+from baselines.adaptation.iterative import (
     ChannelGains,
+    IterativeLearner,
+    LearningGains,
+    Trial,
+    WalkSignals,
     lead_error,
     limit_surprise,
     update,
     zero_phase,
 )
-from baselines.adaptation.learned_signals import LearningGains, WalkSignals
 from baselines.adaptation.offset_table import DESCRIPTION, OFFSETS
 from baselines.policies import Track, track
 from baselines.walking.zmp_shift import center_of_mass_shift

@@ -14,8 +14,8 @@ import pytest
 
 from baselines import PositionCompensator
 from baselines.lerobot import ArmSettings, LeRobotArm, read_calibration
+from baselines.lerobot.arm import units_of
 from baselines.lerobot.settings import JointPlace, Motor, MotorCalibration, motors_of, robot_types
-from baselines.lerobot.units import units_of
 from elastic_env.core.errors import ActionError, ConfigurationError
 
 FOLDER = Path("docs/hardware")

@@ -10,9 +10,17 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.policies import Track, sensors_needed, track
-from baselines.walking.foot_balance import FootBalance, FootBalanceGains
-from baselines.walking.hip_torque import HipTorque, HipTorqueGains, limit_rate, low_pass
-from baselines.walking.stance_roll import StanceRoll, StanceRollGains, stance_roll
+from baselines.walking.published import (
+    FootBalance,
+    FootBalanceGains,
+    HipTorque,
+    HipTorqueGains,
+    StanceRoll,
+    StanceRollGains,
+    limit_rate,
+    low_pass,
+    stance_roll,
+)
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import foot_pose, rotation_x

@@ -11,7 +11,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.compensators import Compensated, DynamicCompensator
 from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.controller import WalkingController
-from baselines.walking.refined_walk import RefinedWalk, refined
+from baselines.walking.foothold import RefinedWalk, refined
 from elastic_env.core.signals import Array
 from tests.played import play_to_the_end
 

@@ -27,8 +27,8 @@ from baselines.compensation.inputs import input_signals
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Channels, Corrected
 from baselines.residual.features import Features
-from baselines.residual.network import Network
 from baselines.residual.residual_policy import (
+    Network,
     ResidualPolicy,
     load_residual,
     read_description,

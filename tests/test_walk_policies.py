@@ -18,7 +18,7 @@ from baselines.compensation.oracle import Oracle, TrueSensors
 from baselines.compensation.policy import Zero
 from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
-from baselines.walking.refined_walk import RefinedWalk, refined
+from baselines.walking.foothold import RefinedWalk, refined
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 

@@ -43,9 +43,8 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
-from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Step
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Step, filter_share
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
@@ -141,9 +140,8 @@ class DisturbanceObserver(PolicyAround):
         self._dt = model.control_period_s
         self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
-        self._body = make_dynamics(model, self._static.gravity)
-        self._follow_share = 1.0 - float(np.exp(-self._dt / gains.time_constant_s))
-        self._smooth_share = 1.0 - float(np.exp(-self._dt / gains.rate_filter_s))
+        self._follow_share = filter_share(self._dt, gains.time_constant_s)
+        self._smooth_share = filter_share(self._dt, gains.rate_filter_s)
         self._zero_steps = round(gains.zero_s / self._dt)
         model.require_constant_friction("the disturbance observer")
         self._coulomb = gains.friction * model.coulomb_friction
@@ -182,7 +180,10 @@ class DisturbanceObserver(PolicyAround):
         imu = rows[:, self._imu].copy()
         q_ref_dot = self.view.motion(rows).q_dot
         is_zeroing = steps <= self._zero_steps
-        missing = self._disagreement(theta, imu) - was.offset
+        # by how much the IMU shows too little in a joint without load
+        q = self._static.link_angle(theta)
+        unloaded = np.where(np.abs(theta - q) < _UNLOADED_RAD, q - imu, 0.0)
+        missing = unloaded - was.offset
         offset = was.offset + is_zeroing * missing / steps
         # between two samples of the IMU the encoder goes on: the deflection is known where both are
         # new
@@ -202,7 +203,7 @@ class DisturbanceObserver(PolicyAround):
         known = smooth(friction, was.smooth_friction)
         joints = (model.stiffness, model.damping, model.backlash)
         passed = joint_torque(delta, delta_dot, *joints)
-        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was.rate) / dt)
+        needed = self._static.gravity.inverse_dynamics(q, q_dot, (q_dot - was.rate) / dt)
         # at rest dry friction takes any value up to F: only what is beyond is a disturbance
         left = passed - needed - was.disturbance
         stuck = np.clip(left, -self._coulomb, self._coulomb)
@@ -213,8 +214,3 @@ class DisturbanceObserver(PolicyAround):
         return JointObservation(
             offset, imu, deflection, friction, delta, q, known, q_dot, disturbance
         )
-
-    def _disagreement(self, theta: Array, imu: Array) -> Array:
-        """By how much the IMU shows too little in a joint without load, else 0 [rad]."""
-        q = self._static.link_angle(theta)
-        return np.where(np.abs(theta - q) < _UNLOADED_RAD, q - imu, 0.0)

@@ -9,10 +9,23 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 
 ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the
 feet. Without torque sensors ρ of pitch is left out: friction hides the bending there. Joints
-without a link encoder have r_j = 0. r_j is by the regression of
-`baselines.estimation.joint_stiffness`. The expected deflection is :math:`h = K^{-1} (\tau +
-\tau_F)` with the Coulomb friction, and with the torque of the measured foot wrenches, or of the
+without a link encoder have r_j = 0. r_j is by the regression below. The expected deflection is
+:math:`h = K^{-1} (\tau + \tau_F)` with the Coulomb friction, and with the torque of the measured foot wrenches, or of the
 motion on a fixed base.
+
+**Regression.** The Coulomb friction :math:`\tau_F` turns round over a short displacement of the
+link [Dahl1968]. Sensors show
+
+.. math:: \delta = (1 + r) h + c
+
+with c for homing errors. This is linear regression of δ − h on h, joint by joint, after every
+measurement. Its prior says that the joints of a robot are alike: :math:`r \sim N(0, \sigma_c^2
+\mathbf{1}\mathbf{1}^T + \sigma_i^2 I)`, so that joints without load take after the others
+[Gelman2013, chapter 15]. The normal matrix is diagonal but for one rank, which the matrix inversion
+lemma solves in closed form.
+
+[Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
+[Gelman2013] A. Gelman et al., "Bayesian Data Analysis", 3rd edition.
 """  # noqa: E501
 
 from abc import abstractmethod
@@ -23,13 +36,53 @@ from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.dry_friction import presliding_friction
-from baselines.compensation.gravity_torque import make_dynamics
+from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.measured import DeflectionSensors
 from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.joint_stiffness import StiffnessPrior, regress
+from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.world.robot_model import RobotModel, WalkerModel
+
+
+class StiffnessPrior(Model):
+    """Knowledge of the joints before they are measured, as standard deviations."""
+
+    common: float = quantity("1", 0.5, gt=0)
+    """Relative error that all joints share [1]."""
+    own: float = quantity("1", 0.1, gt=0)
+    """Relative error of a joint beside it [1]."""
+    offset_rad: float = quantity("rad", 0.002, gt=0)
+    """Offset of a measured deflection [rad]."""
+    noise_rad: float = quantity("rad", 0.01, gt=0)
+    """Model error of a measured deflection [rad]."""
+
+
+def regress(sums: Array, prior: StiffnessPrior) -> Array:
+    """Relative errors r of the joints by the regression of the module.
+
+    Args:
+        sums: Number of measurements, and sums of h, h², y = δ − h, and h y of each joint, (5, ...,
+            n), with h in [rad].
+        prior: Standard deviations.
+
+    Returns:
+        (..., n) [1].
+    """
+    number, h, hh, y, hy = sums
+    counted = number + (prior.noise_rad / prior.offset_rad) ** 2  # c is eliminated
+    information = (hh - h * h / counted) / prior.noise_rad**2
+    right = (hy - h * y / counted) / prior.noise_rad**2
+    own = prior.own**2
+    common = prior.common**2
+    n = h.shape[-1]
+    diagonal = 1.0 / own + information
+    rank_one = common / (own * (own + n * common))
+    alone = right / diagonal
+    shared = rank_one / diagonal
+    common = alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1))
+    return alone + shared * common[..., None]
+
 
 _SEEN = SignalTable(BendingObserver.signals)
 _ERROR = _SEEN.group("model_error")
@@ -134,7 +187,7 @@ class EncoderEstimator(Estimator):
 
     def _compensator_of(self, model: RobotModel) -> Any:
         """Says which deflection to expect."""
-        return make_dynamics(model, GravityCompensator(model).gravity)
+        return make_gravity(model)
 
     @override
     def begin(self, num_worlds: int) -> Any:

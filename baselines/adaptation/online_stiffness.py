@@ -73,7 +73,7 @@ class OnlineStiffness(policies.PolicyAround):
         dt = model.control_period_s
         self.estimator = estimator
         self.every = max(round(gains.period_s / dt), 1)
-        self.share = 1.0 - float(np.exp(-dt / gains.filter_s))
+        self.share = policies.filter_share(dt, gains.filter_s)
         self.limit = gains.limit
 
     @override

@@ -13,17 +13,15 @@ import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import (
-    LegTorque,
+    PlannedTorque,
     WrenchTorque,
     planned_feet,
     shift_plan,
 )
 from baselines.compensation.dry_friction import FrictionCompensation, FrictionMemory
 from baselines.compensation.gravity_torque import (
-    FixedTorque,
     GravityMethod,
     GravityModel,
-    make_dynamics,
     make_gravity,
 )
 from baselines.compensation.inputs import DEFLECTION
@@ -35,14 +33,16 @@ from baselines.compensation.policy import (
     Step,
     WalkView,
     put_rows,
+    record_rows,
     select_rows,
 )
 from baselines.compensation.startup import Ramp
-from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.compiled import compiled
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array, IntArray, Parameter
 from elastic_env.joint import elasticity
 from elastic_env.motion.trajectory import STAND_S
+from elastic_env.rigid.leg_chains import LegTorque
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
@@ -180,7 +180,7 @@ class GravityCompensator(Compensator):
 
     @override
     def at(self, rows: Array) -> "GravityCompensator":
-        if isinstance(self.gravity, FixedTorque):
+        if not isinstance(self.model, WalkerModel):
             return self
         bound = shallow_copy(self)
         if self._load is self.gravity:
@@ -272,7 +272,9 @@ class DynamicCompensator(Compensator):
     ) -> None:
         self.model = model
         self._static = GravityCompensator(model, output, method)
-        self._body = make_dynamics(model, self._static.gravity)
+        is_walker = isinstance(model, WalkerModel)  # whose planned motion alone is known
+        gravity = self._static.gravity
+        self._body: Any = PlannedTorque(model, gravity) if is_walker else make_gravity(model)
         self._measures = output == "wrench"
         self._dt = model.control_period_s
         self._stiffness = model.stiffness[None]
@@ -285,11 +287,14 @@ class DynamicCompensator(Compensator):
             stribeck_speed=model.stribeck_speed,
         )
         self._rubs = friction
-        self._drives: Any = np.zeros(len(model.joint_names), DRIVE)
-        self._drives["damping"] = model.damping
-        self._drives["rotor_inertia"] = model.rotor_inertia
-        for name in ("position_gain", "braking", "integral_gain"):
-            self._drives[name] = [getattr(servo, name) for servo in model.servos]
+        servos = model.servos
+        self._drives = record_rows(
+            damping=model.damping,  # D [N·m·s/rad]
+            rotor_inertia=model.rotor_inertia,  # B [kg·m²]
+            position_gain=[servo.position_gain for servo in servos],  # [N·m/rad]
+            braking=[servo.braking for servo in servos],  # k_v and back-EMF [N·m·s/rad]
+            integral_gain=[servo.integral_gain for servo in servos],  # [N·m/(rad·s)]
+        )
 
     @override
     def at(self, rows: Array) -> Self:
@@ -363,16 +368,6 @@ class DynamicCompensator(Compensator):
         return self._static.link_rate(theta, theta_dot)
 
 
-DRIVE = record_type(
-    damping=(),  # D [N·m·s/rad]
-    rotor_inertia=(),  # B [kg·m²]
-    position_gain=(),  # [N·m/rad]
-    braking=(),  # k_v and the motor's back-EMF [N·m·s/rad]
-    integral_gain=(),  # [N·m/(rad·s)]
-)
-"""Rotor, damper and servo of a joint."""
-
-
 @compiled
 def lead_motors(
     torque: Array,
@@ -393,7 +388,7 @@ def lead_motors(
         q_ddot: Their accelerations, (worlds, n) [rad/s²].
         before: Deflection, its rate and the integral of the servo error, (worlds, n) each.
         stiffness: K of the worlds, (worlds, n), or of all, (1, n) [N·m/rad].
-        drives: Rows of `DRIVE`, one per joint, (n,).
+        drives: Rotor, damper and servo of each joint, rows, (n,).
         period_s: Control period [s].
 
     Returns:
@@ -501,6 +496,7 @@ class Compensated(PolicyAround):
         self.inputs = (DEFLECTION, *self.policy.inputs)
         self.compensator = compensator
         self._theta = model.observation_table.group("encoder_angle")
+        self._theta_dot = model.observation_table.group("encoder_rate")
         self._corrects_policy = corrects_policy
         self.ramp = Ramp(model, ramp_s).table
         self._plan: tuple[WalkView, Any] | None = None
@@ -535,10 +531,11 @@ class Compensated(PolicyAround):
             links = links - compensator.modelled * correction * (theta - links)
             if not self._corrects_policy:
                 inputs = inputs._replace(deflection=None)
-        rates = None
+        seen = rows.copy()
+        seen[:, self._theta] = links
         if self.policy.reads_rates:
-            rates = compensator.link_rate(theta, self.view.theta_dot(rows))
-        seen = self.view.with_links(rows, links, rates)
+            rates = compensator.link_rate(theta, rows[:, self._theta_dot])
+            seen[:, self._theta_dot] = rates
         action, inner = self.policy.act(seen, memory.inner, inputs)
         wanted = action.astype(np.float64)
         motion = self.view.motion(rows)

@@ -17,90 +17,37 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import WalkView
-from elastic_env.core.compiled import compiled, record_type
+from baselines.compensation.policy import WalkView, record_row, record_rows
+from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
-from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.motion.walk_plan import WalkPlan
-from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_chains import LegTorque
 from elastic_env.rigid.tree.kernels import Vector, loads_type
 from elastic_env.world.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
 
-CONTACT = record_type(
-    gravity=(),  # [m/s²]
-    mass=(),  # of the robot [kg]
-    ankle_height=(),  # [m]
-    period_s=(),  # of the control
-    is_at_zmp=bool,  # or at the ankle axes
-)
-"""How the ground carries the robot."""
-
-FEET = record_type(
-    share=(),  # load share of the right foot [1]
-    soles=(2, 2),  # their middles in the plan's world frame [m]
-    yaw=(2, 2),  # cosine and sine of their headings [1]
-    heading=(2,),  # cosine and sine of the heading of the pelvis [1]
-    across=(2,),  # from the right sole to the left one, a unit vector in the local frame [1]
-    spacing=(),  # distance of the soles [m]
-)
-"""The feet where the plan has them, one row per control step."""
-
 
 def planned_feet(plan: WalkPlan) -> Any:
-    """Rows of `FEET` of a plan; the local frame is that of `elastic_env.motion.walk_plan`."""
-    rows = np.zeros(len(plan.q), FEET)
+    """The feet where a plan has them, one row per control step.
+
+    The local frame is that of `elastic_env.motion.walk_plan`.
+    """
     between = plan.local.ankles[:, 0, :2] - plan.local.ankles[:, 1, :2]
     spacing = np.hypot(between[:, 0], between[:, 1])
-    rows["share"] = plan.share
-    rows["soles"] = plan.ankles[..., :2]
-    rows["yaw"] = np.stack([np.cos(plan.foot_yaw), np.sin(plan.foot_yaw)], axis=-1)
-    rows["heading"] = np.stack([np.cos(plan.heading), np.sin(plan.heading)], axis=-1)
-    rows["across"] = between / spacing[:, None]
-    rows["spacing"] = spacing
-    return rows
+    return record_rows(
+        share=plan.share,  # load share of the right foot [1]
+        soles=plan.ankles[..., :2],  # their middles in the plan's world frame [m]
+        yaw=cosine_and_sine(plan.foot_yaw),
+        heading=cosine_and_sine(plan.heading),  # of the pelvis
+        across=between / spacing[:, None],  # direction from the right sole to the left one
+        spacing=spacing,  # distance of the soles [m]
+    )
 
 
-class LegTorque(NamedTuple):
-    """Torques of legs under loads that go with any posture: a `GravityModel`, (num_worlds, 12)."""
-
-    chains: LegChains
-    loads: Any
-    """Rows of `LOADS`, (num_worlds,)."""
-
-    def gravity_torque(self, q: Array) -> Array:
-        """Torque that holds the legs, (num_worlds, 12) [rad] to [N·m]."""
-        return self.chains.torque(self.loads, q)
-
-    def gravity_gradient(self, q: Array) -> Array:
-        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad].
-
-        It is not symmetric under a wrench, which turns with its foot.
-        """
-        return self.chains.gradient(self.loads, q)
-
-    def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
-        """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
-
-        Args:
-            q: (num_worlds, 12) [rad].
-            stiffness: K, (12,) [N·m/rad].
-            torque: τ, (num_worlds, 12) [N·m]; None for τ_g.
-
-        Returns:
-            (num_worlds, 12) [rad].
-
-        Raises:
-            ElasticError: The matrix is singular.
-        """
-        x, is_small = self.chains.solve(self.loads, q, stiffness, torque)
-        if not is_small:
-            torque = self.gravity_torque(q) if torque is None else torque
-            # says so if it is singular
-            K = np.broadcast_to(stiffness, q.shape)
-            solve_stiffness(K, self.gravity_gradient(q), torque)
-        return x
+def cosine_and_sine(angles: Array) -> Array:
+    """Both of angles, (...) [rad] to (..., 2) [1]."""
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
 LOADS = loads_type(2)
@@ -112,7 +59,7 @@ class ContactGravity:
 
     Attributes:
         chains: Its legs.
-        contact: Row of `CONTACT`, (1,).
+        contact: How the ground carries the robot, a row, (1,).
 
     Args:
         model: Assumed walker.
@@ -123,9 +70,13 @@ class ContactGravity:
         biped = model.biped
         self._view = WalkView(model.observation_table)
         self.chains = biped.weightless_chains if method == "lumped" else biped.chains
-        robot = (biped.gravity, biped.chains.mass, biped.ankle_height)
-        contact = (*robot, model.control_period_s, method == "com")
-        self.contact: Any = np.array([contact], CONTACT)
+        self.contact = record_row(
+            gravity=biped.gravity,  # [m/s²]
+            mass=biped.chains.mass,  # of the robot [kg]
+            ankle_height=biped.ankle_height,  # [m]
+            period_s=model.control_period_s,
+            is_at_zmp=method == "com",  # or at the ankle axes
+        )
         self._feet = planned_feet(model.plan)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
@@ -217,8 +168,8 @@ def planned_loads(observed: Any, contact: Any, feet: Any, level: Any, tilted: An
 
     Args:
         observed: Observations, rows with fields.
-        contact: Row of `CONTACT`, (1,).
-        feet: Rows of `FEET`, one per control step.
+        contact: How the ground carries the robot, a row, (1,).
+        feet: Rows of `planned_feet`.
         level: Loads of a pelvis that is level, to be filled, rows of `LOADS`.
         tilted: The same of one that is tilted as the IMU says.
     """
@@ -310,7 +261,7 @@ def shift_plan(observed: Any, shift: Array, feet: Any, period_s: float) -> None:
     Args:
         observed: Observations, rows with fields, (n,).
         shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
-        feet: Rows of `FEET`, one per control step.
+        feet: Rows of `planned_feet`.
         period_s: Control period [s].
     """
     for world in range(len(observed)):
@@ -331,7 +282,7 @@ def shifted_shares(observed: Any, shift: Array, feet: Any, period_s: float, foun
     Args:
         observed: Observations, rows with fields, (n,).
         shift: Of the ZMP in the local frame, x forward and y left, (n, 2) [m].
-        feet: Rows of `FEET`, one per control step.
+        feet: Rows of `planned_feet`.
         period_s: Control period [s].
         found: To be filled, (n,).
     """

@@ -11,7 +11,6 @@ import numpy as np
 from baselines.compensation.contact_torque import (
     ContactGravity,
     ContactMethod,
-    PlannedTorque,
 )
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
@@ -33,19 +32,6 @@ class GravityModel(Protocol):
         ...
 
 
-class FixedTorque:
-    """Torques of a robot on a fixed base, whose loads are the same at every control step."""
-
-    def __init__(self, torque: "HingeTorque | RigidBody") -> None:
-        self.gravity_torque = torque.gravity_torque
-        self.gravity_gradient = torque.gravity_gradient
-        self.inverse_dynamics = torque.inverse_dynamics
-
-    def at(self, rows: Array, gravity: Any = None) -> "FixedTorque":  # noqa: ARG002  a walker's
-        """Itself."""
-        return self
-
-
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     """The gravity torque of a robot by a chosen method; a `GravityModel` after `at(observations)`.
 
@@ -65,20 +51,13 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     chosen = method or ("hinge" if is_plain_hinge else "tree")
     require_known("gravity method", [chosen], ("hinge", "tree"))
     if chosen == "tree":
-        return FixedTorque(RigidBody(model.rigid, model.joint_names))
+        return RigidBody(model.rigid, model.joint_names)
     if is_more_than_gravity:
         raise ConfigurationError(
             "gravity method 'hinge' knows gravity alone, and this model has springs of joints"
             " or gravcomp; choose tree"
         )
-    return FixedTorque(HingeTorque(model))
-
-
-def make_dynamics(model: RobotModel, gravity: Any) -> Any:
-    """Inverse dynamics: of any motion on a fixed base, of the planned one for a walker."""
-    if isinstance(model, WalkerModel):
-        return PlannedTorque(model, gravity)
-    return make_gravity(model)
+    return HingeTorque(model)
 
 
 class HingeTorque:

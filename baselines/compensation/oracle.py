@@ -158,13 +158,14 @@ class TrueSensors(PassingMemory):
         self._env = env.unwrapped
         super().__init__(policy, self._env.assumed_model)
         table = self.model.observation_table
-        names = {"imu_attitude": "attitude", "imu_rate": "pelvis_rate", "wrench": "wrench"}
-        self._columns = [(table.group(group), name) for group, name in names.items()]
+        groups = ("imu_attitude", "imu_rate", "wrench")
+        self._columns = [table.group(group) for group in groups]
 
     @override
     def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
         truth = self._env.truth()
         seen = rows.copy()
-        for columns, name in self._columns:
-            seen[:, columns] = getattr(truth, name).reshape(len(rows), -1)
+        shown = (truth.attitude, truth.pelvis_rate, truth.wrench)
+        for columns, values in zip(self._columns, shown, strict=True):
+            seen[:, columns] = values.reshape(len(rows), -1)
         return self.policy.act(seen, memory, inputs)

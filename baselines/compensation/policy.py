@@ -11,12 +11,14 @@ per world; the memory of the policy inside it is one of its fields.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
+from elastic_env.core.compiled import record_type
 from elastic_env.core.errors import ElasticError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, SignalTable
 from elastic_env.world.robot_model import RobotModel
@@ -184,13 +186,17 @@ class PolicyAround(BatchPolicy):
         self.inputs = self.policy.inputs
         self.estimates = self.policy.estimates
 
+    def inner_memory(self, memory: Any) -> Any:
+        """Memory of the policy inside."""
+        return memory.inner
+
     @override
     def estimate(self, name: str, rows: Array, memory: Any) -> Array:
-        return self.policy.estimate(name, rows, memory.inner)
+        return self.policy.estimate(name, rows, self.inner_memory(memory))
 
     @override
     def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory.inner)
+        return self.policy.link_angles(rows, self.inner_memory(memory))
 
 
 class PassingMemory(PolicyAround):
@@ -201,12 +207,8 @@ class PassingMemory(PolicyAround):
         return self.policy.begin(rows)
 
     @override
-    def estimate(self, name: str, rows: Array, memory: Any) -> Array:
-        return self.policy.estimate(name, rows, memory)
-
-    @override
-    def link_angles(self, rows: Array, memory: Any) -> Array:
-        return self.policy.link_angles(rows, memory)
+    def inner_memory(self, memory: Any) -> Any:
+        return memory
 
 
 class Zero(BatchPolicy):
@@ -347,6 +349,11 @@ def _map_arrays(function: Callable[..., Array], memory: Any, *others: Any) -> An
     return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
 
 
+def filter_share(period_s: float, time_constant_s: float) -> float:
+    """Share of its way that a first-order filter goes in a period [1]."""
+    return 1.0 - float(np.exp(-period_s / time_constant_s))
+
+
 class Motion(NamedTuple):
     """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
 
@@ -364,7 +371,6 @@ class ObservationView:
         self._period_s = model.control_period_s
         self._clock: Any = table.group("clock") if "clock.time" in table.names else None
         self._theta = table.group("encoder_angle")
-        self._theta_dot = table.group("encoder_rate")
         self._q = table.group("reference_angle")
         self._q_dot = table.group("reference_rate")
         self._q_ddot = table.group("reference_acceleration")
@@ -375,10 +381,6 @@ class ObservationView:
         """Encoder angles, (num_worlds, n) [rad]."""
         return rows[:, self._theta]
 
-    def theta_dot(self, rows: Array) -> Array:
-        """Encoder rates, (num_worlds, n) [rad/s]."""
-        return rows[:, self._theta_dot]
-
     def plan_row(self, rows: Array) -> IntArray:
         """Row of a walk's plan at the end of the coming control period, (num_worlds,)."""
         return np.rint(rows[:, self._clock.start] / self._period_s).astype(np.int64)
@@ -386,14 +388,6 @@ class ObservationView:
     def motion(self, rows: Array) -> Motion:
         """Reference motion for the coming control period, (num_worlds, n) each."""
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
-
-    def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
-        """A copy with link angles in the encoders' place, and rates if they are given."""
-        seen = rows.copy()
-        seen[:, self._theta] = q
-        if q_dot is not None:
-            seen[:, self._theta_dot] = q_dot
-        return seen
 
     def rows(self, observation: Array) -> Array:
         """The observation with one row per world, (num_worlds, m).
@@ -483,3 +477,27 @@ class WalkView:
         """Observations, (num_worlds, m), as rows with fields, (num_worlds,), in the same memory."""
         rows = np.ascontiguousarray(rows)
         return np.ndarray(len(rows), self._type, rows, 0, rows.strides[:1])
+
+
+def record_rows(**fields: Any) -> Any:
+    """Rows with named fields for compiled kernels, such as a plan.
+
+    Args:
+        **fields: Numbers of each field, (rows, ...).
+    """
+    shapes = [(name, np.shape(values)[1:]) for name, values in fields.items()]
+    rows = np.empty(len(next(iter(fields.values()))), _row_type(*shapes))
+    for name, values in fields.items():
+        rows[name] = values
+    return rows
+
+
+@cache
+def _row_type(*shapes: tuple[str, tuple[int, ...]]) -> np.dtype[Any]:
+    """Type of rows, one object for all of a kind: Numba compares others at every call."""
+    return record_type(**dict(shapes))
+
+
+def record_row(**fields: Any) -> Any:
+    """One row of constants for compiled kernels, (1,), from the numbers of each field."""
+    return record_rows(**{name: [value] for name, value in fields.items()})

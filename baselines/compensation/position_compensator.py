@@ -138,6 +138,7 @@ class PositionCompensator:
 
     Attributes:
         joints: Names of the joints, in the order of all arrays.
+        constants: What it computes with.
         clipped: Which joints of the last command met a limit, (n,).
 
     Args:
@@ -182,7 +183,6 @@ class PositionCompensator:
         period_s: float = 0.01,
         friction: bool | None = None,
     ) -> None:
-        self._model = model
         require_robot(model)
         is_free = joints is None
         if joints is None:
@@ -190,26 +190,31 @@ class PositionCompensator:
             joints = commanded_hinges(model, named)
         settings = _read_stiffness(model, stiffness, joints, is_held_left_out=is_free)
         self.joints = tuple(settings)
-        self._links = RigidBody(model, self.joints, _held(model, self.joints))
-        at = [int(model.joint(name).id) for name in self.joints]
-        self._lowest, self._highest = joint_ranges(model, self.joints)
-        self._compliance = 1.0 / np.array([one.stiffness for one in settings.values()])
+        own = list(settings.values())
+        lowest, highest = joint_ranges(model, self.joints)
+        compliance = 1.0 / np.array([one.stiffness for one in own])
         gains = _servo_gains(model, settings, position_gain)
-        self._of_command = self._compliance + 1.0 / gains
         limits = CommandLimits(limit_rad=limit_rad, ramp_s=ramp_s, period_s=period_s)
-        self._limit = limits.limit_rad
-        self._ramp = limits.ramp_s
-        self._steps = max(int(np.ceil(limits.ramp_s / limits.period_s)), 1)
-        self._period_s = limits.period_s
-        self._friction = _friction(settings, friction)
-        self._viscous = np.array([one.viscous_friction or 0.0 for one in settings.values()])
-        self._lag_s = np.array([one.servo.braking for one in settings.values()]) / gains
-        self._rotor_s2 = np.array([one.rotor_inertia or 0.0 for one in settings.values()]) / gains
+        self.constants = CompensatorConstants(
+            model=model,
+            body=RigidBody(model, self.joints, _held(model, self.joints)),
+            tip=max(int(model.jnt_bodyid[model.joint(name).id]) for name in self.joints),
+            compliance=compliance,
+            of_command=compliance + 1.0 / gains,
+            lowest=lowest,
+            highest=highest,
+            limit_rad=limits.limit_rad,
+            ramp_steps=int(np.ceil(limits.ramp_s / limits.period_s)),
+            period_s=limits.period_s,
+            friction=_friction(settings, friction),
+            viscous=np.array([one.viscous_friction or 0.0 for one in own]),
+            lag_s=np.array([one.servo.braking for one in own]) / gains,
+            rotor_s2=np.array([one.rotor_inertia or 0.0 for one in own]) / gains,
+        )
         self._said: set[str] = set()
-        self._tip = int(model.jnt_bodyid[at].max())
         self.reset()
-        needed = self._of_command * self._most_passed(self._heaviest())
-        if (needed > self._limit).any():
+        needed = self.constants.of_command * self._most_passed(self._heaviest())
+        if (needed > limits.limit_rad).any():
             self._warn_of_offset(needed, "at some pose within the joint ranges")
 
     @classmethod
@@ -236,36 +241,16 @@ class PositionCompensator:
             given = _of_file(compiled, Path(stiffness), options.get("joints"))
         return cls(compiled, given, **options)
 
-    @property
-    def constants(self) -> CompensatorConstants:
-        """What it computes with."""
-        return CompensatorConstants(
-            model=self._model,
-            body=self._links,
-            tip=self._tip,
-            compliance=self._compliance,
-            of_command=self._of_command,
-            lowest=self._lowest,
-            highest=self._highest,
-            limit_rad=self._limit,
-            ramp_steps=self._steps if self._ramp > 0.0 else 0,
-            period_s=self._period_s,
-            friction=self._friction,
-            viscous=self._viscous,
-            lag_s=self._lag_s,
-            rotor_s2=self._rotor_s2,
-        )
-
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
         self._count = 0
         self._asked: _Motion | None = None
         self._load = self._load_wanted = self._load_step = 0.0
-        self._carrier = self._tip
+        self._carrier = self.constants.tip
         self._place = np.zeros(3)
-        self._links.set_load(self._carrier, 0.0, self._place)
-        if self._friction is not None:
-            self._rubbed = self._friction.begin((len(self.joints),))
+        self.constants.body.set_load(self._carrier, 0.0, self._place)
+        if self.constants.friction is not None:
+            self._rubbed = self.constants.friction.begin((len(self.joints),))
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(
@@ -288,9 +273,9 @@ class PositionCompensator:
         """
         payload = Payload(mass_kg=mass_kg, at=at)  # pyright: ignore[reportArgumentType]
         place = np.array(payload.at)
-        carrier = self._tip
+        carrier = self.constants.tip
         if body is not None:
-            model = self._model
+            model = self.constants.model
             bodies = {model.body(i).name: i for i in range(model.nbody)}
             sites = [model.site(i).name for i in range(model.nsite)]
             require_known("body or site", [body], [*bodies, *sites])
@@ -308,12 +293,14 @@ class PositionCompensator:
             self._carrier = carrier
             self._place = place
         self._load_wanted = payload.mass_kg
-        self._load_step = abs(payload.mass_kg - self._load) / self._steps
-        if self._ramp == 0.0:
+        steps = self.constants.ramp_steps
+        self._load_step = abs(payload.mass_kg - self._load) / max(steps, 1)
+        if steps == 0:
             self._load = payload.mass_kg
-        self._links.set_load(self._carrier, self._load, self._place)
+        self.constants.body.set_load(self._carrier, self._load, self._place)
         if asked is not None and before is not None:
-            self._warn_of_jump(self._of_command * (self._passed_along(asked) - before))
+            jump = self._passed_along(asked) - before
+            self._warn_of_jump(self.constants.of_command * jump)
 
     def torque(self, q: npt.ArrayLike, q_dot: Rates = None, q_ddot: Rates = None) -> Array:
         """Torque that the joints have to deliver, (n,) [N·m]; arguments and errors as `command`."""
@@ -336,16 +323,18 @@ class PositionCompensator:
         motion = self._motion(q_desired, q_dot, q_ddot)
         self._take_load()
         offset = self._lead(motion)
-        if self._count < self._steps and self._ramp > 0.0:
+        known = self.constants
+        if self._count < known.ramp_steps:
             self._count += 1
-            offset *= minimum_jerk(np.array(self._count / self._steps))
+            offset *= minimum_jerk(np.array(self._count / known.ramp_steps))
         wanted = offset + motion[0]
-        within = np.minimum(np.maximum(offset, -self._limit), self._limit) + motion[0]
-        command = np.minimum(np.maximum(within, self._lowest), self._highest)
+        limit = known.limit_rad
+        within = np.minimum(np.maximum(offset, -limit), limit) + motion[0]
+        command = np.minimum(np.maximum(within, known.lowest), known.highest)
         self.clipped = command != wanted
         self._asked = motion
         if self.clipped.any():
-            if np.abs(offset).max() > self._limit:
+            if np.abs(offset).max() > limit:
                 self._warn_of_offset(np.abs(offset), "now")
             self._warn_of_range(wanted)
         return command
@@ -367,7 +356,8 @@ class PositionCompensator:
                 leads to, or there are several.
         """
         shown_angle = self._checked("theta", theta, "rad")
-        gradient = self._compliance[:, None] * self._passed_gradient(shown_angle)
+        compliance = self.constants.compliance
+        gradient = compliance[:, None] * self._passed_gradient(shown_angle)
         size = gradient.ravel()
         # by the Frobenius norm, which is fast: there may be other equilibria
         is_soft = size.dot(size) >= 1.0
@@ -380,7 +370,7 @@ class PositionCompensator:
             return self._soft_link_angle(shown_angle, None)
         q = shown_angle
         for _ in range(_MOST_ITERATIONS):
-            residual = q - shown_angle + self._compliance * self._passed_at_rest(q)
+            residual = q - shown_angle + compliance * self._passed_at_rest(q)
             step, _ = _solved(factors, pivots, residual)
             q = q - step
             missing = residual.dot(residual)
@@ -396,76 +386,86 @@ class PositionCompensator:
     def _lead(self, motion: _Motion) -> Array:
         """Offset along a motion, (n,) [rad]; the friction follows its direction."""
         torque = self._torque(*motion)
-        if self._friction is None:
-            return self._of_command * torque
+        if self.constants.friction is None:
+            return self.constants.of_command * torque
         q, q_dot, q_ddot = motion
         displacement = np.zeros_like(q) if self._asked is None else q - self._asked[0]
         slack = self._rubbed.slack
-        self._rubbed = self._friction.follow(displacement, self._rubbed)
+        self._rubbed = self.constants.friction.follow(displacement, self._rubbed)
         if q_dot is None:  # without what trembles
-            q_dot = (displacement + slack - self._rubbed.slack) / self._period_s
-        passed = self._friction.passed(torque + self._viscous * q_dot, q_dot, self._rubbed)
-        lag = self._lag_s * q_dot
+            q_dot = (displacement + slack - self._rubbed.slack) / self.constants.period_s
+        passed = self.constants.friction.passed(
+            torque + self.constants.viscous * q_dot, q_dot, self._rubbed
+        )
+        lag = self.constants.lag_s * q_dot
         if q_ddot is not None:
-            lag = lag + self._rotor_s2 * q_ddot
-        return self._of_command * passed + lag
+            lag = lag + self.constants.rotor_s2 * q_ddot
+        return self.constants.of_command * passed + lag
 
     def _passed_along(self, motion: _Motion) -> Array:
         """Torque that is passed to links at a motion, by the side of the last commands, (n,)."""
         torque = self._torque(*motion)
-        if self._friction is None:
+        if self.constants.friction is None:
             return torque
         rate = np.zeros_like(torque) if motion[1] is None else motion[1]
-        return self._friction.passed(torque + self._viscous * rate, rate, self._rubbed)
+        return self.constants.friction.passed(
+            torque + self.constants.viscous * rate, rate, self._rubbed
+        )
 
     def _most_passed(self, torque: Array) -> Array:
         """Largest torque that is passed to links under loads of either sign, (n,) [N·m]."""
-        if self._friction is None:
+        if self.constants.friction is None:
             return torque
-        return self._friction.most_passed(torque)
+        return self.constants.friction.most_passed(torque)
 
     def _passed_at_rest(self, q: Array) -> Array:
         """Torque that is passed to links at rest, (..., n) [rad] to (..., n) [N·m]."""
-        torque = self._links.gravity_torque(q)
-        if self._friction is None:
+        torque = self.constants.body.gravity_torque(q)
+        if self.constants.friction is None:
             return torque
-        return self._friction.passed(torque, np.zeros_like(q), self._rubbed)
+        return self.constants.friction.passed(torque, np.zeros_like(q), self._rubbed)
 
     def _passed_gradient(self, q: Array) -> Array:
         """Its gradient, (..., n) [rad] to (..., n, n) [N·m/rad]."""
-        gradient = self._links.gravity_gradient(q)
-        if self._friction is None:
+        gradient = self.constants.body.gravity_gradient(q)
+        if self.constants.friction is None:
             return gradient
-        torque = self._links.gravity_torque(q)
-        share = self._friction.share(torque, np.zeros_like(q), self._rubbed)
+        torque = self.constants.body.gravity_torque(q)
+        share = self.constants.friction.share(torque, np.zeros_like(q), self._rubbed)
         return share[..., None] * gradient
 
     def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
         """Link angle on a spring that bends far, by a growing load; `guess` for the same pose."""
-        ends = (self._lowest, self._highest)
-        springs = (self._compliance, self._passed_at_rest, self._passed_gradient)
-        found = follow_load(theta, *springs, tolerance=_LAST_RESIDUAL_RAD, within=ends)
+        known = self.constants
+        found = follow_load(
+            theta,
+            known.compliance,
+            self._passed_at_rest,
+            self._passed_gradient,
+            tolerance=_LAST_RESIDUAL_RAD,
+            within=(known.lowest, known.highest),
+        )
         if found.lost.any():
-            raise ElasticError(
-                f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}"
-            )
+            reason = found.reason(known.compliance, self.joints)
+            raise ElasticError(f"no link angles for {theta} rad: {reason}")
         if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD:
             return guess
         return found.q
 
     def _heaviest(self) -> Array:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
-        lowest = np.where(np.isfinite(self._lowest), self._lowest, -np.pi)
-        highest = np.where(np.isfinite(self._highest), self._highest, np.pi)
+        known = self.constants
+        lowest = np.where(np.isfinite(known.lowest), known.lowest, -np.pi)
+        highest = np.where(np.isfinite(known.highest), known.highest, np.pi)
         generator = np.random.default_rng(0)
         poses = generator.uniform(lowest, highest, (_POSES, len(self.joints)))
-        torque = np.abs(self._links.gravity_torque(poses))
+        torque = np.abs(known.body.gravity_torque(poses))
         found = torque.max(axis=0)
         for joint, pose in enumerate(poses[torque.argmax(axis=0)]):
             for i in range(len(pose)):  # by one joint after the other, uphill
                 tried = np.repeat(pose[None], _TRIES, axis=0)
                 tried[:, i] = np.linspace(lowest[i], highest[i], _TRIES)
-                there = np.abs(self._links.gravity_torque(tried)[:, joint])
+                there = np.abs(known.body.gravity_torque(tried)[:, joint])
                 if there.max() > found[joint]:
                     found[joint] = there.max()
                     pose = tried[there.argmax()]
@@ -473,10 +473,11 @@ class PositionCompensator:
 
     def _warn_of_range(self, wanted: Array) -> None:
         """Say once that a command, (n,) [rad], met a joint range."""
-        over = np.maximum(self._lowest - wanted, wanted - self._highest)
+        known = self.constants
+        over = np.maximum(known.lowest - wanted, wanted - known.highest)
         if over.max() > 0.0:
             worst = int(over.argmax())
-            ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
+            ends = f"{known.lowest[worst]:.4g} to {known.highest[worst]:.4g} rad"
             self._warn_once(
                 "range",
                 f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond"
@@ -493,8 +494,8 @@ class PositionCompensator:
         self._warn_once(
             "limit_rad",
             f"the load needs an offset of {needed:.3g} rad of joint {joint!r} {when},"
-            f" and commands are cut at limit_rad = {self._limit:g}: the link ends short of where it"
-            f" should be; limit_rad={enough:.3g} is enough",
+            f" and commands are cut at limit_rad = {self.constants.limit_rad:g}: the link ends"
+            f" short of where it should be; limit_rad={enough:.3g} is enough",
         )
 
     def _warn_of_jump(self, jump: Array) -> None:
@@ -505,7 +506,7 @@ class PositionCompensator:
             return
         calm_s = max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5)
         cure = f"ramp_s={calm_s:.3g} takes it over in that time"
-        if self._ramp > 0.0:
+        if self.constants.ramp_steps > 0:
             cure = "set the payload to 0 where it was, and let ramp_s pass before"
         self._warn_once(
             "jump",
@@ -544,10 +545,10 @@ class PositionCompensator:
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
         if q_dot is None and q_ddot is None:
-            return self._links.gravity_torque(q)
+            return self.constants.body.gravity_torque(q)
         q_dot = np.zeros(len(q)) if q_dot is None else q_dot
         q_ddot = np.zeros(len(q)) if q_ddot is None else q_ddot
-        return self._links.inverse_dynamics(q, q_dot, q_ddot)
+        return self.constants.body.inverse_dynamics(q, q_dot, q_ddot)
 
     def _take_load(self) -> None:
         """One step towards the payload that is wanted."""
@@ -557,7 +558,7 @@ class PositionCompensator:
                 self._load = self._load_wanted
             else:
                 self._load += np.copysign(self._load_step, way)
-            self._links.set_load(self._carrier, self._load, self._place)
+            self.constants.body.set_load(self._carrier, self._load, self._place)
 
 
 def _warn(message: str) -> None:

@@ -35,7 +35,9 @@ class Ramp:
         self._period_s = model.control_period_s
         self._delay = 0.0
         if isinstance(model, WalkerModel):
-            held = _held_stiffness(model)
+            # springs in series with the servos that hold their motor side [N·m/rad]
+            servo = np.array([servo.position_gain for servo in model.servos])
+            held = 1.0 / (1.0 / model.stiffness + 1.0 / servo)
             sway = sway_frequencies(model.biped, model.plan.pelvis[0], held, model.plan.ankles[0])
             half_period = np.pi / sway[0]
             if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
@@ -53,9 +55,3 @@ class Ramp:
     def is_over(self, steps: Array | IntArray) -> BoolArray:
         """True where the compensation is complete."""
         return steps * self._period_s >= self._duration
-
-
-def _held_stiffness(model: RobotModel) -> Array:
-    """Springs in series with the servos that hold their motor side [N·m/rad]."""
-    servo = np.array([servo.position_gain for servo in model.servos])
-    return 1.0 / (1.0 / model.stiffness + 1.0 / servo)

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from baselines.compensation.policy import filter_share
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, rename_group
 from elastic_env.rigid.leg_kinematics import rotation_of_tilt
@@ -80,7 +81,7 @@ class GroundLevel:
         self._least_n = LOADED_SHARE * model.biped.weight
         self._period_s = period_s
         self._gravity = model.biped.gravity
-        self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
+        self._least_gain = filter_share(period_s, mean_s)
 
     def begin(self, num_worlds: int) -> GroundMemory:
         """Memory before the first measurement."""
@@ -112,18 +113,15 @@ class GroundLevel:
         moment = wrench[:, :, 1]
         over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
         mean, number = self._mean(force.sum(axis=1), velocity, memory)
-        lean = mean * self._certainty(number)[:, None]
+        change = self._gravity * TILT_RAD * self._period_s * number
+        certainty = change**2 / (change**2 + VELOCITY_M_PER_S**2)
+        lean = mean * certainty[:, None]
         R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
         x, y = np.moveaxis(over_ankles * (upright - force)[..., :2], -1, 0)
         turned = moment + np.stack([-y, x, np.zeros_like(x)], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
         return lean, wrenches, GroundMemory(number, mean, velocity)
-
-    def _certainty(self, number: Array) -> Array:
-        """How much of the mean the estimate is, 0 to 1."""
-        change = self._gravity * TILT_RAD * self._period_s * number
-        return change**2 / (change**2 + VELOCITY_M_PER_S**2)
 
     def _mean(self, force: Array, velocity: Array, memory: Any) -> tuple[Array, Array]:
         """The mean after a measurement, about x and y [rad], and of how many it is."""

@@ -13,25 +13,142 @@ one in its jackknife form (CR3), a cluster per pose, with Student's t:
 
 (R. M. Bell and D. F. McCaffrey, "Bias Reduction in Standard Errors for Linear Regression with
 Multi-Stage Samples", Survey Methodology 28(2), 2002.) Λ is the precision of the prior.
+
+A log whose signs contradict the model is refused: swapped encoders, joints that turn the other way.
 """  # noqa: E501
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import least_squares
 
-from baselines.identification.log_signs import (
-    require_deflections_with_load,
-    require_like_encoders,
-    require_signs,
-)
-from baselines.identification.pose_log import Kind
+from baselines.identification.pose_log import Kind, PoseLog
 from baselines.identification.pose_model import PoseModel, measurement_unit
 from elastic_env.core.errors import ConfigurationError, ElasticError
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
+
+_EXPLAINED = 0.8
+"""Share of a joint's deflections that a spring of negative stiffness explains where it
+contradicts the model.
+"""
+_MOST_CORRELATED = -0.9
+_LEAST_MOTION_RAD = 0.05
+_BETTER = 0.2
+"""Ratio of the spreads of the residuals with a sign turned round and as logged, where the sign
+is wrong.
+"""
+_MOST_NAMED = 4
+_MOST_JOINTS = 16
+"""Joints of an arm whose signs are tried."""
+
+
+def require_like_encoders(log: PoseLog) -> None:
+    """Refuse link encoders that run against the motor encoders.
+
+    Raises:
+        ConfigurationError: Those of a joint do.
+    """
+    if log.kind != "link_encoders":
+        return
+    wrong = []
+    for column, joint in enumerate(log.columns):
+        theta = log.theta[:, log.joints.index(joint)]
+        q = log.measured[:, column]
+        moves = min(np.ptp(theta), np.ptp(q)) > _LEAST_MOTION_RAD
+        if moves and np.corrcoef(theta, q)[0, 1] < _MOST_CORRELATED:
+            wrong.append(joint)
+    if wrong:
+        raise ConfigurationError(
+            f"theta and q run against each other: a sign is wrong ({_joints(wrong)}); give both the"
+            " sign of the model"
+        )
+
+
+def require_deflections_with_load(model: PoseModel, unknowns: Array, half_width: Array) -> None:
+    """Refuse link encoders that show springs of negative stiffness.
+
+    Args:
+        model: The poses.
+        unknowns: Estimates, (p,).
+        half_width: Of the intervals of the compliances, (k,) [rad/(N·m)].
+
+    Raises:
+        ConfigurationError: The links of a joint deflect against their load.
+    """
+    if model.log.kind != "link_encoders":
+        return
+    compliance = unknowns[model.unknowns.slices["compliance"]]
+    torque = model.torque(unknowns, model.link_angles(unknowns)[0])
+    against = []
+    for i, at in enumerate(model.unknowns.elastic):
+        name = model.log.joints[at]
+        if name in model.log.columns and compliance[i] < -half_width[i]:
+            q = model.log.measured[:, model.log.columns.index(name)]
+            measured = model.log.theta[:, at] - q
+            missing = measured - compliance[i] * torque[:, at]
+            if np.var(missing) < (1.0 - _EXPLAINED) * np.var(measured):
+                against.append(name)
+    if against:
+        raise ConfigurationError(
+            "the links deflect against their load: are theta and q swapped, or a sign wrong"
+            f" ({_joints(against)})? Springs give way to the load; give theta.JOINT of the motor"
+            " encoder and q.JOINT of the link encoder in the signs of the model"
+        )
+
+
+def require_signs(model: PoseModel, spread_of: Callable[[PoseModel], float]) -> None:
+    """Refuse a log that fits the model far better with the sign of a joint turned round.
+
+    Args:
+        model: The poses.
+        spread_of: Spread of the residuals, also with other poses.
+
+    Raises:
+        ConfigurationError: There is such a joint.
+    """
+    joints = model.log.joints
+    if len(joints) > _MOST_JOINTS:
+        return
+    turned = {joint: replace(model, log=turn_joint(model.log, joint)) for joint in joints}
+    found = {joint: spread_of(other) for joint, other in turned.items()}
+    least = min(found.values())
+    if least < _BETTER * spread_of(model):
+        wrong = [joint for joint, own in found.items() if own < 2.0 * least]
+        raise ConfigurationError(
+            f"the links deflect against their load: a sign is wrong ({_joints(wrong)}). With all"
+            f" columns of {' or '.join(wrong[:3])} turned round the poses fit the model; give them"
+            " the sign of the model"
+        )
+
+
+def turn_joint(log: PoseLog, joint: str) -> PoseLog:
+    """A log in which a joint turns the other way."""
+    at = np.array(log.joints) == joint
+    measured = log.measured
+    if log.kind in ("link_encoders", "torques"):
+        measured = _negative(measured, np.array(log.columns) == joint)
+    return replace(
+        log,
+        theta=_negative(log.theta, at),
+        measured=measured,
+        direction=_negative(log.direction, at),
+        known=_negative(log.known, at),
+    )
+
+
+def _negative(table: Any, columns: BoolArray) -> Any:
+    return None if table is None else np.where(columns, -table, table)
+
+
+def _joints(names: Sequence[str]) -> str:
+    """A joint, or one of several, of which the first few are named."""
+    if len(names) > _MOST_NAMED:
+        names = [*names[:_MOST_NAMED], f"{len(names) - _MOST_NAMED} others"]
+    return f"joint {' or '.join(names)}"
+
 
 _FINEST: dict[Kind, float] = {
     "end_effector": 1e-4,
@@ -133,11 +250,49 @@ def solve_unknowns(model: PoseModel, progress: Callable[[int], None] | None = No
     """
     if not model.unknowns.size:
         return np.zeros(0)
-    problem = _Problem(model, _FINEST[model.log.kind], progress)
+    noise = _FINEST[model.log.kind]
+    count = 0
+    at = gradient = np.empty(0)
+
+    def residual(x: Array) -> Array:
+        """Predicted less measured in units of noise, then the prior, (N m + p,).
+
+        Infinite where a load overcomes a spring: the solver takes a shorter step.
+        """
+        nonlocal count, at, gradient
+        count += 1
+        if progress is not None:
+            progress(count)
+        try:
+            predicted, gradient = model.predict(model.scale * x)
+        except ElasticError:
+            if not len(at):  # at the start
+                raise
+            return np.full(model.target.size + len(x), np.inf)
+        at = x.copy()
+        return np.concatenate([(predicted - model.target).ravel() / noise, x])
+
+    def jacobian(x: Array) -> Array:
+        """Its derivatives, (N m + p, p); the solver has asked for the residual there."""
+        if not np.array_equal(x, at):
+            residual(x)
+        rows = gradient.reshape(-1, len(x)) * model.scale / noise
+        return np.concatenate([rows, np.eye(len(x))])
+
+    def solve(start: Array, evaluations: int, scale: Any) -> Any:
+        return least_squares(
+            residual,
+            start,
+            jac=jacobian,  # pyright: ignore[reportArgumentType]  a callable is meant to be here
+            method="trf",
+            max_nfev=evaluations,
+            x_scale=scale,
+        )
+
     start = model.start_with(_FIRST_DEFLECTION_RAD) / model.scale
-    found = _least_squares(problem, start, MOST_EVALUATIONS)
-    if not found.success:  # ill-conditioned: steps in units of the derivatives come further
-        found = _least_squares(problem, found.x, _FURTHER_EVALUATIONS, x_scale="jac")
+    found = solve(start, MOST_EVALUATIONS, 1.0)
+    if not found.success:  # ill-conditioned: steps in units of the derivatives help
+        found = solve(found.x, _FURTHER_EVALUATIONS, "jac")
     if not found.success:
         raise ElasticError(
             f"the fit did not converge in {MOST_EVALUATIONS + _FURTHER_EVALUATIONS} steps; check"
@@ -145,17 +300,6 @@ def solve_unknowns(model: PoseModel, progress: Callable[[int], None] | None = No
             " joints by --joints"
         )
     return model.scale * found.x
-
-
-def _least_squares(problem: "_Problem", start: Array, evaluations: int, **options: Any) -> Any:
-    return least_squares(
-        problem.residual,
-        start,
-        jac=problem.jacobian,  # pyright: ignore[reportArgumentType]  a callable is meant to be here
-        method="trf",
-        max_nfev=evaluations,
-        **options,
-    )
 
 
 def _spread_near(model: PoseModel) -> float:
@@ -167,57 +311,6 @@ def _spread_near(model: PoseModel) -> float:
     residual = (model.target - predicted).ravel() / noise
     step = np.linalg.solve(rows.T @ rows + np.eye(len(start)), rows.T @ residual)
     return noise * float(np.std(residual - rows @ step))
-
-
-class _Problem:
-    """Residuals of poses and prior, and their derivatives, in units of noise and of the scales.
-
-    Args:
-        model: The poses.
-        noise: Noise of a measurement, in its unit.
-        progress: Called with the number of evaluations so far.
-    """
-
-    def __init__(
-        self, model: PoseModel, noise: float, progress: Callable[[int], None] | None
-    ) -> None:
-        self._model = model
-        self._noise = noise
-        self._progress = progress
-        self._count = 0
-        self._at = np.empty(0)
-        self._gradient = np.empty(0)
-        self._size = model.target.size + model.unknowns.size
-
-    def residual(self, x: Array) -> Array:
-        """Predicted less measured, then the prior, (N m + p,).
-
-        Infinite where a load overcomes a spring.
-
-        Raises:
-            ElasticError: It does so at the start.
-        """
-        self._count += 1
-        if self._progress is not None:
-            self._progress(self._count)
-        try:
-            predicted, self._gradient = self._model.predict(self._model.scale * x)
-        except ElasticError:
-            if not len(self._at):
-                raise
-            return np.full(self._size, np.inf)  # the solver takes a shorter step
-        self._at = x.copy()
-        return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
-
-    def jacobian(self, x: Array) -> Array:
-        """Its derivatives, (N m + p, p).
-
-        `least_squares` asks for them where it has asked for the residual.
-        """
-        if not np.array_equal(x, self._at):
-            self.residual(x)
-        rows = self._gradient.reshape(-1, len(x)) * self._model.scale / self._noise
-        return np.concatenate([rows, np.eye(len(x))])
 
 
 def needed_poses(model: PoseModel) -> int:
@@ -238,27 +331,17 @@ def require_poses(model: PoseModel) -> None:
             f" {model.target.shape[1]} measured numbers each, the log has {len(model.log)}; log"
             " further poses, or seek fewer joints by --joints"
         )
-    if model.log.kind == "end_effector":
-        _require_reach(model)
-
-
-def _require_reach(model: PoseModel) -> None:
-    """Refuse positions that spread far more or less than the model's, such as millimetres."""
-    own, measured = (
-        _radius(points)
-        for points in (model.arm.attitude(model.log.theta).position, model.log.measured)
-    )
+    if model.log.kind != "end_effector":
+        return
+    places = (model.arm.attitude(model.log.theta).position, model.log.measured)
+    # root mean square distances from the mean, which do not depend on the frame
+    own, measured = (float(np.sqrt(np.var(part, axis=0).sum())) for part in places)
     if not own / _UNLIKE < measured < own * _UNLIKE:
         raise ConfigurationError(
             f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of"
             f" the model over {own:.3g} m: convert millimetres to metres, or name the body that was"
             " measured by --end-effector"
         )
-
-
-def _radius(points: Array) -> float:
-    """Root mean square distance from the mean, which does not depend on the frame [m]."""
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))
 
 
 def information_of(model: PoseModel, unknowns: Array, spread: float) -> tuple[Array, Array]:
@@ -308,12 +391,10 @@ def in_unit(noise: float, kind: Kind) -> str:
 
 def summed_up(fit: ArmFit) -> str:
     """The residuals in a sentence, with what friction means for the intervals."""
-    friction = (
-        "friction is separated by the sides of approach"
-        if fit.model.log.direction is not None
-        else (
+    friction = "friction is separated by the sides of approach"
+    if fit.model.log.direction is None:
+        friction = (
             "the log has no sides of approach: friction counts as noise, and the intervals"
             " contain it"
         )
-    )
     return f"residual spread {in_unit(fit.spread, fit.model.log.kind)}; {friction}"

@@ -138,7 +138,7 @@ def describe_fit(
         )
     why = reasons(fit, within)
     after = None if planned is None else expected_half_width(fit, planned)
-    joints = tuple(_joint(fit, i, within, assumed, why[i], after) for i in range(len(compliance)))
+    joints = tuple(_joint(fit, i, within, assumed, reason, after) for i, reason in enumerate(why))
     payload, payload_half = _first_known(fit, "payload")
     log = fit.model.log
     sought = [joint.joint for joint in joints]
@@ -214,10 +214,17 @@ def _joint(
     offset, offset_half = fit.estimate("offset")
     friction, friction_half = _first_known(fit, "friction", i)
     is_shown = why not in (UNLOADED, UNSEEN)
-    source = _source(c, h, within, is_rigid=best == 0.0 or not is_shown, assumed=assumed)
-    stiffness = (
-        math.inf if source == "rigid" else 1.0 / best if assumed is None or c > h else assumed
-    )
+    is_rigid = best == 0.0 or not is_shown
+    source: Source
+    if c > h and not is_rigid:
+        source = "told apart" if h <= within * c else "wide interval"
+    elif assumed is not None:
+        source = "assumed"
+    else:
+        source = "rigid" if is_rigid else "no upper end"
+    stiffness = math.inf
+    if source != "rigid":
+        stiffness = 1.0 / best if assumed is None or c > h else assumed
     return JointStiffness(
         joint=fit.model.log.joints[fit.model.unknowns.elastic[i]],
         stiffness_nm_per_rad=stiffness,
@@ -234,15 +241,6 @@ def _joint(
         largest_torque_nm=float(fit.model.load[i]),
         planned_half_width=None if planned is None else float(planned[i]),
     )
-
-
-def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float | None) -> Source:
-    """Origin of a stiffness, from the compliance c and the half-width h of its interval."""
-    if c > h and not is_rigid:
-        return "told apart" if h <= within * c else "wide interval"
-    if assumed is not None:
-        return "assumed"
-    return "rigid" if is_rigid else "no upper end"
 
 
 def bounded_compliance(fit: ArmFit) -> Array:

@@ -71,28 +71,33 @@ class GeometryPriors(Model):
     """Dry friction of a joint over its largest torque, where sides of approach are logged."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """One estimate.
+UNITS = {
+    "translation": "m",
+    "rotation": "rad",
+    "marker": "m",
+    "offset": "rad",
+    "length": "m",
+    "angle": "rad",
+    "compliance": "rad/(N·m)",
+    "friction": "N·m",
+}
+"""Units of the kinds of parameters."""
 
-    Attributes:
-        kind: Kind of parameter, a field of `Parameters`.
-        name: Joint or marker and axis, such as `elbow.x`.
-        value: Estimate.
-        deviation: Its standard deviation.
-        prior: Standard deviation of its prior.
-    """
+
+class GeometryEstimate(Model):
+    """One parameter and its 95 % interval."""
 
     kind: str
+    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance,
+    friction."""
     name: str
+    """Joint or marker, with the axis of the joint's frame where it has several."""
     value: float
-    deviation: float
-    prior: float
-
-    @property
-    def is_told(self) -> bool:
-        """True if the poses narrow its deviation to less than half of the prior's."""
-        return self.deviation < _TOLD * self.prior
+    half_width: float
+    """Half of the 95 % interval."""
+    unit: str
+    is_told: bool
+    """Whether the poses narrow it to less than half of its prior's deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +193,8 @@ class GeometryProblem:
 
         def seek(kind: str, name: str, first: int, direction: Array, prior: float) -> None:
             column = np.zeros(starts[-1])
-            column[begin[kind] + first : begin[kind] + first + len(direction)] = direction
+            at = begin[kind] + first
+            column[at : at + len(direction)] = direction
             found.append((kind, name, column, prior))
 
         for axis, unit in zip("xyz", np.eye(3), strict=True):
@@ -200,11 +206,12 @@ class GeometryProblem:
             is_free = joint in self.free
             one = np.ones(1)
             seek("offset", joint, j, one, own.frame_rad if is_free else own.offset_rad)
-            length = own.frame_m if is_free else own.length_m
-            angle = own.frame_rad if is_free else own.angle_rad
-            for name, direction, is_length in self._errors_of(j, is_free):
-                kind = "length" if is_length else "angle"
-                seek(kind, f"{joint}.{name}", 3 * j, direction, length if is_length else angle)
+            size = {
+                "length": own.frame_m if is_free else own.length_m,
+                "angle": own.frame_rad if is_free else own.angle_rad,
+            }
+            for kind, name, direction in self._errors_of(j, is_free):
+                seek(kind, f"{joint}.{name}", 3 * j, direction, size[kind])
             if joint not in self.elastic:
                 continue
             moment = self.largest_moment[j]
@@ -218,15 +225,15 @@ class GeometryProblem:
         kinds, names, columns, priors = zip(*found, strict=True)
         return Unknowns(kinds, names, np.stack(columns, axis=1), np.array(priors))
 
-    def _errors_of(self, joint: int, is_free: bool) -> list[tuple[str, Array, bool]]:
-        """Name and direction of the unknown lengths, and angles, of a joint's frame."""
+    def _errors_of(self, joint: int, is_free: bool) -> list[tuple[str, str, Array]]:
+        """Kind, name and direction of the unknown lengths and angles of a joint's frame."""
         if self.geometry == "offsets" and not is_free:
             return []
         across, along = self.model.normals[joint]
         axis = np.array([0.0, 0.0, 1.0])
-        errors = [("x", across, True), ("z", axis, True), ("x", across, False)]
+        errors = [("length", "x", across), ("length", "z", axis), ("angle", "x", across)]
         if self.geometry == "full" or is_free:
-            errors += [("y", along, True), ("y", along, False)]
+            errors += [("length", "y", along), ("angle", "y", along)]
         return errors
 
     def parameters(self, x: Array) -> Parameters:
@@ -235,9 +242,8 @@ class GeometryProblem:
         nominal = self.model.nominal_parameters()
         ends = np.cumsum([part.size for part in nominal])
         parts = np.split(flat, ends[:-1])
-        return Parameters(
-            *(part.reshape(like.shape) for part, like in zip(parts, nominal, strict=True))
-        )
+        pairs = zip(parts, nominal, strict=True)
+        return Parameters(*(part.reshape(like.shape) for part, like in pairs))
 
     def residual(self, x: Array) -> Array:
         """Shown by the model less measured, (N k 3,) [m]."""
@@ -274,30 +280,26 @@ class GeometryFit:
         return self.problem.parameters(self.x)
 
     @cached_property
-    def estimates(self) -> tuple[Estimate, ...]:
+    def estimates(self) -> tuple[GeometryEstimate, ...]:
         """The unknowns with their intervals."""
         own = self.problem.unknowns
-        deviations = np.sqrt(np.diag(self.covariance))
+        deviation = np.sqrt(np.diag(self.covariance))
         return tuple(
-            Estimate(*row)
-            for row in zip(
-                own.kinds,
-                own.names,
-                self.x.tolist(),
-                deviations.tolist(),
-                own.prior.tolist(),
-                strict=True,
+            GeometryEstimate(
+                kind=own.kinds[i],
+                name=own.names[i],
+                value=self.x[i],
+                half_width=QUANTILE * deviation[i],
+                unit=UNITS[own.kinds[i]],
+                is_told=bool(deviation[i] < _TOLD * own.prior[i]),
             )
+            for i in range(len(self.x))
         )
 
     def missed(self, problem: GeometryProblem) -> Array:
         """Places of the markers less those that this fit predicts, (N, k, 3) [m]."""
         shown = self.problem.model.measured(self.parameters, problem.theta, problem.axial)
         return problem.measured - shown
-
-    def errors(self, problem: GeometryProblem) -> Array:
-        """Distances of the markers from where they were measured, (N, k) [m]."""
-        return np.linalg.norm(self.missed(problem), axis=-1)
 
 
 def fit_geometry(problem: GeometryProblem) -> GeometryFit:
@@ -323,7 +325,8 @@ def fit_geometry(problem: GeometryProblem) -> GeometryFit:
         spread = np.sqrt(residual @ residual / max(len(residual) - used, 1.0))
         noise = max(float(spread), _FINEST_M)
     prior = problem.unknowns.prior
-    return GeometryFit(problem, x, _covariance(problem, x, noise) * np.outer(prior, prior), noise)
+    covariance = _covariance(problem, x, noise) * np.outer(prior, prior)
+    return GeometryFit(problem, x, covariance, noise)
 
 
 def _covariance(problem: GeometryProblem, x: Array, noise: float) -> Array:
@@ -344,7 +347,7 @@ def _least(problem: GeometryProblem, x: Array, noise: float) -> Array:
     def residual(z: Array) -> Array:
         try:
             missed = problem.residual(prior * z) / noise
-        except ElasticError:  # a posture that no spring holds: the solver takes a shorter step
+        except ElasticError:  # no spring holds it: the solver takes a shorter step
             missed = np.full(problem.measured.size, _LOST_M / noise)
         return np.concatenate([missed, z])
 
@@ -387,5 +390,7 @@ def align_tracker(model: GeometryModel, theta: Array, measured: Array) -> Geomet
             f"the markers spread over {shown_m:.3g} m, those of the model over {own_m:.3g} m:"
             " convert millimetres to metres, or name the bodies that were measured"
         )
-    R = Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[0].as_matrix()
-    return replace(model, alignment=R, origin=shown.mean(axis=0) - R @ own.mean(axis=0))
+    middle = shown.mean(axis=0)
+    own_middle = own.mean(axis=0)
+    R = Rotation.align_vectors(shown - middle, own - own_middle)[0].as_matrix()
+    return replace(model, alignment=R, origin=middle - R @ own_middle)

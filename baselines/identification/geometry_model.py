@@ -316,27 +316,43 @@ class GeometryModel:
         n = self.num_joints
         k = len(self.markers)
         loads = self._loads(parameters, posture, axial)
-        bent = self._bent(parameters, posture, loads)
+        compliance = parameters.compliance
+        # deflections φ of all joints: 1 − c ∂m/∂φ, and the markers by them
+        housings = np.moveaxis(posture.housing, 0, 1)
+        axes = housings @ _left_jacobian(compliance * loads)
+        bending = self._about(axes, turns_housing=False)
+        stiff = np.eye(3 * n) - self._moment_change(posture, bending, compliance)
+        by_bending = self._marker_change(posture, bending)
+
+        def by_turns(turns: Array, direct: Array | float = 0.0) -> Array:
+            """Derivatives of the measurement by turns of the joints, (N, 3 n, P) [rad].
+
+            `direct` is what the markers move besides.
+            """
+            turned = np.linalg.solve(stiff, turns)
+            return R @ (direct + np.einsum("nkaq,nqp->nkap", by_bending, turned))
 
         def by(twists: Twists) -> Array:
             """Derivatives of the measurement by twists, (N, k, 3, P)."""
-            direct = self._marker_change(posture, twists)
-            turned = np.linalg.solve(
-                bent.matrix, self._moment_change(posture, twists, bent.compliance)
-            )
-            return R @ (direct + np.einsum("nkaq,nqp->nkap", bent.marker, turned))
+            turns = self._moment_change(posture, twists, compliance)
+            return by_turns(turns, self._marker_change(posture, twists))
 
-        def by_turns(turns: Array) -> Array:
-            """Derivatives of the measurement by turns of the joints, (N, 3 n, P) [rad]."""
-            turned = np.linalg.solve(bent.matrix, turns)
-            return R @ np.einsum("nkaq,nqp->nkap", bent.marker, turned)
-
+        turning = Twists(
+            joint=np.arange(n),
+            axis=np.moveaxis(posture.link[..., 2], 0, 1),
+            velocity=np.zeros((count, n, 3)),
+            turns_housing=np.zeros(n, dtype=np.bool_),
+        )
+        frames = self._nominal_frames(posture)
+        tilting = self._about(frames @ _left_jacobian(parameters.angle))
+        along = self._about(frames)
+        along = along._replace(axis=along.velocity, velocity=along.axis)
         own = np.zeros((count, 3 * n, 3 * n))
         own[:, np.arange(3 * n), np.arange(3 * n)] = loads.reshape(count, 3 * n)
         held = np.zeros((count, 3 * n, n))
         if axial is not None:
-            about_axes = -parameters.compliance[:, 2] * axial.direction
-            held[:, np.arange(2, 3 * n, 3), np.arange(n)] = about_axes
+            by_friction = -compliance[:, 2] * axial.direction
+            held[:, np.arange(2, 3 * n, 3), np.arange(n)] = by_friction
         of_marker = np.zeros((count, k, 3, k, 3))
         for i, marker in enumerate(self.markers):
             of_marker[:, i, :, i] = R @ (
@@ -347,9 +363,9 @@ class GeometryModel:
             rotation=-cross_matrix(shown - self.origin - parameters.translation)
             @ _left_jacobian(parameters.rotation),
             marker=of_marker,
-            offset=-by(self._about_axes(posture)),
-            length=by(self._along_frames(posture)).reshape(count, k, 3, n, 3),
-            angle=by(self._about_frames(parameters, posture)).reshape(count, k, 3, n, 3),
+            offset=-by(turning),
+            length=by(along).reshape(count, k, 3, n, 3),
+            angle=by(tilting).reshape(count, k, 3, n, 3),
             compliance=by_turns(own).reshape(count, k, 3, n, 3),
             friction=np.zeros((count, k, 3, n)) if axial is None else by_turns(held),
         )
@@ -391,25 +407,10 @@ class GeometryModel:
         ]
         return Posture(housing, link, anchor, lever, np.stack(places, axis=1))
 
-    @cached_property
-    def _weight_beyond(self) -> Array:
-        """Weight of all links at a joint and beyond, (n,) [N]."""
-        return self.is_beyond @ self.weight
-
     def moments(self, posture: Posture) -> Array:
         """Moments of gravity about the anchors, in the axes of the housings, (N, n, 3) [N·m]."""
         moment = np.cross(posture.lever, self.down)
         return np.einsum("jnba,jnb->nja", posture.housing, moment)
-
-    def _about_axes(self, posture: Posture) -> Twists:
-        """A turn of each joint about its axis."""
-        axis = np.moveaxis(posture.link[..., 2], 0, 1)
-        return Twists(
-            joint=np.arange(self.num_joints),
-            axis=axis,
-            velocity=np.zeros_like(axis),
-            turns_housing=np.zeros(self.num_joints, dtype=np.bool_),
-        )
 
     def _nominal_frames(self, posture: Posture) -> Array:
         """Axes of the nominal frames behind their parents' links, (N, n, 3, 3)."""
@@ -420,53 +421,27 @@ class GeometryModel:
         ]
         return np.stack(parents, axis=1) @ self.nominal
 
-    def _along_frames(self, posture: Posture) -> Twists:
-        """A shift of each joint along the axes of its nominal frame, 3 n twists."""
-        frames = self._nominal_frames(posture)
-        velocity = frames.transpose(0, 1, 3, 2).reshape(len(frames), -1, 3)
+    def _about(self, frames: Array, turns_housing: bool = True) -> Twists:
+        """A turn of each joint about each axis of its frame, (N, n, 3, 3): 3 n twists."""
+        count, n = frames.shape[:2]
+        axis = frames.transpose(0, 1, 3, 2).reshape(count, 3 * n, 3)
         return Twists(
-            joint=np.repeat(np.arange(self.num_joints), 3),
-            axis=np.zeros_like(velocity),
-            velocity=velocity,
-            turns_housing=np.ones(3 * self.num_joints, dtype=np.bool_),
-        )
-
-    def _about_frames(self, parameters: Parameters, posture: Posture) -> Twists:
-        """A change of each component of ω, 3 n twists."""
-        frames = self._nominal_frames(posture) @ _left_jacobian(parameters.angle)
-        axis = frames.transpose(0, 1, 3, 2).reshape(len(frames), -1, 3)
-        return Twists(
-            joint=np.repeat(np.arange(self.num_joints), 3),
-            axis=axis,
-            velocity=np.zeros_like(axis),
-            turns_housing=np.ones(3 * self.num_joints, dtype=np.bool_),
-        )
-
-    def _bent(self, parameters: Parameters, posture: Posture, loads: Array) -> "_Bent":
-        """How deflections φ of all joints change markers and moments."""
-        count = posture.link.shape[1]
-        n = self.num_joints
-        turn = parameters.compliance * loads
-        axes = np.moveaxis(posture.housing, 0, 1) @ _left_jacobian(turn)
-        axis = axes.transpose(0, 1, 3, 2).reshape(count, 3 * n, 3)
-        twists = Twists(
             joint=np.repeat(np.arange(n), 3),
             axis=axis,
             velocity=np.zeros_like(axis),
-            turns_housing=np.zeros(3 * n, dtype=np.bool_),
+            turns_housing=np.full(3 * n, turns_housing),
         )
-        marker = self._marker_change(posture, twists)
-        compliance = parameters.compliance.reshape(3 * n, 1)
-        change = self._moment_change(posture, twists, compliance)
-        return _Bent(np.eye(3 * n) - change, marker, compliance)
 
     def _marker_change(self, posture: Posture, twists: Twists) -> Array:
         """Velocities of the markers in the base, (N, k, 3, P)."""
         changes = []
+        anchor = np.moveaxis(posture.anchor, 0, 1)[:, twists.joint]
         for i, marker in enumerate(self.markers):
-            arm = posture.marker[:, i, None] - np.moveaxis(posture.anchor, 0, 1)[:, twists.joint]
-            carried = self.is_beyond[twists.joint, marker.joint] if marker.joint >= 0 else 0.0
+            arm = posture.marker[:, i, None] - anchor
             moved = np.cross(twists.axis, arm) + twists.velocity
+            carried = 0.0
+            if marker.joint >= 0:
+                carried = self.is_beyond[twists.joint, marker.joint]
             changes.append(moved * np.reshape(carried, (-1, 1)))
         return np.stack(changes, axis=1).transpose(0, 1, 3, 2)
 
@@ -476,11 +451,12 @@ class GeometryModel:
         changes = np.empty((self.num_joints, count, len(twists.joint), 3))
         lever = np.moveaxis(posture.lever, 0, 1)
         own_lever = lever[:, twists.joint]
-        own_weight = self._weight_beyond[twists.joint, None]
+        own_weight = (self.is_beyond @ self.weight)[twists.joint, None]
         of_outer = np.cross(twists.axis, own_lever) + own_weight * twists.velocity
         for j in range(self.num_joints):
-            carries = self.is_beyond[twists.joint, j][:, None]  # the twist moves joint j itself
-            is_inner = self.is_beyond[j, twists.joint][:, None]  # it moves weight beyond joint j
+            # the twist moves joint j itself, or weight beyond it
+            carries = self.is_beyond[twists.joint, j][:, None]
+            is_inner = self.is_beyond[j, twists.joint][:, None]
             of_inner = np.cross(twists.axis, lever[:, j, None])
             change = np.where(carries, of_inner, np.where(is_inner, of_outer, 0.0))
             moment = np.cross(change, self.down)
@@ -489,21 +465,7 @@ class GeometryModel:
             moment = moment - np.where(turns, np.cross(twists.axis, own), 0.0)
             changes[j] = moment @ posture.housing[j]
         stacked = changes.transpose(1, 0, 3, 2).reshape(count, 3 * self.num_joints, -1)
-        return compliance * stacked
-
-
-class _Bent(NamedTuple):
-    """How deflections of all joints act, q = 3 n of them.
-
-    Attributes:
-        matrix: 1 − c ∂m/∂φ, (N, q, q).
-        marker: Change of the markers in the base, (N, k, 3, q) [m/rad].
-        compliance: (q, 1) [rad/(N·m)].
-    """
-
-    matrix: Array
-    marker: Array
-    compliance: Array
+        return compliance.reshape(-1, 1) * stacked
 
 
 def rotation_of(vectors: Array) -> Array:

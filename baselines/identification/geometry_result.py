@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from pydantic import Field
 
-from baselines.identification.geometry_fit import QUANTILE, Estimate, GeometryFit
+from baselines.identification.geometry_fit import GeometryEstimate, GeometryFit
 from baselines.identification.geometry_model import Geometry, rotation_of
 from baselines.identification.holdout import HeldOut
 from elastic_env.core.config import Model
@@ -15,34 +15,6 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import yaml_line
 from elastic_env.rigid.tree.links import Tree
-
-UNITS = {
-    "translation": "m",
-    "rotation": "rad",
-    "marker": "m",
-    "offset": "rad",
-    "length": "m",
-    "angle": "rad",
-    "compliance": "rad/(N·m)",
-    "friction": "N·m",
-}
-"""Units of the kinds of parameters."""
-
-
-class GeometryEstimate(Model):
-    """One parameter and its 95 % interval."""
-
-    kind: str
-    """What it is of: tracker (translation, rotation), marker, offset, length, angle, compliance,
-    friction."""
-    name: str
-    """Joint or marker, with the axis of the joint's frame where it has several."""
-    value: float
-    half_width: float
-    """Half of the 95 % interval."""
-    unit: str
-    is_told: bool
-    """Whether the poses narrow it to less than half of its prior's deviation."""
 
 
 class JointCompliance(Model):
@@ -111,17 +83,7 @@ def describe_geometry(fit: GeometryFit, held_out: HeldOut | None) -> GeometryIde
         lateral=problem.lateral,
         noise_mm=1e3 * fit.noise_m,
         joints=tuple(_joint(joint, told.get(joint)) for joint in problem.joints),
-        parameters=tuple(
-            GeometryEstimate(
-                kind=estimate.kind,
-                name=estimate.name,
-                value=estimate.value,
-                half_width=QUANTILE * estimate.deviation,
-                unit=UNITS[estimate.kind],
-                is_told=estimate.is_told,
-            )
-            for estimate in fit.estimates
-        ),
+        parameters=fit.estimates,
         held_out=held_out,
     )
 
@@ -162,7 +124,7 @@ def correct_model(spec: mujoco.MjSpec, tree: Tree, fit: GeometryFit) -> mujoco.M
     return corrected
 
 
-def _joint(joint: str, estimate: Estimate | None) -> JointCompliance:
+def _joint(joint: str, estimate: GeometryEstimate | None) -> JointCompliance:
     """Stiffness by a compliance; rigid where it is not sought, not told, or not above zero."""
     if estimate is None or estimate.value <= 0.0 or not estimate.is_told:
         return JointCompliance(
@@ -172,7 +134,7 @@ def _joint(joint: str, estimate: Estimate | None) -> JointCompliance:
             stiffness_high_nm_per_rad=None,
         )
     c = estimate.value
-    h = QUANTILE * estimate.deviation
+    h = estimate.half_width
     return JointCompliance(
         joint=joint,
         stiffness_nm_per_rad=1.0 / c,

@@ -14,17 +14,151 @@ separates an IMU error of that shape from K.
 """  # noqa: E501
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
-from baselines.identification.static_points import StaticPoints, link_torque, record_points
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array, IntArray
+
+_PROGRESS_STEPS = 250
+
+
+@dataclass(frozen=True)
+class StaticPoints:
+    """Averages of the windows at rest, one entry per visit.
+
+    Attributes:
+        theta: Encoder [rad].
+        q: IMU on the link [rad].
+        direction: Side of approach, +1 from below, -1 from above.
+        position: Number of the static position; its two visits share it.
+        load: Which of the masses was mounted, 0 or 1.
+    """
+
+    theta: Array
+    q: Array
+    direction: IntArray
+    position: IntArray
+    load: IntArray
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def rows(self, chosen: IntArray) -> "StaticPoints":
+        """Some of the points, in the given order."""
+        columns = {field.name: getattr(self, field.name)[chosen] for field in fields(self)}
+        return StaticPoints(**columns)
+
+    @staticmethod
+    def join(parts: "Sequence[StaticPoints]") -> "StaticPoints":
+        """The points of several loads together, positions numbered through."""
+        numbered: list[StaticPoints] = []
+        first = 0
+        for load, part in enumerate(parts):
+            own = replace(part, position=part.position + first, load=np.full(len(part), load))
+            first += part.position.max() + 1
+            numbered.append(own)
+        names = [field.name for field in fields(StaticPoints)]
+        columns = {name: [getattr(part, name) for part in numbered] for name in names}
+        joined = {name: np.concatenate(own) for name, own in columns.items()}
+        return StaticPoints(**joined)
+
+
+class HoldRecorder:
+    """Averages encoder and IMU over the windows at rest of a `hold` reference.
+
+    Args:
+        directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
+        num_worlds: Worlds that play the reference in step.
+    """
+
+    def __init__(self, directions: IntArray, num_worlds: int = 1) -> None:
+        self._directions = directions
+        self._sums = np.zeros((len(directions), num_worlds, 2))
+        self._counts = np.zeros(len(directions), dtype=np.int64)
+
+    def take(self, encoder: Array, imu: Array, rest: int) -> None:
+        """Take in encoder and IMU, (num_worlds,) [rad], and the window, -1 outside."""
+        if rest >= 0:
+            self._sums[rest] += np.stack([encoder, imu], axis=-1)
+            self._counts[rest] += 1
+
+    @property
+    def is_complete(self) -> bool:
+        """True when every window has been visited."""
+        return bool(self._counts.all())
+
+    def points(self) -> list[StaticPoints]:
+        """The averages of every world.
+
+        Raises:
+            ElasticError: A window has no sample: the run ended early.
+        """
+        if not self.is_complete:
+            raise ElasticError(
+                f"the run ended before all {len(self._counts)} static positions were visited"
+            )
+        means = self._sums / self._counts[:, None, None]
+        half = len(self._directions) // 2
+        position = np.concatenate([np.arange(half), np.arange(half)[::-1]])
+        load = np.zeros(len(position), dtype=np.int64)
+        return [
+            StaticPoints(means[:, world, 0], means[:, world, 1], self._directions, position, load)
+            for world in range(means.shape[1])
+        ]
+
+
+def record_points(
+    env: Any, seed: int | None = None, progress: Callable[[float], None] | None = None
+) -> list[StaticPoints]:
+    """Drive a testbed, simulated or real, through its `hold` reference without compensation.
+
+    Args:
+        env: Testbed environment with reference "hold", scalar or vector.
+        seed: Seed of the episode, of the first world's in a vector environment.
+        progress: Called with the share of the episode that is done, now and then.
+
+    Returns:
+        The static points of every world; one entry for a scalar environment.
+
+    Raises:
+        ConfigurationError: The environment's reference has no static positions.
+        ElasticError: The episode ended early.
+    """
+    task = env.unwrapped.task
+    if not hasattr(task.config.reference, "visits"):
+        raise ConfigurationError(
+            "identification needs the reference 'hold', the environment has"
+            f" {task.config.reference.kind!r}"
+        )
+    recorder = HoldRecorder(task.config.reference.visits[1], task.num_worlds)
+    encoder = task.observation_table.names.index("encoder_angle")
+    zero = np.zeros(env.action_space.shape, dtype=np.float32)
+    env.reset(seed=seed)
+    for step in range(task.num_steps):
+        observation, _, terminated, _, info = env.step(zero)
+        window = int(np.max(info["rest"]))
+        recorder.take(observation[..., encoder], info["link_angle_imu"], window)
+        if progress is not None and (step + 1) % _PROGRESS_STEPS == 0:
+            progress((step + 1) / task.num_steps)
+        if np.any(terminated):
+            break
+    return recorder.points()
+
+
+def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], q: Array) -> Array:
+    """Gravity torque at link angles q [rad], each under its point's load, (len(points),) [N·m]."""
+    torque = np.empty(len(points))
+    for load, model in enumerate(gravity):
+        rows = points.load == load
+        torque[rows] = model.gravity_torque(q[rows, None])[:, 0]
+    return torque
+
 
 HYSTERESIS_RESOLUTION_RAD = 1e-4
 """Differences between the directions of approach below this are not called hysteresis [rad]."""
@@ -72,7 +206,8 @@ class Identification(Model):
 
     def link_angles(self, points: StaticPoints) -> Array:
         """Link angles of static points in the encoder's zero, (len(points),) [rad]."""
-        return corrected_angles(points.q, self.offset_rad, self.imu_sine_error_rad or 0.0)
+        sine_error = self.imu_sine_error_rad or 0.0
+        return corrected_angles(points.q, self.offset_rad, sine_error)
 
     def save(self, path: Path) -> None:
         """Write the JSON file."""
@@ -140,9 +275,8 @@ def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: b
         scaled, _, rank, _ = np.linalg.lstsq(design / scale, deflection, rcond=_SINGULAR)
         coefficients = scaled / scale
         friction = coefficients[1] / coefficients[0]
-    return Fit(
-        coefficients, deflection - design @ coefficients, is_determined=rank == design.shape[1]
-    )
+    residuals = deflection - design @ coefficients
+    return Fit(coefficients, residuals, is_determined=rank == design.shape[1])
 
 
 def fit_link_angles(

@@ -4,7 +4,7 @@ docs/identification.md describes it.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -38,8 +38,10 @@ UNITS = {
 MOST_POSES = 10_000
 """Rows of a log."""
 
+_TABLES = ("theta", "measured", "direction", "known")
+"""Fields of a log with a row per pose."""
 _SPELT = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
-_BEYOND_RAD = 0.5  # homing errors and bent joints may exceed the range of the model by less
+_BEYOND_RAD = 0.5  # homing errors and bent joints exceed the model's range by less
 _TURNS_RAD = 4.0 * math.pi  # of joints without a range
 _ALIKE_RAD = 1e-3
 
@@ -73,13 +75,9 @@ class PoseLog:
 
     def part(self, poses: IntArray) -> "PoseLog":
         """Some of its poses."""
-        return replace(
-            self,
-            theta=self.theta[poses],
-            measured=self.measured[poses],
-            direction=None if self.direction is None else self.direction[poses],
-            known=None if self.known is None else self.known[poses],
-        )
+        tables = {name: getattr(self, name) for name in _TABLES}
+        given = {name: part[poses] for name, part in tables.items() if part is not None}
+        return replace(self, **given)
 
 
 def read_log(
@@ -96,10 +94,10 @@ def read_log(
         ConfigurationError: The log cannot be used; the message says what to change.
     """
     columns = _columns(path)
-    names = {
-        quantity: [key.split(".", 1)[1] for key in columns if key.startswith(f"{quantity}.")]
-        for quantity in UNITS
-    }
+    names: dict[str, list[str]] = {quantity: [] for quantity in UNITS}
+    for key in columns:
+        quantity, _, name = key.partition(".")
+        names[quantity].append(name)
     for quantity in ("theta", "q", "torque", "direction", "tau_known"):
         for joint in names[quantity]:
             if joint not in ranges:
@@ -115,21 +113,22 @@ def read_log(
         )
     quantity = _quantity(path, [name for name in KINDS if names[name]], kind)
     chosen = KINDS[quantity][0]
-    _require_columns(path, chosen, names[quantity], joints)
-    order = AXES.get(chosen) or tuple(joint for joint in joints if joint in names[quantity])
-    if chosen == "markers":
-        order = tuple(
-            f"{name}.{axis}" for name in _markers(path, names[quantity]) for axis in "xyz"
-        )
+    order = _order(path, chosen, names[quantity], joints)
     log = PoseLog(
         joints,
-        _table(columns, "theta", joints),
-        chosen,
-        order,
-        _table(columns, quantity, order),
-        _directions(path, columns, joints) if names["direction"] else None,
-        _optional(columns, "tau_known", joints) if names["tau_known"] else None,
+        theta=_table(columns, "theta", joints),
+        kind=chosen,
+        columns=order,
+        measured=_table(columns, quantity, order),
+        direction=_table(columns, "direction", joints) if names["direction"] else None,
+        known=_table(columns, "tau_known", joints) if names["tau_known"] else None,
     )
+    sides = np.zeros(0) if log.direction is None else log.direction.ravel()
+    if len(wrong := sides[~np.isin(sides, (-1.0, 0.0, 1.0))]):
+        raise ConfigurationError(
+            f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown),"
+            f" got {wrong[0]:g}"
+        )
     _require_radians(path, "theta", joints, log.theta, ranges)
     if chosen == "link_encoders":
         _require_radians(path, "q", order, log.measured, ranges)
@@ -224,8 +223,10 @@ def _name(path: Path, text: str) -> str:
     return f"{quantity}.{of}"
 
 
-def _table(columns: Mapping[str, Array], quantity: str, of: Iterable[str]) -> Array:
-    return np.stack([columns[f"{quantity}.{name}"] for name in of], axis=-1)
+def _table(columns: Mapping[str, Array], quantity: str, of: Sequence[str]) -> Array:
+    """A quantity of joints or axes, zero for those without a column, (N, n)."""
+    zero = np.zeros(len(next(iter(columns.values()))))
+    return np.stack([columns.get(f"{quantity}.{name}", zero) for name in of], axis=-1)
 
 
 def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
@@ -248,49 +249,31 @@ def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
     )
 
 
-def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> None:
-    """Refuse axes that are missing or unknown, and joints without a motor encoder."""
-    if kind in AXES and sorted(given) != sorted(AXES[kind]):
-        raise ConfigurationError(
-            f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
-            f" {', '.join(given)}"
-        )
-    if kind in ("link_encoders", "torques") and (
-        without := [joint for joint in given if joint not in joints]
-    ):
-        raise ConfigurationError(
-            f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column"
-        )
-
-
-def _markers(path: Path, columns: Sequence[str]) -> list[str]:
-    """Markers that have a column for each axis."""
-    names = list(dict.fromkeys(column.rpartition(".")[0] for column in columns))
-    for name in names:
-        own = sorted(column for column in columns if column.rpartition(".")[0] == name)
+def _order(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+    """Columns of a measurement in order; all axes must be there, and a motor encoder by joint."""
+    if kind in AXES:
+        if sorted(given) != sorted(AXES[kind]):
+            raise ConfigurationError(
+                f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got"
+                f" {', '.join(given)}"
+            )
+        return AXES[kind]
+    if kind != "markers":
+        if without := [joint for joint in given if joint not in joints]:
+            raise ConfigurationError(
+                f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column"
+            )
+        return tuple(joint for joint in joints if joint in given)
+    order: list[str] = []
+    for name in dict.fromkeys(column.rpartition(".")[0] for column in given):
+        own = sorted(column for column in given if column.rpartition(".")[0] == name)
         if not name or own != [f"{name}.{axis}" for axis in "xyz"]:
             raise ConfigurationError(
                 f"{path}: a marker needs the columns marker.NAME.x, .y and .z, where NAME is a site"
                 f" or body of the model; got marker.{own[0]}"
             )
-    return names
-
-
-def _optional(columns: Mapping[str, Array], quantity: str, joints: Sequence[str]) -> Array:
-    """A quantity of all joints, zero for those without a column, (N, n)."""
-    zero = np.zeros(len(columns[f"theta.{joints[0]}"]))
-    return np.stack([columns.get(f"{quantity}.{joint}", zero) for joint in joints], axis=-1)
-
-
-def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str]) -> Array:
-    """Sides of approach, zero for joints without a column."""
-    table = _optional(columns, "direction", joints)
-    if not np.isin(table, (-1.0, 0.0, 1.0)).all():
-        raise ConfigurationError(
-            f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown),"
-            f" got {table[~np.isin(table, (-1.0, 0.0, 1.0))][0]:g}"
-        )
-    return table
+        order += own
+    return tuple(order)
 
 
 def _require_radians(

@@ -148,7 +148,8 @@ class PoseModel:
         """Unknowns to begin with, (p,): a deflection under each largest torque, and zeros."""
         values = np.zeros(self.unknowns.size)
         compliance = self.unknowns.slices["compliance"]
-        values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
+        scale = self.scale[compliance]
+        values[compliance] = scale * deflection_rad / LARGEST_DEFLECTION_RAD
         return values
 
     @cached_property
@@ -217,12 +218,14 @@ class PoseModel:
         for _ in range(_FIRST_ITERATIONS):
             q = theta - compliance * self.torque(unknowns, q)
             q = np.where(np.abs(q - theta) < _FARTHEST_RAD, q, theta)
-        bend = compliance[:, None] * self.arm.torque_gradient(q, self.payload_kg(unknowns))
+        payload_kg = self.payload_kg(unknowns)
+        bend = compliance[:, None] * self.arm.torque_gradient(q, payload_kg)
         is_soft = np.abs(bend).sum(axis=-1).max(axis=-1)[:, None] >= _SOFT
         inverse = np.linalg.inv(one + np.where(is_soft[..., None], 0.0, bend))
         is_open = ~is_soft.all()
         for _ in range(_MOST_ITERATIONS if is_open else 0):
-            step = inverse @ (q - theta + compliance * self.torque(unknowns, q))[..., None]
+            missing = q - theta + compliance * self.torque(unknowns, q)
+            step = inverse @ missing[..., None]
             q = np.where(is_soft, q, q - step[..., 0])
             if not np.abs(step[~is_soft[:, 0]]).max() > _LAST_STEP_RAD:
                 is_open = False
@@ -231,7 +234,7 @@ class PoseModel:
             return q, inverse
         followed = is_soft | is_open
         q = np.where(followed, self._followed(unknowns, theta, compliance, followed), q)
-        bend = compliance[:, None] * self.arm.torque_gradient(q, self.payload_kg(unknowns))
+        bend = compliance[:, None] * self.arm.torque_gradient(q, payload_kg)
         return q, np.where(followed[..., None], np.linalg.inv(one + bend), inverse)
 
     def _followed(self, unknowns: Array, theta: Array, compliance: Array, rows: BoolArray) -> Array:
@@ -275,7 +278,8 @@ class PoseModel:
         Places are a point, the end of a unit vertical, or the joints.
         """
         if self.log.kind == "imu":
-            seen = self._seen(unknowns, self.arm.attitude(self.link_angles(unknowns)[0]))
+            q, _ = self.link_angles(unknowns)
+            seen = self._seen(unknowns, self.arm.attitude(q))
             return (vertical(self.log.measured) - seen)[:, None]
         missed = self.target - self.predict(unknowns)[0]
         return missed[:, None] if self.log.kind == "end_effector" else missed[..., None]
@@ -329,7 +333,8 @@ class PoseModel:
         across = _across(vertical(self.log.measured))
         back = self._turned(unknowns) @ at.rotation.transpose(0, 2, 1)
         seen = self._seen(unknowns, at)
-        gradient = back @ cross_matrix(np.broadcast_to(up, seen.shape)) @ at.rotation_gradient @ dq
+        turning = cross_matrix(np.broadcast_to(up, seen.shape))
+        gradient = back @ turning @ at.rotation_gradient @ dq
         if self.unknowns.rotation:
             gradient[..., own["rotation"]] = -cross_matrix(seen)
         return (across @ seen[..., None])[..., 0], across @ gradient

@@ -33,7 +33,7 @@ MOST_PLANNED = 200
 """Poses of a plan."""
 
 _MOST_DRAWS = 20  # times the candidates
-_WITHIN = 0.95  # share of the joint ranges, so that commands that lead the link stay within
+_WITHIN = 0.95  # share of the joint ranges: commands that lead the link stay within
 _UNLIMITED_RAD = np.pi  # range of joints without one
 _MOST_EXCHANGES = 10  # rounds; two or three are usual
 _LEAST_GAIN = 1e-6
@@ -73,7 +73,7 @@ def plan_poses(
         count: How many.
     """
     own = replace(model, log=candidates)
-    own.__dict__["scale"] = model.scale  # of the log, so that both informations have the same units
+    own.__dict__["scale"] = model.scale  # of the log: both informations have its units
     rows, _ = information_of(own, unknowns, spread)
     chosen = _chosen(rows, information, count, len(model.unknowns.elastic))
     direction = None if candidates.direction is None else candidates.direction[chosen]
@@ -101,7 +101,8 @@ def candidate_poses(
     Raises:
         ElasticError: Nearly all poses are in contact.
     """
-    low, high = np.where(np.isfinite(arm.ranges), arm.ranges, [-_UNLIMITED_RAD, _UNLIMITED_RAD]).T
+    unlimited = [-_UNLIMITED_RAD, _UNLIMITED_RAD]
+    low, high = np.where(np.isfinite(arm.ranges), arm.ranges, unlimited).T
     middle = 0.5 * (low + high)
     half = 0.5 * _WITHIN * (high - low)
     touches = _Contacts(shapes, arm.joints)
@@ -176,7 +177,8 @@ def _chosen(rows: Array, information: Array, count: int, sought: int) -> IntArra
     """Numbers of the poses that a greedy choice with exchanges takes."""
     chosen: list[int] = []
     for _ in range(min(count, len(rows))):
-        chosen.append(int(_best(rows, _with(information, rows[chosen]), chosen, sought)[0]))
+        best, _ = _best(rows, _with(information, rows[chosen]), chosen, sought)
+        chosen.append(best)
     for _ in range(_MOST_EXCHANGES):
         before = list(chosen)
         for place in range(len(chosen)):
@@ -184,7 +186,7 @@ def _chosen(rows: Array, information: Array, count: int, sought: int) -> IntArra
             without = _with(information, rows[others])
             best, gains = _best(rows, without, others, sought)
             if gains[best] > gains[chosen[place]] + _LEAST_GAIN:
-                chosen[place] = int(best)
+                chosen[place] = best
         if chosen == before:
             break
     return np.array(chosen, dtype=np.int64)
@@ -192,7 +194,8 @@ def _chosen(rows: Array, information: Array, count: int, sought: int) -> IntArra
 
 def _best(rows: Array, information: Array, taken: list[int], sought: int) -> tuple[int, Array]:
     """The pose that adds most to the criterion, and what each adds, (candidates,)."""
-    gains = _gain(rows, information) - _gain(rows[..., sought:], information[sought:, sought:])
+    others = _gain(rows[..., sought:], information[sought:, sought:])
+    gains = _gain(rows, information) - others
     gains[taken] = -np.inf
     return int(np.argmax(gains)), gains
 

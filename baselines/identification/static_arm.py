@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from baselines.compensation.position_compensator import PositionCompensator
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.world.robot_model import joint_ranges
 
@@ -57,12 +57,13 @@ class StaticArm:
         self.joints = tuple(joints)
         # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into
         # account
-        self._bare = PositionCompensator(model, np.inf, joints=joints)
-        self._loaded: PositionCompensator | None = None
+        self._bare = PositionCompensator(model, np.inf, joints=joints).constants.body
+        self._loaded = None
         if payload is not None:
             body, place = place_of(model, payload)
-            self._loaded = PositionCompensator(model, np.inf, joints=joints)
-            self._loaded.set_payload(1.0, place, model.body(body).name)
+            loaded = PositionCompensator(model, np.inf, joints=joints)
+            loaded.set_payload(1.0, place, model.body(body).name)
+            self._loaded = loaded.constants.body
         self._data = mujoco.MjData(model)
         if model.nkey:
             self._data.qpos[:] = model.key_qpos[0]
@@ -96,15 +97,13 @@ class StaticArm:
 
     def torque(self, q: Array) -> Array:
         """Torque that holds the arm without payload, (N, n) [rad] to (N, n) [N·m]."""
-        return _rows(self._bare, q)
+        return self._bare.gravity_torque(q)
 
     def payload_torque(self, q: Array) -> Array:
         """Torque that a payload of 1 kg adds, (N, n) [rad] to (N, n) [N·m]; 0 without one."""
-        return (
-            np.zeros(q.shape)
-            if self._loaded is None
-            else _rows(self._loaded, q) - _rows(self._bare, q)
-        )
+        if self._loaded is None:
+            return np.zeros(q.shape)
+        return self._loaded.gravity_torque(q) - self._bare.gravity_torque(q)
 
     def torque_gradient(self, q: Array, payload_kg: float = 0.0) -> Array:
         """∂τ/∂q by central differences, (N, n) [rad] to (N, n, n) [N·m/rad]."""
@@ -137,33 +136,21 @@ class StaticArm:
         return found
 
 
-def _rows(compensator: PositionCompensator, q: Array) -> Array:
-    """Torques at rest of all poses, with the bits of `PositionCompensator.torque`, (N, n) [N·m]."""
-    return compensator._links.gravity_torque(q)
-
-
-def _sites(model: mujoco.MjModel) -> list[str]:
-    return [model.site(i).name for i in range(model.nsite)]
-
-
-def _bodies(model: mujoco.MjModel) -> list[str]:
-    return [model.body(i).name for i in range(1, model.nbody)]
-
-
 def place_of(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
     """Body of a site or body, and the place of its origin in the body's frame [m]."""
-    if name in _sites(model):
+    sites = [model.site(i).name for i in range(model.nsite)]
+    bodies = [model.body(i).name for i in range(1, model.nbody)]
+    require_known("site or body", [name], [*sites, *bodies])
+    if name in sites:
         site = model.site(name)
         return int(site.bodyid[0]), site.pos.copy()
-    if name in _bodies(model):
-        return int(model.body(name).id), np.zeros(3)
-    raise unknown_name("site or body", name, [*_sites(model), *_bodies(model)])
+    return int(model.body(name).id), np.zeros(3)
 
 
 def _turn(model: mujoco.MjModel, name: str) -> Array:
     """Rotation from the frame of a site or body to the frame of its body, (3, 3)."""
     turn = np.eye(3).ravel()
-    if name in _sites(model):
+    if name in [model.site(i).name for i in range(model.nsite)]:
         mujoco.mju_quat2Mat(turn, model.site(name).quat)
     return turn.reshape(3, 3)
 

@@ -4,9 +4,8 @@
 The other modules need neither it nor torch.
 """
 
-from baselines.lerobot.arm import LeRobotArm
+from baselines.lerobot.arm import JointUnits, LeRobotArm
 from baselines.lerobot.settings import ArmSettings, JointPlace, MotorCalibration, read_calibration
-from baselines.lerobot.units import JointUnits
 
 __all__ = [
     "ArmSettings",

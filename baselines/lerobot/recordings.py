@@ -14,9 +14,8 @@ import numpy as np
 from baselines.identification.servo_file import read_episodes
 from baselines.identification.servo_log import ServoLog
 from baselines.lerobot.arm import LeRobotArm
+from baselines.lerobot.settings import read_json
 from elastic_env.core.errors import ConfigurationError, list_names, shorten
-from elastic_env.core.files import read_bounded
-from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array
 
 _MOST_BYTES = 200_000_000
@@ -101,8 +100,10 @@ def read_recordings(folder: Path, episodes: Sequence[int] = ()) -> list[Recordin
             f" {list_names(goals)}"
         )
     files = sorted((folder / "data").rglob("*.parquet"))
-    parts = (part for file in files for part in _episodes(file, motors, goals, positions, episodes))
-    found = sorted(parts, key=lambda one: one.episode)
+    found: list[Recording] = []
+    for file in files:
+        found += _episodes(file, motors, goals, positions, episodes)
+    found.sort(key=lambda one: one.episode)
     known = {one.episode for one in found}
     missing = [f"episode {episode}" for episode in episodes if episode not in known]
     if missing or not found:
@@ -129,8 +130,9 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
     at = [recording.motors.index(name) for name in arm.motors]
     goal = arm.units.angle(recording.goal[:, at])
     position = arm.units.angle(recording.position[:, at])
+    is_known = np.ones(len(recording.time), dtype=np.bool_)
     rates = [
-        ServoLog("", recording.time, *both, np.ones(len(recording.time), bool)).derivatives()
+        ServoLog("", recording.time, *both, is_known).derivatives()
         for both in zip(goal.T, position.T, strict=True)
     ]
     q_dot, q_ddot = np.moveaxis(np.array(rates), 0, -1)
@@ -163,19 +165,18 @@ def log_text(log: JointLog) -> str:
 def _info(folder: Path) -> Mapping[str, Any]:
     """Content of meta/info.json."""
     path = folder / "meta" / "info.json"
-    try:
-        content = parse_json(read_bounded(path, _MOST_BYTES).decode("utf-8"))
-    except OSError as error:
-        raise ConfigurationError(
-            f"{shorten(folder)} is no data set of LeRobot, which has meta/info.json and data/"
-            f" ({error.strerror})"
-        ) from None
-    except ConfigurationError:
-        raise
-    except ValueError as error:
-        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
-    if not isinstance(content, Mapping) or not isinstance(content.get("features"), Mapping):
-        raise ConfigurationError(f"{shorten(path)} describes no features; record the data set anew")
+    content = read_json(
+        path,
+        _MOST_BYTES,
+        lambda why: (
+            f"{shorten(folder)} is no data set of LeRobot, which has meta/info.json and"
+            f" data/ ({why})"
+        ),
+    )
+    features = content.get("features") if isinstance(content, Mapping) else None
+    if not isinstance(features, Mapping):
+        problem = f"{shorten(path)} describes no features; record the data set anew"
+        raise ConfigurationError(problem)
     return content
 
 

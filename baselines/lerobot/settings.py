@@ -2,10 +2,11 @@
 
 import csv
 import math
+from collections.abc import Callable
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
@@ -131,23 +132,20 @@ class ArmSettings(Model):
 @cache
 def _known_motors() -> dict[str, tuple[Motor, ...]]:
     """Motors of the robots of motors.csv, by the robot's type."""
-    text = resources.files("baselines.lerobot").joinpath("motors.csv").read_text(encoding="utf-8")
-    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    file = resources.files("baselines.lerobot") / "motors.csv"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     found: dict[str, tuple[Motor, ...]] = {}
     for row in rows:
         counts = row["counts_per_turn"]
         motor = Motor(
             name=row["motor"],
-            units=_units(row["units"]),
+            units=row["units"],  # pyright: ignore[reportArgumentType]  checked by the model
             counts_per_turn=int(counts) if counts else None,
             joint=row["joint"] or None,
         )
         found[row["robot"]] = (*found.get(row["robot"], ()), motor)
     return found
-
-
-def _units(name: str) -> Units:
-    return next(units for units in get_args(Units) if units == name)
 
 
 def robot_types() -> list[str]:
@@ -180,6 +178,27 @@ def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     )
 
 
+def read_json(path: Path, most_bytes: int, missing: Callable[[str], str]) -> Any:
+    """Content of a JSON file.
+
+    Args:
+        path: The file.
+        most_bytes: Largest size.
+        missing: What to say where it cannot be read, for a reason.
+
+    Raises:
+        ConfigurationError: It cannot be read, or is not JSON.
+    """
+    try:
+        return parse_json(read_bounded(path, most_bytes).decode("utf-8"))
+    except ConfigurationError:
+        raise
+    except OSError as error:
+        raise ConfigurationError(missing(str(error.strerror))) from None
+    except ValueError as error:
+        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+
+
 class _Calibration(Model):
     """Motors by their names."""
 
@@ -192,17 +211,14 @@ def read_calibration(path: Path) -> dict[str, MotorCalibration]:
     Raises:
         ConfigurationError: It cannot be read, or is no calibration.
     """
-    try:
-        content = parse_json(read_bounded(path, _MOST_BYTES).decode("utf-8"))
-    except OSError as error:
-        raise ConfigurationError(
-            f"no calibration at {shorten(path)} ({error.strerror}); LeRobot writes it to"
+    content = read_json(
+        path,
+        _MOST_BYTES,
+        lambda why: (
+            f"no calibration at {shorten(path)} ({why}); LeRobot writes it to"
             " calibration/robots/TYPE/ID.json in its folder of the cache"
-        ) from None
-    except ConfigurationError:
-        raise
-    except ValueError as error:
-        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+        ),
+    )
     try:
         return _Calibration(motors=content).motors
     except ModelError as error:

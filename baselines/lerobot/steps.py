@@ -29,8 +29,23 @@ from baselines.lerobot.settings import ArmSettings
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
+class _ArmStep:
+    """Settings and arm of a step."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.arm = LeRobotArm(ArmSettings(**settings))
+
+    def get_config(self) -> dict[str, Any]:
+        """Settings as JSON, with the content of files in the place of their names."""
+        return self.arm.settings.model_dump(mode="json")
+
+    def transform_features(self, features: Features) -> Features:
+        """The same features."""
+        return features
+
+
 @ProcessorStepRegistry.register("elastic_env_compensate_action")
-class CompensateActionStep(RobotActionProcessorStep):
+class CompensateActionStep(_ArmStep, RobotActionProcessorStep):
     """Leads the positions of an action by what springs and servos give way.
 
     Args:
@@ -43,44 +58,22 @@ class CompensateActionStep(RobotActionProcessorStep):
         ConfigurationError: A setting cannot be used.
     """
 
-    def __init__(self, **settings: Any) -> None:
-        self.arm = LeRobotArm(ArmSettings(**settings))
-
     def action(self, action: RobotAction) -> RobotAction:
         """Action with compensated positions."""
         return self.arm.command(action)
-
-    def get_config(self) -> dict[str, Any]:
-        """Settings as JSON, with the content of files in the place of their names."""
-        return self.arm.settings.model_dump(mode="json")
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero."""
         self.arm.reset()
 
-    def transform_features(self, features: Features) -> Features:
-        """The same features."""
-        return features
-
 
 @ProcessorStepRegistry.register("elastic_env_correct_observation")
-class CorrectObservationStep(ObservationProcessorStep):
+class CorrectObservationStep(_ArmStep, ObservationProcessorStep):
     """Puts the angles of the links in the place of those that encoders show.
 
     Arguments, attributes and errors are as of `CompensateActionStep`.
     """
 
-    def __init__(self, **settings: Any) -> None:
-        self.arm = LeRobotArm(ArmSettings(**settings))
-
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Observation with positions of the links."""
         return self.arm.link_angles(observation)
-
-    def get_config(self) -> dict[str, Any]:
-        """Settings as JSON, with the content of files in the place of their names."""
-        return self.arm.settings.model_dump(mode="json")
-
-    def transform_features(self, features: Features) -> Features:
-        """The same features."""
-        return features

@@ -18,23 +18,24 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.policy import BatchPolicy, put_rows, select_rows
+from baselines.compensation.policy import put_rows, select_rows
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
-from baselines.residual.true_robot import TrueRobot
-from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from baselines.residual.true_robot import true_robot
+from baselines.walking.foothold import OF_FEET
+from baselines.walking.mean_zmp import IN_PLANE, LEAST_LOAD, FlatFeet
 from baselines.walking.phase_table import harmonics, stride_angle
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import (
     Array,
     BoolArray,
-    Mirrored,
     Signal,
     SignalGroup,
     rename_group,
@@ -81,8 +82,9 @@ class Features:
         names = _source_names(settings.observe, model)
         self._sources = [_source(name, corrected, period_s) for name in names]
         if settings.privileged:
-            self._sources.append(TrueRobot(settings.privileged, model, corrected.truth))
-        self._reads_base = any(isinstance(source, _Estimate) for source in self._sources)
+            signals, see = true_robot(settings.privileged, model, corrected.truth)
+            self._sources.append(_Instant(signals, lambda rows: see()))  # noqa: ARG005
+        self._of_base = [getattr(source, "reads_base", False) for source in self._sources]
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
         self._measured = np.flatnonzero([signal.kind == "measured" for signal in seen])
@@ -131,10 +133,10 @@ class Features:
         else:
             kept = put_rows(memory, fresh, select_rows(kept, fresh))
         memories = kept.sources
-        if self._reads_base:
+        if any(self._of_base):
             base = self._corrected.base_memory(rows, state, episode_start)
-            pairs = zip(self._sources, memories, strict=True)
-            memories = [base if isinstance(one, _Estimate) else own for one, own in pairs]
+            pairs = zip(self._of_base, memories, strict=True)
+            memories = [base if is_of_base else own for is_of_base, own in pairs]
         pairs = zip(self._sources, memories, strict=True)
         observed = [source.observe(rows, own) for source, own in pairs]
         values = [values for values, _ in observed]
@@ -193,7 +195,8 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
     """
     model = corrected.model
     if name in corrected.base.estimates:
-        return _Estimate(corrected.base, name)
+        base = corrected.base
+        return _Instant(base.estimates[name], partial(base.estimate, name), reads_base=True)
     table = model.observation_table
     groups = _groups(model)
     if name in groups or name in table.names:
@@ -205,65 +208,44 @@ def _source(name: str, corrected: Corrected, period_s: float) -> Any:
         signals = rename_group(table.signals_of("encoder_angle"), name)
         return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
     if isinstance(model, WalkerModel):
-        if name == "bending":
-            return BendingObserver(model)
-        if name == "phase":
-            return _phase(model)
-        if name == "zmp_error":
-            return _zmp_error(model)
-        if name == "zmp_of_steps":
-            return _ZmpOfSteps(model)
-        timed = {"contact_error": _ContactError, "level": GroundLevel}
-        if name in timed:
-            return timed[name](model, period_s)
-        further += [
-            *timed,
-            "bending",
-            "phase",
-            "zmp_error",
-            "zmp_of_steps",
-            *corrected.base.estimates,
-        ]
+        made: dict[str, Callable[[], Any]] = {
+            "contact_error": lambda: _ContactError(model, period_s),
+            "level": lambda: GroundLevel(model, period_s),
+            "bending": lambda: BendingObserver(model),
+            "phase": lambda: _phase(model),
+            "zmp_error": lambda: _zmp_error(model),
+            "zmp_of_steps": lambda: _ZmpOfSteps(model),
+        }
+        if name in made:
+            return made[name]()
+        further += [*made, *corrected.base.estimates]
     known = [OBSERVATION, BASE_ACTION, *further, *groups]
     raise unknown_name("feature of a residual", name, known)
 
 
 class _Instant:
-    """A source that remembers nothing."""
+    """A source that remembers nothing: values of observations, or of the base's memory too."""
 
-    def __init__(self, signals: Any, function: Callable[..., Array]) -> None:
+    def __init__(
+        self, signals: Any, function: Callable[..., Array], reads_base: bool = False
+    ) -> None:
         self.signals = signals
+        self.reads_base = reads_base
         self._function = function
 
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 0))
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        return self._function(rows), memory
-
-
-class _Estimate:
-    """A source that the base has in its memory, see `BatchPolicy.estimate`."""
-
-    def __init__(self, base: BatchPolicy, name: str) -> None:
-        self.signals = base.estimates[name]
-        self._base = base
-        self._name = name
-
-    def begin(self, num_worlds: int) -> Array:
-        return np.zeros((num_worlds, 0))
-
     def observe(self, rows: Array, memory: Any) -> tuple[Array, Array]:
-        """Values from the memory of the base; nothing is kept beside it."""
-        return self._base.estimate(self._name, rows, memory), self.begin(len(rows))
+        values = self._function(rows, memory) if self.reads_base else self._function(rows)
+        return values, self.begin(len(rows))
 
 
 def _zmp_error(model: WalkerModel) -> _Instant:
     """ZMP of flat feet less the planned one; zero where the feet carry too little."""
     feet = FlatFeet(model, LEAST_LOAD * model.biped.weight)
-    mirrored: dict[str, Mirrored | None] = {"x": "same", "y": "opposite"}
     meaning = "{part} of the ZMP of flat feet less the planned one"
-    signals = SignalGroup.of("zmp_error", "m", meaning, mirrored, None).signals
+    signals = SignalGroup.of("zmp_error", "m", meaning, IN_PLANE, None).signals
     return _Instant(signals, lambda rows: np.nan_to_num(feet.zmp_error(rows), nan=0.0))
 
 
@@ -290,18 +272,12 @@ class _ZmpOfSteps:
     """
 
     def __init__(self, model: WalkerModel) -> None:
-        of_feet: dict[str, Mirrored | None] = {
-            "l_x": "same",
-            "l_y": "opposite",
-            "r_x": "same",
-            "r_y": "opposite",
-        }
         meaning = "mean ZMP error {part} in the last step on a foot"
-        self.signals = SignalGroup.of("zmp_of_steps", "m", meaning, of_feet, None).signals
+        self.signals = SignalGroup.of("zmp_of_steps", "m", meaning, OF_FEET, None).signals
         self._error = _zmp_error(model)
-        self._time, self._support = (
-            model.observation_table.columns(f"clock.{name}") for name in ("time", "support")
-        )
+        clock = model.observation_table.group("clock")
+        self._time = clock.start
+        self._support = clock.stop - 1
 
     def begin(self, num_worlds: int) -> _StepMemory:
         total = np.zeros((num_worlds, 2))
@@ -310,13 +286,13 @@ class _ZmpOfSteps:
 
     def observe(self, rows: Array, memory: _StepMemory) -> tuple[Array, _StepMemory]:
         error, _ = self._error.observe(rows, memory.total)
-        support = rows[:, self._support][:, 0]
+        support = rows[:, self._support]
         is_new = support != memory.support
         mean = memory.total / np.maximum(memory.number, 1.0)[:, None]
         feet = np.arange(2) == memory.support[:, None]
         ended = (is_new[:, None] & feet)[:, :, None]
         means = np.where(ended, mean[:, None], memory.means)
-        walks = rows[:, self._time][:, 0] > STAND_S
+        walks = rows[:, self._time] > STAND_S
         total = np.where(is_new[:, None], 0.0, memory.total) + walks[:, None] * error
         number = np.where(is_new, 0.0, memory.number) + walks
         return means.reshape(len(rows), 4), _StepMemory(total, number, support, means)
@@ -328,9 +304,9 @@ def _phase(model: WalkerModel) -> _Instant:
     psi = stride_angle(plan.timing, plan.gait.step_period_s)
     table = harmonics(psi, _PHASE_HARMONICS, is_odd=False)
     time = model.observation_table.columns("clock.time")
-    parts = [f"{kind}_{k + 1}" for k in range(_PHASE_HARMONICS) for kind in ("cosine", "sine")]
-    mirrored: dict[str, Mirrored | None] = dict.fromkeys(parts, "same")
-    signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", mirrored, None).signals
+    orders = range(1, _PHASE_HARMONICS + 1)
+    parts: Any = {f"{kind}_{k}": "same" for k in orders for kind in ("cosine", "sine")}
+    signals = SignalGroup.of("phase", "1", "{part} of the phase of a step", parts, None).signals
 
     def observe(rows: Array) -> Array:
         row = np.rint(rows[:, time][:, 0] / model.control_period_s).astype(np.int64)

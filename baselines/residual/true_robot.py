@@ -5,7 +5,7 @@ bounds what estimates of it can bring. A critic that knows the robot takes no ot
 the actor's merit: an IMU that is mounted askew costs the same whatever the actor does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,8 +39,10 @@ def truth_of(env: Any) -> Truth | None:
     return lambda: [one.truth() for one in envs]
 
 
-class TrueRobot:
-    """A source of features that are the truth, see `baselines.residual.features`.
+def true_robot(
+    names: Sequence[str], model: RobotModel, truth: Truth | None
+) -> tuple[tuple[Signal, ...], Callable[[], Array]]:
+    """The truth as signals, and what shows it of all worlds, (num_worlds, columns).
 
     Args:
         names: Of `baselines.residual.settings.TRUE_QUANTITIES`.
@@ -50,45 +52,36 @@ class TrueRobot:
     Raises:
         ConfigurationError: There is no truth to see, or the robot is no walker.
     """
+    if truth is None or not isinstance(model, WalkerModel):
+        raise ConfigurationError(
+            f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
+            " knows: it is no residual for a robot; train one with privileged: [], and"
+            " critic_sees: [] where there is no such truth"
+        )
+    signals: list[Signal] = []
+    for name in names:
+        joints: dict[str, Mirrored] = dict.fromkeys(model.joint_names, "same")
+        unit, parts = _PARTS.get(name) or (_UNIT_OF_JOINTS[name], joints)
+        signals += [
+            Signal(f"true_{name}.{part}", unit, f"true {name}, {part}", mirrored=mirrored)
+            for part, mirrored in parts.items()
+        ]
 
-    def __init__(self, names: Sequence[str], model: RobotModel, truth: Truth | None) -> None:
-        if truth is None or not isinstance(model, WalkerModel):
-            raise ConfigurationError(
-                f"a teacher sees the true {', '.join(names)}, which only the simulation of a walker"
-                " knows: it is no residual for a robot; train one with privileged: [], and"
-                " critic_sees: [] where there is no such truth"
-            )
-        self._names = names
-        self._truth = truth
-        self._stiffness = model.stiffness
-        signals: list[Signal] = []
-        for name in names:
-            joints: dict[str, Mirrored] = dict.fromkeys(model.joint_names, "same")
-            unit, parts = _PARTS.get(name) or (_UNIT_OF_JOINTS[name], joints)
-            signals += [
-                Signal(f"true_{name}.{part}", unit, f"true {name}, {part}", mirrored=mirrored)
-                for part, mirrored in parts.items()
-            ]
-        self.signals = tuple(signals)
-
-    def begin(self, num_worlds: int) -> Array:
-        """It has no memory."""
-        return np.zeros((num_worlds, 0))
-
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        """The truth of all worlds, (num_worlds, columns)."""
+    def see() -> Array:
         parts = []
-        for truth in self._truth():
+        for own in truth():
             values = {
-                "stiffness": truth.stiffness / self._stiffness - 1.0,
-                "backlash": truth.backlash,
-                "load": truth.load,
-                "slope": truth.slope,
-                "friction": truth.friction[:, None],
-                "mounting": truth.mounting,
+                "stiffness": own.stiffness / model.stiffness - 1.0,
+                "backlash": own.backlash,
+                "load": own.load,
+                "slope": own.slope,
+                "friction": own.friction[:, None],
+                "mounting": own.mounting,
             }
-            parts.append(np.hstack([values[name] for name in self._names]))
-        return np.concatenate(parts), memory
+            parts.append(np.hstack([values[name] for name in names]))
+        return np.concatenate(parts)
+
+    return tuple(signals), see
 
 
 class CriticView:
@@ -104,14 +97,14 @@ class CriticView:
 
     def __init__(self, names: Sequence[str], corrected: Corrected) -> None:
         model = corrected.model
-        self._source = TrueRobot(names, model, corrected.truth)
-        self._mirror = Mirror(self._source.signals) if corrected.settings.mirror else None
+        signals, self._see = true_robot(names, model, corrected.truth)
+        self._mirror = Mirror(signals) if corrected.settings.mirror else None
         self._support = model.observation_table.columns("clock.support")
-        self.width = len(self._source.signals)
+        self.width = len(signals)
 
     def at(self, rows: Array) -> Array:
         """Truth at a decision, (num_worlds, width), for observations, (num_worlds, m)."""
-        values, _ = self._source.observe(rows, self._source.begin(len(rows)))
+        values = self._see()
         if self._mirror is None:
             return values
         return np.where(rows[:, self._support] == 1.0, self._mirror(values), values)

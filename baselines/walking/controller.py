@@ -30,7 +30,11 @@ from typing import Any
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.contact_torque import planned_feet, shifted_shares
+from baselines.compensation.contact_torque import (
+    cosine_and_sine,
+    planned_feet,
+    shifted_shares,
+)
 from baselines.compensation.policy import (
     NO_INPUTS,
     ONE_WORLD,
@@ -39,6 +43,9 @@ from baselines.compensation.policy import (
     Records,
     Step,
     WalkView,
+    filter_share,
+    record_row,
+    record_rows,
 )
 from baselines.walking.zmp_shift import (
     Stances,
@@ -102,34 +109,6 @@ def _sole(biped: Biped) -> Array:
 
 
 _GAINS = [name for name in WalkingGains.model_fields if not name.endswith("filter_s")]
-CONTROLLER = record_type(
-    period_s=(),
-    is_com_fed_back=bool,
-    thigh=(),  # [m]
-    shank=(),  # [m]
-    weight=(),  # of the robot [N]
-    weight_of_feet=(),  # below the sensors [N]
-    omega=(),  # of the pendulum [rad/s]
-    following_share=(),  # of its way in a period [1]
-    per_pelvis=(2,),  # motion of the center of mass per motion of the pelvis [1]
-    ankle_stiffness=(2, 2),  # pitch and roll of the legs [N·m/rad]
-    friction_deflection=(2, 6),  # [rad]
-    velocity_share=(),  # of a step in a period [1]
-    zmp_share=(),  # likewise
-    weight_share=(),  # likewise
-    **dict.fromkeys(_GAINS, ()),
-)
-"""Assumptions of the controller, and its gains."""
-
-PLAN = record_type(
-    share=(),  # load share of the right foot [1]
-    com=(2,),  # center of mass [m]
-    com_dot=(2,),  # against the feet that stand [m/s]
-    soles=(2, 2),  # middles of the soles [m]
-    foot_yaw=(2, 2),  # cosine and sine of the headings of the feet [1]
-)
-"""The plan in its local frame, one row per control step."""
-
 MEMORY = record_type(
     steps=(),
     difference=(),  # of the leg lengths [m]
@@ -157,9 +136,9 @@ class WalkingController(BatchPolicy):
     """Commands a walker around its plan, see the module; its memory is rows of `MEMORY`.
 
     Attributes:
-        constants: Row of `CONTROLLER`, (1,).
+        constants: Assumptions of the controller, and its gains, a row, (1,).
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
-        plan: Rows of `PLAN`, one per control step.
+        plan: The plan in its local frame, one row per control step.
 
     Args:
         model: Assumed walker.
@@ -190,13 +169,13 @@ class WalkingController(BatchPolicy):
         self.constants = _constants(model, com_feedback, gains or WalkingGains())
         plan = model.plan
         local = plan.local
-        self.plan: Any = np.zeros(plan.num_steps + 1, PLAN)
-        self.plan["share"] = plan.share
-        self.plan["com"] = local.com
-        self.plan["com_dot"] = local.com_dot
-        self.plan["soles"] = local.ankles[..., :2]
-        turned = (np.cos(local.foot_yaw), np.sin(local.foot_yaw))
-        self.plan["foot_yaw"] = np.stack(turned, axis=-1)
+        self.plan = record_rows(
+            share=plan.share,  # load share of the right foot [1]
+            com=local.com,  # center of mass [m]
+            com_dot=local.com_dot,  # against the feet that stand [m/s]
+            soles=local.ankles[..., :2],  # their middles [m]
+            foot_yaw=cosine_and_sine(local.foot_yaw),
+        )
         self._feet = planned_feet(plan)
         self._period_s = model.control_period_s
         self._stances = Stances.of(model)
@@ -215,6 +194,11 @@ class WalkingController(BatchPolicy):
         theta = rows[:, self._theta]
         attitude = rows[:, self._attitude]
         com, soles = self._biped.chains.com_and_feet(theta, self._sole, attitude)
+        shares = _NO_SHARES
+        if (shift := inputs.zmp_shift) is not None:
+            shares = np.empty(len(rows))
+            shift = np.ascontiguousarray(shift)
+            shifted_shares(observed, shift, self._feet, self._period_s, shares)
         action = np.empty((len(rows), 12))
         now = np.empty(len(rows), MEMORY)
         coming = np.empty(len(rows), dtype=np.int64)
@@ -226,7 +210,7 @@ class WalkingController(BatchPolicy):
             observed=observed,
             com=com,
             soles=soles,
-            shares=self._shares(observed, inputs.zmp_shift),
+            shares=shares,
             inputs=_dense(inputs, len(rows)),
             before=memory,
             now=now,
@@ -238,47 +222,33 @@ class WalkingController(BatchPolicy):
             move_pelvis(*self._stances, coming, pelvis, action)
         return action.astype(np.float32), now
 
-    def _shares(self, observed: Records, shift: Array | None) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1].
-
-        (0,) for those of the plan.
-        """
-        if shift is None:
-            return _NO_SHARES
-        shares = np.empty(len(observed))
-        shift = np.ascontiguousarray(shift)
-        shifted_shares(observed, shift, self._feet, self._period_s, shares)
-        return shares
-
 
 _NO_SHARES: Array = np.empty(0)
+"""Load shares of a plan that nothing shifts."""
 
 
 def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> Any:
-    """Row of `CONTROLLER` for the kernel, (1,)."""
+    """Assumptions and gains for the kernel, a row, (1,)."""
     biped = model.biped
     stiffness = model.stiffness.reshape(2, 6)
     period_s = model.control_period_s
-    constants: Any = np.zeros(1, CONTROLLER)
-    for name in _GAINS:
-        constants[name] = getattr(gains, name)
-    constants["period_s"] = period_s
-    constants["is_com_fed_back"] = com_feedback
-    constants["thigh"] = biped.leg.thigh
-    constants["shank"] = biped.leg.shank
-    constants["weight"] = biped.weight
-    above_feet = biped.chains_above_feet.mass * biped.gravity
-    constants["weight_of_feet"] = biped.weight - above_feet
-    constants["omega"] = model.plan.omega
-    constants["following_share"] = following_share(model.plan.omega, period_s)
-    constants["per_pelvis"] = center_of_mass_per_pelvis(model)
-    constants["ankle_stiffness"] = stiffness[:, 4:]
-    constants["friction_deflection"] = model.coulomb_friction.reshape(2, 6) / stiffness
-    for name in ("velocity", "zmp", "weight"):
-        filter_s = getattr(gains, f"{name}_filter_s")
-        share = 0.0 if filter_s is None else 1.0 - float(np.exp(-period_s / filter_s))
-        constants[f"{name}_share"] = share
-    return constants
+    return record_row(
+        period_s=period_s,
+        is_com_fed_back=com_feedback,
+        thigh=biped.leg.thigh,  # [m]
+        shank=biped.leg.shank,  # [m]
+        weight=biped.weight,  # of the robot [N]
+        weight_of_feet=biped.weight - biped.chains_above_feet.mass * biped.gravity,  # [N]
+        omega=model.plan.omega,  # of the pendulum [rad/s]
+        following_share=following_share(model.plan.omega, period_s),
+        per_pelvis=center_of_mass_per_pelvis(model),
+        ankle_stiffness=stiffness[:, 4:],  # pitch and roll of the legs [N·m/rad]
+        friction_deflection=model.coulomb_friction.reshape(2, 6) / stiffness,  # [rad]
+        velocity_share=filter_share(period_s, gains.velocity_filter_s),
+        zmp_share=filter_share(period_s, gains.zmp_filter_s),
+        weight_share=filter_share(period_s, gains.weight_filter_s or np.inf),
+        **{name: getattr(gains, name) for name in _GAINS},
+    )
 
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
@@ -312,8 +282,8 @@ def control(
     """Offsets of the joints, and the memory after a control step; whether the pelvis is shifted.
 
     Args:
-        controller: Row of `CONTROLLER`, (1,).
-        plan: Rows of `PLAN`, one per control step.
+        controller: Assumptions and gains, a row, (1,).
+        plan: The plan in its local frame, one row per control step.
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
         observed: Observations, rows with fields, (n,).
         com: Center of mass in a level frame, (n, 3) [m].

@@ -29,8 +29,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
-from baselines.walking.flat_feet import LEAST_LOAD, FlatFeet
+from baselines.compensation.policy import (
+    PolicyAround,
+    PolicyInputs,
+    Records,
+    Step,
+    WalkView,
+    filter_share,
+    record_row,
+    record_rows,
+)
+from baselines.walking.mean_zmp import LEAST_LOAD, FlatFeet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -48,18 +57,6 @@ class DcmObserverGains(Model):
     limit_m: float = quantity("m", 0.03, gt=0, lt=0.05)
     """Largest disturbance that is met, forward and sideways [m]."""
 
-
-OBSERVER = record_type(
-    period_s=(),
-    omega=(),  # of the pendulum [rad/s]
-    smooth_share=(),  # of a step in a period [1]
-    follow_share=(),  # likewise
-    limit_m=(),
-)
-"""Assumptions of the observer, and its gains."""
-
-PLANNED = record_type(com=(2,), soles=(2, 2))
-"""Center of mass and soles in the plan's local frame, one row per control step [m]."""
 
 OBSERVED = record_type(
     steps=(),
@@ -99,16 +96,15 @@ class DcmObserver(PolicyAround):
         self._chains = model.biped.chains
         self._sole = np.array([0.0, 0.0, -model.biped.ankle_height])
         period_s = model.control_period_s
-        self._constants: Any = np.zeros(1, OBSERVER)
-        self._constants["period_s"] = period_s
-        self._constants["omega"] = model.plan.omega
-        self._constants["smooth_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
-        self._constants["follow_share"] = 1.0 - float(np.exp(-period_s / gains.time_constant_s))
-        self._constants["limit_m"] = gains.limit_m
+        self._constants = record_row(
+            period_s=period_s,
+            omega=model.plan.omega,  # of the pendulum [rad/s]
+            smooth_share=filter_share(period_s, gains.filter_s),
+            follow_share=filter_share(period_s, gains.time_constant_s),
+            limit_m=gains.limit_m,
+        )
         local = model.plan.local
-        self._plan: Any = np.zeros(len(local.com), PLANNED)
-        self._plan["com"] = local.com
-        self._plan["soles"] = local.ankles[..., :2]
+        self._plan = record_rows(com=local.com, soles=local.ankles[..., :2])
         steps = max(round(ramp_s / period_s), 1)
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
 
@@ -136,7 +132,7 @@ def meet_disturbance(constants: Any, ramp: Array, memory: Any, shift: Array) -> 
     """Shift of the planned ZMP against the disturbance.
 
     Args:
-        constants: Row of `OBSERVER`, (1,).
+        constants: Assumptions and gains, a row, (1,).
         ramp: Share of it after 0, 1, ... control steps, up to the last one [1].
         memory: Rows of `OBSERVED`, (n,).
         shift: To be filled, (n, 2) [m].
@@ -162,9 +158,9 @@ def observe(
     """Bring the estimate of the disturbance up to date.
 
     Args:
-        constants: Row of `OBSERVER`, (1,).
+        constants: Assumptions and gains, a row, (1,).
         observed: Observations, rows with fields, (n,).
-        plan: Rows of `PLANNED`.
+        plan: Center of mass and soles in the plan's local frame [m], one row per control step.
         com: Center of mass in a level frame, (n, 3) [m].
         soles: Middles of the soles in the same, (n, 2, 3) [m].
         zmp_error: Measured ZMP less the planned one and the shift, (n, 2) [m].

@@ -1,4 +1,28 @@
-r"""Foothold correction: feet land where the plan has them, by the forces that closed legs carry.
+r"""Feet that land as planned: a refined plan, tared foot sensors, corrected footholds.
+
+**Refined walk**: the policy walks a plan of its own, whose ZMP is nearer to the reference.
+
+The plan that the environment shows puts the center of mass of a cart-table under the reference p of
+the ZMP. Legs that swing move the ZMP of the whole robot off it, which inverse dynamics tells. That
+error passes the preview control once more [Kajita2003], and gives a plan with other joint angles
+(`elastic_env.motion.walk_plan.refine_plan`),
+
+.. math:: q_{ref}' = q_{ref} + \Delta q
+
+The policy inside knows the refined plan alone: it sees q_ref' and its derivatives where the
+observation has q_ref, and the action is Δq + a, with its own action a.
+
+[Kajita2003] S. Kajita et al., "Biped Walking Pattern Generation by using Preview Control of
+Zero-Moment Point", ICRA.
+
+**Foot tare**: foot sensors are set to zero in every swing, as a foot in the air weighs only itself.
+
+Six-axis sensors of feet drift by some newtons while a robot walks. Practice zeroes them where the
+load is known: with the foot in the air, the sensor at the ankle carries the foot alone, f = m (g −
+a) with the planned acceleration a, and its moment c × f about the ankle. The mean of what it shows
+beyond that, over the middle of a swing, is taken off until the next swing of the same foot.
+
+**Foothold correction**: feet land where the plan has them, by the forces that closed legs carry.
 
 A robot on elastic joints puts its foot down beside its foothold: the joints of the standing leg
 give way under the load. Encoders and IMU do not show by how much. Once both feet stand, the legs
@@ -20,18 +44,180 @@ which this foot landed before. While the foot takes over the load, its offset go
 """
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from typing_extensions import override
 
-from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, Step, WalkView
+from baselines.compensation.policy import (
+    PassingMemory,
+    PolicyAround,
+    PolicyInputs,
+    Records,
+    Step,
+    WalkView,
+    record_row,
+    record_rows,
+)
 from baselines.walking.zmp_shift import Stances, move_feet
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray, Mirrored, SignalGroup
+from elastic_env.motion.walk_plan import derivatives, refine_plan
 from elastic_env.rigid.leg_kinematics import turn
+from elastic_env.world.foot_sensors import FootSensors
 from elastic_env.world.robot_model import WalkerModel
+
+
+def refined(model: WalkerModel) -> WalkerModel:
+    """The assumed walker with its plan refined.
+
+    Raises:
+        ElasticError: A foot is out of reach on the refined plan.
+    """
+    plan = refine_plan(model.plan, model.biped, model.control_period_s)
+    return replace(model, plan=plan)
+
+
+class RefinedWalk(PassingMemory):
+    """A policy for the refined plan of a walker, on the plan that the environment shows.
+
+    Args:
+        policy: What commands the robot along the refined plan.
+        model: Assumed walker, with the plan of the environment.
+        further: The same with the plan that the policy knows.
+    """
+
+    def __init__(self, policy: Any, model: WalkerModel, further: WalkerModel) -> None:
+        super().__init__(policy, model)
+        table = model.observation_table
+        # angles, rates and accelerations stand side by side
+        first = table.group("reference_angle").start
+        self._columns = slice(first, table.group("reference_acceleration").stop)
+        motions = [np.hstack([p.q, p.q_dot, p.q_ddot]) for p in (model.plan, further.plan)]
+        self._change = motions[1] - motions[0]
+
+    @override
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> Step:
+        """Its memory is that of the policy inside."""
+        row = self.view.plan_row(rows)
+        change = self._change.take(row, axis=0, mode="clip")
+        seen = rows.copy()
+        seen[:, self._columns] += change
+        action, memory = self.policy.act(seen, memory, inputs)
+        total = action + change[:, : self.view.num_joints]
+        return total.astype(np.float32), memory
+
+
+class FootTareGains(Model):
+    """When and how far the foot sensors are set to zero."""
+
+    begin: float = quantity("1", 0.3, gt=0, lt=0.5)
+    """Progress of the swing at which the mean begins; it ends as long before landing [1]."""
+    first_gain: float = quantity("1", 1.0, ge=0, le=1)
+    """Share of the first mean that is taken off [1]."""
+    gain: float = quantity("1", 0.5, ge=0, le=1)
+    """Share of what is left in every further swing [1]."""
+
+
+TARE = record_type(
+    bias=(2, 2, 3),  # feet, force and moment, axes [N], [N·m]
+    total=(2, 3),  # of the samples of this swing
+    samples=(),
+    swings=(2,),  # of both feet so far
+)
+"""Memory of the tare."""
+
+
+class FootTareMemory(NamedTuple):
+    """Memory of a policy with tared feet: rows of `TARE`, and that of the policy."""
+
+    tare: Records
+    inner: Any
+
+
+class FootTare(PolicyAround):
+    """A policy of a walker that sees its foot sensors set to zero, see the module.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed walker.
+        gains: When and how far.
+    """
+
+    def __init__(self, policy: Any, model: WalkerModel, gains: FootTareGains) -> None:
+        super().__init__(policy, model)
+        self._walk_view = WalkView(model.observation_table)
+        self._gains = record_row(period_s=model.control_period_s, **gains.model_dump())
+        self._unloaded = unloaded_wrench(model)
+
+    @override
+    def begin(self, rows: Array) -> FootTareMemory:
+        return FootTareMemory(np.zeros(len(rows), TARE), self.policy.begin(rows))
+
+    @override
+    def act(self, rows: Array, memory: FootTareMemory, inputs: PolicyInputs) -> Step:
+        rows = rows.copy()
+        tare = memory.tare.copy()
+        observed = self._walk_view.fields(rows)
+        tare_feet(self._gains, self._unloaded, observed, tare)
+        action, inner = self.policy.act(rows, memory.inner, inputs)
+        return action, FootTareMemory(tare, inner)
+
+
+def unloaded_wrench(model: WalkerModel) -> Array:
+    """Force and moment that feet in the air leave at level ankles by plan, (T, 2, 2, 3).
+
+    Feet, force [N] and moment [N·m], axes in the frames of the feet.
+    """
+    biped = model.biped
+    sensors = FootSensors.of_biped(biped)
+    _, acceleration = derivatives(model.plan.ankles, model.control_period_s)
+    mass = biped.rigid.body_mass[biped.feet]
+    in_feet = turn(acceleration, -model.plan.foot_yaw)
+    force = sensors.weight - mass[:, None] * in_feet
+    return np.stack([force, np.cross(sensors.com, force)], axis=2)
+
+
+@compiled
+def tare_feet(gains: Any, unloaded: Array, observed: Any, memory: Any) -> None:
+    """Take the bias off the wrenches of observations, in place, and keep the memory.
+
+    Args:
+        gains: Gains and the control period, a row, (1,).
+        unloaded: As of `unloaded_wrench`.
+        observed: Observations, rows with fields, (n,).
+        memory: Rows of `TARE`, brought up to date, (n,).
+    """
+    rules = gains[0]
+    for world in range(len(memory)):
+        shown = observed[world]
+        own = memory[world]
+        foot = 1 - int(shown.clock[2])
+        progress = shown.clock[1]
+        if rules.begin < progress < 1.0 - rules.begin:
+            # measured at the end of the last period
+            row = int(np.rint(shown.clock[0] / rules.period_s)) - 1
+            expected = unloaded[min(max(row, 0), len(unloaded) - 1), foot]
+            for part in range(2):
+                for i in range(3):
+                    beyond = shown.wrench[foot, part, i] - expected[part, i]
+                    own.total[part, i] += beyond
+            own.samples += 1.0
+        elif own.samples > 0.0:
+            share = rules.gain if own.swings[foot] > 0.0 else rules.first_gain
+            own.swings[foot] += 1.0
+            for part in range(2):
+                for i in range(3):
+                    mean = own.total[part, i] / own.samples
+                    own.bias[foot, part, i] += share * (mean - own.bias[foot, part, i])
+                    own.total[part, i] = 0.0
+            own.samples = 0.0
+        for side in range(2):
+            for part in range(2):
+                for i in range(3):
+                    shown.wrench[side, part, i] -= own.bias[side, part, i]
 
 
 class FootholdGains(Model):
@@ -50,13 +236,6 @@ class FootholdGains(Model):
     """Largest offset of a foot forward and sideways [m]."""
 
 
-_GAINS = tuple(FootholdGains.model_fields)
-CORRECTION = record_type(period_s=(), **dict.fromkeys(_GAINS, ()))
-"""Gains of the foothold correction, and the control period."""
-
-PLANNED = record_type(heading=(), foot_yaw=(2,))
-"""Heading of the pelvis and of the feet by plan, one row per control step [rad]."""
-
 FOOTHOLDS = record_type(
     place=(2, 2),  # of the feet against the plan, in the world [m]
     bias=(2, 2),  # error with which they land [m]
@@ -71,19 +250,20 @@ FOOTHOLDS = record_type(
 """Memory of the foothold correction."""
 
 
-_OF_FEET: dict[str, Mirrored | None] = {
+OF_FEET: dict[str, Mirrored | None] = {
     "l_x": "same",
     "l_y": "opposite",
     "r_x": "same",
     "r_y": "opposite",
 }
+"""Vectors of both feet in the plane, and what they are in the mirror."""
 # the mirror changes left and right: of their difference x turns round, and y stays
 _OF_BOTH: dict[str, Mirrored | None] = {"x": "opposite", "y": "same"}
 _KNOWN = {
     name: SignalGroup.of(name, "m", meaning, parts, kind=None).signals
     for name, meaning, parts in (
-        ("feet", "displacement {part} of a foot against the plan", _OF_FEET),
-        ("landing", "error {part} of a foot's last landing", _OF_FEET),
+        ("feet", "displacement {part} of a foot against the plan", OF_FEET),
+        ("landing", "error {part} of a foot's last landing", OF_FEET),
         ("shear", "{part} of the landing error by the shear of both feet so far", _OF_BOTH),
     )
 }
@@ -110,13 +290,9 @@ class FootholdCorrection(PolicyAround):
         super().__init__(policy, model)
         self._walk_view = WalkView(model.observation_table)
         self._stances = Stances.of(model)
-        self._gains: Any = np.zeros(1, CORRECTION)
-        self._gains["period_s"] = model.control_period_s
-        for name in _GAINS:
-            self._gains[name] = getattr(gains, name)
-        self._plan: Any = np.zeros(len(model.plan.q), PLANNED)
-        self._plan["heading"] = model.plan.heading
-        self._plan["foot_yaw"] = model.plan.foot_yaw
+        self._gains = record_row(period_s=model.control_period_s, **gains.model_dump())
+        plan = model.plan
+        self._plan = record_rows(heading=plan.heading, foot_yaw=plan.foot_yaw)
         self.estimates = {**self.policy.estimates, **_KNOWN}
 
     @override
@@ -129,9 +305,7 @@ class FootholdCorrection(PolicyAround):
     def estimate(self, name: str, rows: Array, memory: FootholdMemory) -> Array:
         own = memory.footholds
         if name == "feet":
-            time = self._walk_view.fields(rows)["clock"][:, 0]
-            row = np.rint(time / self._gains["period_s"]).astype(np.int64)
-            heading = self._plan["heading"].take(row, mode="clip")
+            heading = self._plan["heading"].take(self.view.plan_row(rows), mode="clip")
             return turn(own["place"], -heading[:, None]).reshape(len(rows), 4)
         if name == "landing":
             return own["landed"].reshape(len(rows), 4)
@@ -156,8 +330,8 @@ def correct_footholds(gains: Any, plan: Any, observed: Any, memory: Any, coming:
     """Offsets of the feet and the memory after a control step.
 
     Args:
-        gains: Row of `CORRECTION`, (1,).
-        plan: Rows of `PLANNED`, one per control step.
+        gains: Gains and the control period, a row, (1,).
+        plan: Headings of the pelvis and of the feet [rad], one row per control step.
         observed: Observations, rows with fields, (n,).
         memory: Rows of `FOOTHOLDS`, brought up to date, (n,).
         coming: Rows of the plan at the end of the control period, to be filled, (n,).

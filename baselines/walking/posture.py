@@ -61,16 +61,6 @@ class PostureGains(Model):
     """Largest part of either integral, and of the whole [rad]."""
 
 
-_GAINS = ("proportional", "integral", "derivative", "leak_s", "trim", "limit_rad")
-POSTURE = record_type(
-    period_s=(),
-    **dict.fromkeys(_GAINS, ()),
-    integral_limit=(),  # [rad·s]
-    filter_share=(),  # of a step in a period [1]
-    swing_share=(),  # likewise
-)
-"""Gains of the posture feedback."""
-
 FEEDBACK = record_type(
     steps=(),
     tilt=(2,),  # filtered roll and pitch [rad]
@@ -92,7 +82,7 @@ class PostureFeedback(policies.PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Attributes:
-        gains: Row of `POSTURE`, (1,).
+        gains: Gains for the kernel, a row, (1,).
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
 
     Args:
@@ -110,15 +100,16 @@ class PostureFeedback(policies.PolicyAround):
         self._walk_view = policies.WalkView(model.observation_table)
         self.ramp = Ramp(model, ramp_s).table
         period_s = model.control_period_s
-        self.gains: Any = np.zeros(1, POSTURE)
-        for name in _GAINS:
-            self.gains[name] = getattr(gains, name)
-        self.gains["period_s"] = period_s
-        self.gains["integral_limit"] = np.inf
+        integral_limit = np.inf
         if gains.integral > 0.0:
-            self.gains["integral_limit"] = gains.limit_rad / gains.integral
-        self.gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
-        self.gains["swing_share"] = period_s / max(gains.swing_s, period_s)
+            integral_limit = gains.limit_rad / gains.integral
+        self.gains = policies.record_row(
+            period_s=period_s,
+            integral_limit=integral_limit,
+            filter_share=policies.filter_share(period_s, gains.filter_s),
+            swing_share=period_s / max(gains.swing_s, period_s),
+            **gains.model_dump(exclude={"filter_s", "swing_s"}),
+        )
 
     @override
     def begin(self, rows: Array) -> PostureMemory:
@@ -164,7 +155,7 @@ def hold_posture(
     """Add the turn of the hips against the pelvis' tilt, and keep the memory after a control step.
 
     Args:
-        gains: Row of `POSTURE`, (1,).
+        gains: Gains, a row, (1,).
         observed: Observations, rows with fields.
         ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
         change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself goes

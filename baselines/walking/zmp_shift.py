@@ -28,7 +28,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from elastic_env.core.compiled import compiled, record_type
+from baselines.compensation.contact_torque import cosine_and_sine
+from baselines.compensation.policy import record_row, record_rows
+from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_kinematics import LegGeometry, turn
 from elastic_env.world.robot_model import WalkerModel
@@ -80,25 +82,8 @@ def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 
-LEGS = record_type(
-    thigh=(),  # [m]
-    shank=(),  # [m]
-    reach=(),  # to which ankles come from their hips [m]
-    hips=(2, 3),  # [m]
-)
-"""The legs, to move the pelvis over feet that stay."""
-
-STANCE = record_type(
-    pelvis=(3,),  # [m]
-    ankles=(2, 3),  # [m]
-    foot_yaw=(2, 2),  # cosine and sine of the headings of the feet [1]
-    q=(2, 6),  # [rad]
-)
-"""Pelvis, feet and joint angles of the plan in its local frame, one row per control step."""
-
-
 class Stances(NamedTuple):
-    """The legs, a row of `LEGS`, and planned stances, rows of `STANCE`, to move the pelvis over."""
+    """The legs, a row, and the planned stances in the local frame, one row per control step."""
 
     legs: Any
     rows: Any
@@ -106,17 +91,20 @@ class Stances(NamedTuple):
     @classmethod
     def of(cls, model: WalkerModel) -> "Stances":
         """Those of the assumed walker and its plan."""
-        plan = model.plan
         leg = model.biped.leg
-        row = (leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)
-        legs = np.array([row], LEGS)
-        rows = np.zeros(len(plan.q), STANCE)
-        local = plan.local
-        rows["pelvis"] = local.pelvis
-        rows["ankles"] = local.ankles
-        turned = (np.cos(local.foot_yaw), np.sin(local.foot_yaw))
-        rows["foot_yaw"] = np.stack(turned, axis=-1)
-        rows["q"] = plan.q.reshape(-1, 2, 6)
+        local = model.plan.local
+        legs = record_row(
+            thigh=leg.thigh,  # [m]
+            shank=leg.shank,  # [m]
+            reach=_REACH * leg.reach,  # to which ankles come from their hips [m]
+            hips=model.biped.hips,  # [m]
+        )
+        rows = record_rows(
+            pelvis=local.pelvis,  # [m]
+            ankles=local.ankles,  # [m]
+            foot_yaw=cosine_and_sine(local.foot_yaw),
+            q=model.plan.q.reshape(-1, 2, 6),  # [rad]
+        )
         return cls(legs, rows)
 
 
@@ -153,8 +141,8 @@ def move_pelvis(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -
     Where a foot would be out of reach, the leg is as long as it can be.
 
     Args:
-        legs: Row of `LEGS`, (1,).
-        stances: Rows of `STANCE`, one per control step of the plan.
+        legs: Row of `Stances`, (1,).
+        stances: Rows of `Stances`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
         shift: Forward and to the left in the plan's local frame, (n, 2) [m].
         out: To be added to, (n, 12) [rad].
@@ -172,8 +160,8 @@ def move_feet(legs: Any, stances: Any, steps: Any, shift: Array, out: Array) -> 
     """Add the offsets that move planned feet under a pelvis that stays; as `move_pelvis`.
 
     Args:
-        legs: Row of `LEGS`, (1,).
-        stances: Rows of `STANCE`, one per control step of the plan.
+        legs: Row of `Stances`, (1,).
+        stances: Rows of `Stances`, one per control step of the plan.
         steps: Row of the plan for each of the shifts, (n,).
         shift: Of the left and the right foot in the plan's local frame, (n, 2, 2) [m].
         out: To be added to, (n, 12) [rad].

@@ -322,8 +322,8 @@ def _errors_of(inner: RecordedPoses, outer: RecordedPoses, mass_factors: Array) 
             rigid = fit_geometry(problem.as_rigid())
             missed = (rigid.missed(problem), rigid.missed(other))
             rivals = rival_errors(problem.theta, missed[0], other.theta, missed[1])
-            errors = {RIGID: rigid.errors(other), **rivals}
-        errors[variant.name] = fit_geometry(problem).errors(other)
+            errors = {RIGID: np.linalg.norm(missed[1], axis=-1), **rivals}
+        errors[variant.name] = np.linalg.norm(fit_geometry(problem).missed(other), axis=-1)
     return errors
 
 

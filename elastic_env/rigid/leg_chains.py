@@ -6,12 +6,13 @@ the feet. The pelvis' orientation is given by the direction of gravity.
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.rigid.tree import kernels
 from elastic_env.rigid.tree.links import Tree
 
@@ -155,6 +156,47 @@ class LegChains:
         own = self._no_torque if torque is None else _dense(torque)
         is_small = kernels.solutions(self.links, loads, _dense(q), stiffness, own, x)
         return x, is_small
+
+
+class LegTorque(NamedTuple):
+    """Torques of legs under loads that go with any posture, (num_worlds, n)."""
+
+    chains: LegChains
+    loads: Any
+    """Rows of `LegChains.loads_type`, (num_worlds,)."""
+
+    def gravity_torque(self, q: Array) -> Array:
+        """Torque that holds the legs, (num_worlds, n) [rad] to [N·m]."""
+        return self.chains.torque(self.loads, q)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """∂τ_g/∂q, (num_worlds, n, n) [N·m/rad].
+
+        It is not symmetric under a wrench, which turns with its foot.
+        """
+        return self.chains.gradient(self.loads, q)
+
+    def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
+        """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
+
+        Args:
+            q: (num_worlds, n) [rad].
+            stiffness: K, (n,) [N·m/rad].
+            torque: τ, (num_worlds, n) [N·m]; None for τ_g.
+
+        Returns:
+            (num_worlds, n) [rad].
+
+        Raises:
+            ElasticError: The matrix is singular.
+        """
+        x, is_small = self.chains.solve(self.loads, q, stiffness, torque)
+        if not is_small:
+            torque = self.gravity_torque(q) if torque is None else torque
+            # says so if it is singular
+            K = np.broadcast_to(stiffness, q.shape)
+            solve_stiffness(K, self.gravity_gradient(q), torque)
+        return x
 
 
 def _dense(values: Array) -> Array:

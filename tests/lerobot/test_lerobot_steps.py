@@ -27,9 +27,9 @@ from lerobot.processor.converters import (
 from lerobot.robots import koch_follower, openarm_follower, so_follower
 
 from baselines.lerobot import ArmSettings, JointPlace, LeRobotArm
+from baselines.lerobot.arm import units_of
 from baselines.lerobot.settings import motors_of
 from baselines.lerobot.steps import CompensateActionStep, CorrectObservationStep
-from baselines.lerobot.units import units_of
 from tests.test_lerobot import FOLDER, STIFFNESS, calibration, goals, settings
 
 NORMS = {
