@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from baselines import PositionCompensator
+from baselines.identification.servo_log import known_loads
 from elastic_env.core.config import Locator, Model, load_yaml, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -529,9 +530,8 @@ class Log:
 def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
     """A log of each servo for `elastic identify --log`: time, goal, position, and its load.
 
-    Servos that no weight loads are left out: nothing tells their torque. The load is that of the
-    model at the encoders' angles. It turns the joint forward, so that it is the negative of the
-    torque that holds it.
+    Servos that no weight loads are left out: nothing tells their torque. Known is the torque of the
+    weight and of the other joints' motion, by the model at the encoders' angles.
     """
     table = pd.read_csv(log, nrows=_MOST_ROWS)
     theta = table[[f"theta.{joint} [rad]" for joint in known.joints]]
@@ -540,15 +540,18 @@ def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
         return []
     table = table.loc[told]
     angles = np.ascontiguousarray(theta.to_numpy()[told])
-    load = -known.links.gravity_torque(angles)
+    time_s = table["time [s]"].to_numpy()
+    inertia, load = known_loads(known.links, time_s, angles)
+    weight = known.links.gravity_torque(angles)
     files = []
     for column, joint in enumerate(known.joints):
-        if np.abs(load[:, column]).max() < _TOLD_NM:
+        if np.abs(weight[:, column]).max() < _TOLD_NM:
             continue
         content = {
-            "time [s]": table["time [s]"],
+            "time [s]": time_s,
             "goal [rad]": table[f"command.{joint} [rad]"],
             "position [rad]": angles[:, column],
+            "inertia [kg·m²]": inertia[column],
             f"tau_known.{joint} [N·m]": load[:, column],
         }
         files.append(log.with_name(f"servo_{joint}.csv"))

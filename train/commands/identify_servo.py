@@ -79,7 +79,8 @@ def identify_servo(
     paths = fitted_logs(paths, options.unfitted, console)
     logs = [_read(options, path, load, joint) for path in paths]
     further = [_read(options, path, load, joint) for path in options.unfitted]
-    _require_one_supply([*logs, *further])
+    _require_alike("supply voltage", [log.supply for log in (*logs, *further)])
+    _require_alike("gain", [log.gain for log in (*logs, *further) if log.enabled.any()])
     inner, outer = (logs, further) if further or not holdout else split_logs(logs, holdout, seed)
     recorded = {**options.model_dump(mode="json"), "log": list(paths), "seed": seed}
     with run_folder("identify", recorded, seed, output) as folder:
@@ -140,7 +141,7 @@ def show_result(result: ServoIdentification, console: Console) -> None:
         console.print(make_table(title, head, rows, box=box.SIMPLE))
     rows = [
         [
-            f"k_p at gain {one.register_value:g}{_volts(one.supply_v)}",
+            f"k_p{_register(one.register_value)}{_volts(one.supply_v)}",
             f"{one.position_gain_nm_per_rad:.4g}",
             _width(one.half_width),
             "N·m/rad",
@@ -231,12 +232,16 @@ def _read(options: ServoOptions, path: str, load: Load | None, joint: str | None
     return read_servo_log(Path(path), load, options.gain, options.angles, joint)
 
 
-def _require_one_supply(logs: Sequence[ServoLog]) -> None:
-    known = {log.supply != 1.0 for log in logs}
-    if len(known) > 1:
+def _require_alike(what: str, values: Sequence[float]) -> None:
+    """Refuse logs of which only some say a value; it is 1 where they do not."""
+    if len({value == 1.0 for value in values}) > 1:
         raise ConfigurationError(
-            "some logs say their supply voltage and some do not; give it in all or in none"
+            f"some logs say their {what} and some do not; give it in all or in none"
         )
+
+
+def _register(value: float | None) -> str:
+    return "" if value is None else f" at gain {value:g}"
 
 
 def _volts(supply: float | None) -> str:
