@@ -450,6 +450,11 @@ DEGREES = "elbow_flex\n30\n"
         ),
         ("mounting", SOUND.replace("STS3215", "STS32", 1), "no servo 'STS32'"),
         ("targets", DEGREES, "elbow_flex"),
+        (
+            "joints",
+            JOINTS.read_text().replace("stiffness: 238.9", "stiffness: 0.2389"),
+            r"'shoulder_lift' would give way by 5.9. rad .*: give stiffness and position_gain in",
+        ),
         ("targets", POSES.replace("elbow_flex", "elbow"), "elbow"),
     ],
 )
@@ -464,10 +469,10 @@ def test_bad_files_are_told_before_a_port_is_opened(
         pytest.fail("the arm has moved")
 
     monkeypatch.setattr(hardware_compensate, "move_arm", move)
-    path = tmp_path / "file"
+    path = tmp_path / "file.yaml"
     path.write_text(text)
-    files = {"mounting": MOUNTING, "targets": FOLDER / "so101_poses.csv", file: path}
-    options = which(robot=ROBOT, joints=JOINTS, port="/dev/none", **files)
+    files = {"mounting": MOUNTING, "joints": JOINTS, "targets": FOLDER / "so101_poses.csv"}
+    options = which(robot=ROBOT, port="/dev/none", **(files | {file: path}))
     with pytest.raises(ConfigurationError, match=words):
         options.run(PlainConsole(file=io.StringIO()))
 

@@ -139,6 +139,7 @@ class PositionCompensator:
     Attributes:
         joints: Names of the joints, in the order of all arrays.
         clipped: Which joints of the last command met a limit, (n,).
+        needed: Largest offsets that the weight needs within the joint ranges, (n,) [rad].
 
     Args:
         model: Compiled rigid model on a fixed base.
@@ -208,9 +209,9 @@ class PositionCompensator:
         self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[at].max())
         self.reset()
-        needed = self._of_command * self._most_passed(self._heaviest())
-        if (needed > self._limit).any():
-            self._warn_of_offset(needed, "at some pose within the joint ranges")
+        self.needed = self._of_command * self._most_passed(self._heaviest())
+        if (self.needed > self._limit).any():
+            self._warn_of_offset(self.needed, "at some pose within the joint ranges")
 
     @classmethod
     def from_model(

@@ -67,6 +67,8 @@ _TOLD_NM = 0.05
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
+_MOST_OFFSET_RAD = 1.0
+"""Largest `limit_rad`."""
 
 
 class OnArm(Model):
@@ -138,6 +140,13 @@ class KnownArm:
             period_s=1.0 / self.settings.rate_hz,
         )
         self.joints = self.compensator.joints
+        needed = self.compensator.needed
+        if needed.max() > _MOST_OFFSET_RAD:
+            raise ConfigurationError(
+                f"joint {self.joints[needed.argmax()]!r} would give way by {needed.max():.3g} rad"
+                f" under the weight, and at most {_MOST_OFFSET_RAD:g} rad can be compensated: give"
+                " stiffness and position_gain in N·m/rad"
+            )
         self.servos = self.settings.servos(self.joints)
         self.lowest, self.highest = joint_ranges(self.model, self.joints)
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
