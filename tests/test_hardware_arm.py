@@ -812,6 +812,36 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
 
 
+TURNED = (1, 1, -1, 1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"arm": emulated(direction=TURNED)}, "write direction: -1 for it in the mounting"),
+        ({"faults": Faults(same_id=True)}, "damaged packets, as two servos with one id do"),
+        ({"model_number": 2825}, "is a STS3250: correct its id or its model"),
+    ],
+)
+def test_an_arm_that_is_not_as_the_files_say_is_one_sentence_at_the_command_line(
+    changes: dict[str, Any],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches a traceback, a wrong cause, and an exit code of success."""
+    config = EmulatorConfig(model_number=777, ids=tuple(range(1, 7)), arm=emulated())
+    monkeypatch.setattr(command, "emulated", lambda _: config.replace(**changes))
+    files = ["--robot", ROBOT, "--joints", str(JOINTS), "--mounting", str(MOUNTING)]
+    files += ["--targets", str(FOLDER / "so101_poses.csv"), "--output", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as ended:
+        main(["hardware", "compensate", *files, "--dry-run"])
+    assert ended.value.code == 3
+    (said,) = capsys.readouterr().err.strip().splitlines()
+    assert words in said
+
+
 def test_a_virtual_bus_may_keep_the_pace_of_somebody_who_sends_targets() -> None:
     """Catches hours of an emulated arm while its user types a line."""
     bus = VirtualBus(EmulatorConfig(model_number=1020, ids=(1, 2)))
