@@ -1,5 +1,6 @@
 """Emulated servos on a line without terminals and without waiting: bytes in, bytes out."""
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,6 +31,7 @@ class Loop:
 
     baudrate = 1_000_000
     tx_time_per_byte = 0.01
+    clock = time
 
     def __init__(
         self, servos: Sequence[EmulatedServo], change: Callable[[bytes], bytes] = bytes
@@ -118,10 +120,11 @@ class VirtualArm:
         self.goals: list[Array] = []
         self._guard: Guard | None = None
 
-    def monotonic(self) -> float:
-        return self.now_s
+    @property
+    def clock(self) -> "VirtualArm":
+        return self
 
-    def time(self) -> float:
+    def monotonic(self) -> float:
         return self.now_s
 
     def sleep(self, duration_s: float) -> None:

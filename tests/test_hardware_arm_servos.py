@@ -249,10 +249,14 @@ def test_two_servos_with_one_id_are_told_from_silence(number: int) -> None:
     def doubled(reply: bytes) -> bytes:
         return reply[:-2] + bytes(byte & (byte ^ 0x05) for byte in reply[-2:])
 
+    def without_length(reply: bytes) -> bytes:
+        return reply[:3] + bytes(byte & 0x10 for byte in reply[3:])
+
     bus = looped(servos(number, 1))
-    bus.port.change = doubled  # type: ignore[attr-defined]
-    with pytest.raises(ReplyError, match="damaged packets, as two servos with one id do"):
-        bus.read_position(1)
+    for change in (doubled, without_length):
+        bus.port.change = change  # type: ignore[attr-defined]
+        with pytest.raises(ReplyError, match="damaged packets, as two servos with one id do"):
+            bus.read_position(1)
     bus.port.change = lambda _: b""  # type: ignore[attr-defined]
     with pytest.raises(ReplyError, match="does not answer in 3 tries"):
         bus.read_position(1)

@@ -14,7 +14,6 @@ import pytest
 
 from elastic_env.hardware.emulator.launch import RunningEmulator
 from elastic_env.hardware.errors import FaultError
-from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
@@ -128,12 +127,13 @@ class Clock:
     def monotonic(self) -> float:
         return self.now_s
 
+    def sleep(self, seconds: float, /) -> None:
+        self.now_s += seconds
+
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(realtime, "time", clock)
-    return clock
+def clock() -> Clock:
+    return Clock()
 
 
 def paced(clock: Clock, pace: Pace, before_s: float, reading_s: float) -> tuple[float, float]:
@@ -146,7 +146,7 @@ def paced(clock: Clock, pace: Pace, before_s: float, reading_s: float) -> tuple[
 
 def test_a_loop_that_keeps_up_reads_on_the_grid(clock: Clock) -> None:
     """Catches readings whose small delays add up: the loop would run below its rate."""
-    pace = Pace(0.004)
+    pace = Pace(0.004, clock)
     moments, lateness = np.transpose(
         [paced(clock, pace, 0.002, 1e-4 * (number % 3)) for number in range(30)]
     )
@@ -157,7 +157,7 @@ def test_a_loop_that_keeps_up_reads_on_the_grid(clock: Clock) -> None:
 
 @pytest.mark.parametrize("is_command", [True, False])
 def test_a_short_delay_is_caught_up_with_and_no_overrun(clock: Clock, is_command: bool) -> None:
-    pace = Pace(0.004)
+    pace = Pace(0.004, clock)
     delay = (0.0055, 0.0) if is_command else (0.002, 0.0015)
     _, first = paced(clock, pace, *delay)
     moment, second = paced(clock, pace, 0.002, 0.0)
@@ -172,7 +172,7 @@ def test_one_hold_up_is_one_overrun_and_a_whole_period_follows(
 ) -> None:
     """Catches a hold-up that counts twice, and a command that has no time to act before the
     reading after it."""
-    pace = Pace(0.004)
+    pace = Pace(0.004, clock)
     delay = (0.0075, 0.0) if is_command else (0.002, 0.0035)
     (moment, late_s), *after = [
         paced(clock, pace, *delay),
@@ -190,6 +190,6 @@ def test_one_hold_up_is_one_overrun_and_a_whole_period_follows(
 def test_a_loop_that_is_always_too_slow_cannot_hide_it(clock: Clock) -> None:
     """Catches a grid that moves along with every small delay: 4.9 ms for each 4 ms, and never an
     overrun."""
-    pace = Pace(0.004)
+    pace = Pace(0.004, clock)
     overruns = sum(pace.is_overrun(paced(clock, pace, 0.0049, 0.0)[1]) for _ in range(300))
     assert overruns == pytest.approx(100, abs=1)

@@ -237,11 +237,10 @@ def test_torque_goes_on_at_rest_only() -> None:
     assert "error" not in answer
 
 
-def test_reading_does_not_count_as_commanding(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_does_not_count_as_commanding() -> None:
     """Catches a program that only reads and so keeps torque on for ever, as one that hangs in
     its control law may."""
     clock = [0.0]
-    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: clock[0]))
 
     class Slow(Line):
         def read_states(self, timeout_s: float) -> Any:
@@ -249,6 +248,7 @@ def test_reading_does_not_count_as_commanding(monkeypatch: pytest.MonkeyPatch) -
             return super().read_states(timeout_s)
 
     line = Slow("one", 1)
+    line.port.clock = SimpleNamespace(monotonic=lambda: clock[0], sleep=time.sleep)
     line.attach([1])
     *answers, last = served(
         [line], ENABLE, READ, READ, exchange(0.0), READ, READ, READ, READ, exchange(0.0)

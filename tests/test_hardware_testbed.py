@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -302,7 +303,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
     bus = StillBus()
     monkeypatch.setattr(plant, "SupervisedBus", lambda *_: bus)
     monkeypatch.setattr(plant, "time", bus)
-    monkeypatch.setattr(realtime, "time", bus)
+    monkeypatch.setattr(realtime, "Pace", partial(realtime.Pace, clock=bus))
     monkeypatch.setattr(plant.realtime, "prefer_realtime", lambda _: None)
     return bus
 

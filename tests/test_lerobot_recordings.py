@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pandas as pd
 import pytest
@@ -131,8 +132,8 @@ def test_the_robot_is_that_of_the_data_set(said: str, robot: str, tmp_path: Path
 
 
 def test_the_known_torque_is_that_of_weight_and_of_the_other_joints(tmp_path: Path) -> None:
-    """By the model's inverse dynamics along the exact motion. Catches the sign, degrees, and an own
-    inertia that the fit would count twice."""
+    """By the model's inverse dynamics along the exact motion, and the mean of MuJoCo's inertia.
+    Catches the sign, degrees, and an own inertia that counts twice, or for the rotor's."""
     arm = LeRobotArm(settings(joints={"*": "rigid"}))
     recording = read_recordings(dataset(tmp_path / "set"), [0])[0]
     time, _, position = sweep()
@@ -147,10 +148,19 @@ def test_the_known_torque_is_that_of_weight_and_of_the_other_joints(tmp_path: Pa
     inside = slice(10, -10)  # the derivatives at the ends are one-sided
     logs = joint_logs(recording, arm)
     assert [log.joint for log in logs] == list(BODY)
+    model = arm.compensator.constants.model
+    data = mujoco.MjData(model)
+    matrices = np.zeros((len(q), model.nv, model.nv))
+    for row, matrix in zip(q, matrices, strict=True):
+        data.qpos[[model.joint(name).qposadr[0] for name in BODY]] = row
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, matrix)
     for joint, log in enumerate(logs):
-        others = q_ddot.copy()
-        others[:, joint] = 0.0
-        expected = -body.inverse_dynamics(q, q_dot, others)[:, joint]
+        dof = model.joint(log.joint).dofadr[0]
+        own = np.mean(matrices[:, dof, dof]) - model.dof_armature[dof]
+        assert log.inertia == pytest.approx(own, rel=0.01)
+        expected = log.inertia * q_ddot - body.inverse_dynamics(q, q_dot, q_ddot)
+        expected = expected[:, joint]
         largest = np.abs(expected).max()
         np.testing.assert_allclose(
             log.tau_known[inside], expected[inside], atol=0.01 * largest + 2e-4

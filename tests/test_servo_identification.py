@@ -731,6 +731,21 @@ def test_each_gain_is_that_of_its_own_supply() -> None:
     shown = console.export_text()
     assert "k_p at gain 200, 12.1 V" in shown
     assert "torque_limit at 7.4 V" in shown
+    assert "gain register" not in shown
+
+
+def test_a_log_that_says_no_gain_is_not_of_a_gain_of_one(tmp_path: Path) -> None:
+    """Catches a value of the register that nobody has given, and nothing on how to give it."""
+    _, logs = short_logs(3)
+    one = np.ones(len(NAMES))
+    logs = [replace(log, gain=1.0) for log in logs]
+    result = describe_servo(ServoFit(tuple(logs), one, one, one > 0.0, {}, 1e-3), "j")
+    assert [own.register_value for own in result.gains] == [None]
+    assert any("log a column gain, or say it by --gain" in text for text in result.untold)
+    console = Console(width=200, record=True, file=StringIO())
+    show_result(result, console)
+    assert "at gain" not in console.export_text()
+    assert "gain register as in the logs" in result.save(tmp_path)[1].read_text()
 
 
 def test_a_torque_that_is_switched_before_its_row_is_replayed_so() -> None:

@@ -140,6 +140,7 @@ class PositionCompensator:
         joints: Names of the joints, in the order of all arrays.
         constants: What it computes with.
         clipped: Which joints of the last command met a limit, (n,).
+        needed: Largest offsets that the weight needs within the joint ranges, (n,) [rad].
 
     Args:
         model: Compiled rigid model on a fixed base.
@@ -213,9 +214,9 @@ class PositionCompensator:
         )
         self._said: set[str] = set()
         self.reset()
-        needed = self.constants.of_command * self._most_passed(self._heaviest())
-        if (needed > limits.limit_rad).any():
-            self._warn_of_offset(needed, "at some pose within the joint ranges")
+        self.needed = self.constants.of_command * self._most_passed(self._heaviest())
+        if (self.needed > limits.limit_rad).any():
+            self._warn_of_offset(self.needed, "at some pose within the joint ranges")
 
     @classmethod
     def from_model(

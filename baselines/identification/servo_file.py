@@ -31,6 +31,7 @@ _COLUMNS = {
     "torque_enable": "1",
     "gain": "1",
     "voltage": "V",
+    "inertia": "kg·m²",
 }
 _JSON_NAMES = {
     "timestamp": "time",

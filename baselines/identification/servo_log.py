@@ -12,6 +12,7 @@ from baselines.identification.servo_file import AngleUnit, read_content
 from baselines.identification.servo_load import NO_LOAD, Load
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.rigid.rigid_body import RigidBody
 
 FEWEST_ROWS = 50
 """Rows that a fit needs."""
@@ -80,14 +81,42 @@ class ServoLog:
         return pull if self.known is None else pull + self.known
 
     def derivatives(self) -> tuple[Array, Array]:
-        """Speed and acceleration by a moving parabola over 60 ms, (N,) [rad/s], [rad/s²]."""
-        step = float(np.median(np.diff(self.time)))
-        window = max(5, 2 * int(0.5 * _SMOOTHED_S / step) + 1)
-        grid = np.arange(self.time[0], self.time[-1] + step, step)
-        q = np.interp(grid, self.time, self.position)
-        window = min(window, 2 * ((len(grid) - 1) // 2) + 1)
-        slopes = [np.asarray(savgol_filter(q, window, 2, deriv=n, delta=step)) for n in (1, 2)]
-        return np.interp(self.time, grid, slopes[0]), np.interp(self.time, grid, slopes[1])
+        """Speed and acceleration, (N,) [rad/s], [rad/s²]."""
+        return derivatives(self.time, self.position)
+
+
+def derivatives(time: Array, position: Array) -> tuple[Array, Array]:
+    """Speed and acceleration by a moving parabola over 60 ms, (N,) [rad/s], [rad/s²]."""
+    step = float(np.median(np.diff(time)))
+    window = max(5, 2 * int(0.5 * _SMOOTHED_S / step) + 1)
+    grid = np.arange(time[0], time[-1] + step, step)
+    q = np.interp(grid, time, position)
+    window = min(window, 2 * ((len(grid) - 1) // 2) + 1)
+    slopes = [np.asarray(savgol_filter(q, window, 2, deriv=n, delta=step)) for n in (1, 2)]
+    return np.interp(time, grid, slopes[0]), np.interp(time, grid, slopes[1])
+
+
+def known_loads(body: RigidBody, time: Array, position: Array) -> tuple[Array, Array]:
+    """What each joint of an arm carries by its model.
+
+    Args:
+        body: The model.
+        time: Clock, (N,) [s].
+        position: Angles of its joints, (N, n) [rad].
+
+    Returns:
+        Inertia about the joint, mean over the rows, (n,) [kg·m²]; and the torque of all else, the
+        weight and the other joints' motion, positive where it turns forward, (N, n) [N·m].
+    """
+    rates = np.array([derivatives(time, q) for q in position.T])
+    q_dot, q_ddot = np.moveaxis(rates, 0, -1)
+    weight = body.gravity_torque(position)
+    inertia = np.empty(position.shape[1])
+    for joint, unit in enumerate(np.eye(len(inertia))):
+        alone = np.broadcast_to(unit, position.shape)
+        pushed = body.inverse_dynamics(position, np.zeros_like(position), alone)
+        inertia[joint] = np.mean((pushed - weight)[:, joint])
+    return inertia, inertia * q_ddot - body.inverse_dynamics(position, q_dot, q_ddot)
 
 
 def slow_rows(log: ServoLog) -> BoolArray:
@@ -125,6 +154,8 @@ def read_servo_log(
         )
     scale = math.pi / 180.0 if "deg" in (unit, stated) else 1.0
     load = _load(path, load, facts)
+    if load is None and "inertia" in columns:
+        load = Load(inertia=float(np.mean(columns["inertia"])))
     gain = _gain(path, gain, columns, facts)
     if "voltage" in columns and not columns["voltage"].min() > 0.0:
         raise ConfigurationError(

@@ -42,7 +42,8 @@ class ServoParameter(Model):
 class RegisterGain(Model):
     """Position gain of the servo at one value of its gain register."""
 
-    register_value: float
+    register_value: float | None
+    """None where the logs do not say it."""
     position_gain_nm_per_rad: float
     half_width: float | None
     """Half of the 95 % interval; None where the logs do not tell the gain."""
@@ -98,7 +99,8 @@ class ServoIdentification(Model):
         if self.gains:
             volts = self.gains[0].supply_v
             at = "" if volts is None else f" at {volts:g} V"
-            said = f"gain register {self.gains[0].register_value:g}{at}"
+            register = self.gains[0].register_value
+            said = f"gain register {'as in the logs' if register is None else f'{register:g}'}{at}"
         text = f"{head}\n{yaml_line(self.joint, self.settings(), said)}\n"
         files[1].write_text(text, encoding="utf-8")
         return files
@@ -126,7 +128,7 @@ def describe_servo(
         rms_mrad=1e3 * fit.rms,
         gains=tuple(
             RegisterGain(
-                register_value=register,
+                register_value=None if register == 1.0 else register,
                 position_gain_nm_per_rad=gain * register * volts,
                 half_width=half * register * volts if np.isfinite(half) else None,
                 supply_v=None if volts == 1.0 else volts,
@@ -193,7 +195,11 @@ def _untold(fit: ServoFit, parameters: Sequence[ServoParameter]) -> list[str]:
     has_torque = any(log.enabled.any() for log in fit.logs)
     if not has_torque:
         said.append("the servo: its torque is never on")
-    elif "viscous_friction" in fit.tied:
+    elif all(log.gain == 1.0 for log in fit.logs):
+        said.append(
+            "at which value of the gain register k_p holds: log a column gain, or say it by --gain"
+        )
+    if has_torque and "viscous_friction" in fit.tied:
         said.append(
             f"viscous friction apart from the motor's back-EMF ({fit.tied['viscous_friction']}):"
             " log a swing with the torque off"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from baselines.identification.servo_file import read_episodes
-from baselines.identification.servo_log import ServoLog
+from baselines.identification.servo_log import known_loads
 from baselines.lerobot.arm import LeRobotArm
 from baselines.lerobot.settings import read_json
 from elastic_env.core.errors import ConfigurationError, list_names, shorten
@@ -55,6 +55,7 @@ class JointLog:
         time: Clock, (N,) [s].
         goal: Commanded angle of the joint, (N,) [rad].
         position: Measured one.
+        inertia: Of the links about the joint, mean over the rows [kg·m²].
         tau_known: Torque of weight and of the other joints' motion, positive where it turns the
             joint forward, (N,) [N·m].
     """
@@ -64,6 +65,7 @@ class JointLog:
     time: Array
     goal: Array
     position: Array
+    inertia: float
     tau_known: Array
 
 
@@ -130,36 +132,28 @@ def joint_logs(recording: Recording, arm: LeRobotArm) -> list[JointLog]:
     at = [recording.motors.index(name) for name in arm.motors]
     goal = arm.units.angle(recording.goal[:, at])
     position = arm.units.angle(recording.position[:, at])
-    is_known = np.ones(len(recording.time), dtype=np.bool_)
-    rates = [
-        ServoLog("", recording.time, *both, is_known).derivatives()
-        for both in zip(goal.T, position.T, strict=True)
-    ]
-    q_dot, q_ddot = np.moveaxis(np.array(rates), 0, -1)
-    body = arm.compensator.constants.body
-    logs: list[JointLog] = []
-    for joint, name in enumerate(arm.compensator.joints):
-        of_others = q_ddot.copy()
-        of_others[:, joint] = 0.0  # its own inertia is sought
-        torque = body.inverse_dynamics(position, q_dot, of_others)[:, joint]
-        logs.append(
-            JointLog(
-                joint=name,
-                episode=recording.episode,
-                time=recording.time,
-                goal=goal[:, joint],
-                position=position[:, joint],
-                tau_known=-torque,
-            )
+    inertia, known = known_loads(arm.compensator.constants.body, recording.time, position)
+    return [
+        JointLog(
+            joint=name,
+            episode=recording.episode,
+            time=recording.time,
+            goal=goal[:, joint],
+            position=position[:, joint],
+            inertia=float(inertia[joint]),
+            tau_known=known[:, joint],
         )
-    return logs
+        for joint, name in enumerate(arm.compensator.joints)
+    ]
 
 
 def log_text(log: JointLog) -> str:
     """A log as the CSV file that `elastic identify --log` reads."""
-    rows = np.column_stack([log.time, log.goal, log.position, log.tau_known])
+    inertia = np.full_like(log.time, log.inertia)
+    rows = np.column_stack([log.time, log.goal, log.position, inertia, log.tau_known])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
-    return "\n".join(["time [s],goal [rad],position [rad],tau_known [N·m]", *lines, ""])
+    head = "time [s],goal [rad],position [rad],inertia [kg·m²],tau_known [N·m]"
+    return "\n".join([head, *lines, ""])
 
 
 def _info(folder: Path) -> Mapping[str, Any]:

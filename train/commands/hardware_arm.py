@@ -18,14 +18,17 @@ from rich.table import Table
 from rich.text import Text
 
 from baselines import PositionCompensator
+from baselines.identification.servo_log import known_loads
 from elastic_env.core.config import Locator, Model, load_yaml, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.hardware.arm_settings import ArmSettings, ServoMap
 from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_bus import ServoBus
 from elastic_env.hardware.buses.servo_models import servo_models
 from elastic_env.hardware.emulator.joints import EmulatedArm
-from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.live.arm import (
     Arm,
@@ -37,7 +40,7 @@ from elastic_env.hardware.live.arm import (
     weigh,
     wrong_sign,
 )
-from elastic_env.hardware.live.targets import Poses, Socket, Targets
+from elastic_env.hardware.live.targets import Poses, Socket, Stream, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus
@@ -55,7 +58,6 @@ _PLAIN_SHOWN_S = 5.0
 """Between two pictures of the live table: at a terminal, and where lines go into a file [s]."""
 _RAMP_S = 1.0
 _EMULATED = {"feetech": "STS3215", "dynamixel": "XM430-W350"}
-_PATIENT_CYCLES = 10
 _FAR_GAIN = 1.4
 """A gain that is so many times another one is worth a word."""
 _OFF = 0.2
@@ -65,6 +67,8 @@ _TOLD_NM = 0.05
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
+_MOST_OFFSET_RAD = 1.0
+"""Largest `limit_rad`."""
 
 
 class OnArm(Model):
@@ -83,7 +87,7 @@ class OnArm(Model):
     nudge_rad: float = quantity("rad", 0.08, ge=0.02, le=0.2)
     """How far, to either side [rad]."""
     dry_run: bool = False
-    """Play against an emulated arm on an emulated bus."""
+    """Play against an emulated arm, in its own time, and tell the true error of its tip."""
     yes: bool = False
     """Begin to move without asking."""
     output: Path | None = None
@@ -136,6 +140,13 @@ class KnownArm:
             period_s=1.0 / self.settings.rate_hz,
         )
         self.joints = self.compensator.joints
+        needed = self.compensator.needed
+        if needed.max() > _MOST_OFFSET_RAD:
+            raise ConfigurationError(
+                f"joint {self.joints[needed.argmax()]!r} would give way by {needed.max():.3g} rad"
+                f" under the weight, and at most {_MOST_OFFSET_RAD:g} rad can be compensated: give"
+                " stiffness and position_gain in N·m/rad"
+            )
         self.servos = self.settings.servos(self.joints)
         self.lowest, self.highest = joint_ranges(self.model, self.joints)
         self.ranges = self.servos.servo_ranges(self.lowest, self.highest, self.settings.limits)
@@ -147,6 +158,10 @@ class KnownArm:
         self.links = RigidBody(self.model, self.joints, held)
         tool = options.end_effector or outermost_body(self.model)
         self.tool = EndEffector(self.model, self.joints, tool, held)
+
+    def tip_error(self, desired: Array, links: Array) -> float:
+        """Distance of the tip at links from where desired angles put it, rms over rows [m]."""
+        return float(np.sqrt(np.mean(self.tool.errors(desired, links)[0] ** 2)))
 
     @property
     def middle(self) -> Array:
@@ -218,21 +233,20 @@ def move_arm(
     options = known.options
     recorded = options.model_dump(mode="json", exclude={"output"})
     with contextlib.ExitStack() as stack:
-        settings = known.settings
+        console.print(
+            f"{len(known.joints)} servos at {known.settings.port}: {_pairs(known.servos)}"
+        )
+        truth = None
         if options.dry_run:
-            emulator = stack.enter_context(RunningEmulator(emulated(known)))
-            limits = settings.limits.replace(patience_cycles=_PATIENT_CYCLES)
-            settings = settings.replace(port=emulator.port, limits=limits)
-        console.print(f"{len(known.joints)} servos at {settings.port}: {_pairs(known.servos)}")
-        _check_servos(known, settings, console)
-        if not (options.yes or options.dry_run) and settings.confirm:
-            require_consent(_question(known), settings.port)
-        ports = {settings.port: known.servos.ids}
-        bus = stack.enter_context(SupervisedBus(ports, settings.baudrate, settings.protocol))
-        arm = Arm(bus, settings, known.servos, compensator, known.ranges)
+            bus = truth = stack.enter_context(VirtualBus(emulated(known)))
+            _check_servos(known, bus.driver, console)
+        else:
+            bus = stack.enter_context(_real_bus(known, console))
+        arm = Arm(bus, known.settings, known.servos, compensator, known.ranges)
         folder = stack.enter_context(run_folder("hardware", recorded, None, options.output))
-        realtime.prefer_realtime(realtime.Priority.LOOP)
-        stack.callback(realtime.give_up_realtime)
+        if truth is None:
+            realtime.prefer_realtime(realtime.Priority.LOOP)
+            stack.callback(realtime.give_up_realtime)
         start = arm.begin()
         if options.check:
             _check_joints(arm, known, console)
@@ -241,15 +255,50 @@ def move_arm(
         stack.callback(targets.close)
         if isinstance(targets, Socket):
             console.print(f"listening at {targets.address[0]}:{targets.address[1]}")
-        rests = _play(arm, targets, known, folder, console)
+        if truth is not None and isinstance(targets, Stream):
+            truth.keep_pace()
+        rests = _play(arm, targets, known, folder, console, truth)
+    is_whole = isinstance(targets, Poses) and targets.number == len(targets.poses)
+    if options.dry_run and is_whole and not isinstance(compensator, Plain):
+        error = plain_error(known, make_targets)
+        console.print(f"without compensation the tip would be off by {1e3 * error:.2f} mm")
     return folder, rests
 
 
+def plain_error(known: KnownArm, make_targets: MakeTargets) -> float:
+    """True error of an emulated arm's tip at its poses without compensation, rms [m]."""
+    with VirtualBus(emulated(known)) as bus:
+        arm = Arm(bus, known.settings, known.servos, Plain(known.compensator), known.ranges)
+        targets = make_targets(arm.begin())
+        ends: dict[int, tuple[Array, Array]] = {}
+        for state in arm.play(targets):
+            ends[targets.number] = (state.target, bus.links)
+    desired, links = np.array(list(ends.values())).swapaxes(0, 1)
+    return known.tip_error(desired, links)
+
+
+def _real_bus(known: KnownArm, console: Console) -> SupervisedBus:
+    """The servos at a port, which have been looked at, and may move."""
+    settings = known.settings
+    with BUSES[settings.protocol](settings.port, settings.baudrate) as driver:
+        _check_servos(known, driver, console)
+    if settings.confirm and not known.options.yes:
+        require_consent(_question(known), settings.port)
+    ports = {settings.port: known.servos.ids}
+    return SupervisedBus(ports, settings.baudrate, settings.protocol)
+
+
 def _play(
-    arm: Arm, targets: Targets, known: KnownArm, folder: Path, console: Console
+    arm: Arm,
+    targets: Targets,
+    known: KnownArm,
+    folder: Path,
+    console: Console,
+    truth: VirtualBus | None,
 ) -> dict[int, ArmState]:
     """Follow the targets and go back; keep log and table, whatever ends the motion."""
     rests: dict[int, ArmState] = {}
+    true_links: dict[int, Array] = {}
     path = folder / "log.csv"
     with path.open("w", newline="", encoding="utf-8") as file, _shown(console) as show:
         log = Log(file, known.joints)
@@ -259,6 +308,8 @@ def _play(
                 log.write(state, targets.number)
                 if np.isfinite(state.link).all():
                     rests[targets.number] = state
+                    if truth is not None:
+                        true_links[targets.number] = truth.links
                 targets.tell(_told(state, known.joints))
                 show(lambda now=state: live_table(now, known.joints, arm, targets))
             for state in arm.go(arm.start):
@@ -278,6 +329,12 @@ def _play(
     )
     if isinstance(targets, Poses) and rests:
         console.print(rest_table(list(rests.values()), known.joints))
+        desired = np.array([state.target for state in rests.values()])
+        links = {"estimated": np.array([state.link for state in rests.values()])}
+        if true_links:
+            links["true"] = np.array(list(true_links.values()))
+        told = [f"{1e3 * known.tip_error(desired, q):.2f} mm {how}" for how, q in links.items()]
+        console.print(f"tip from its poses, rms: {', '.join(told)}")
     print_files(folder, files, console)
     return rests
 
@@ -314,23 +371,22 @@ def _number(name: str) -> int:
     return by_name[name]
 
 
-def _check_servos(known: KnownArm, settings: ArmSettings, console: Console) -> None:
+def _check_servos(known: KnownArm, bus: ServoBus, console: Console) -> None:
     """Look at all servos, nothing moves.
 
     Raises:
         HardwareError: A servo is another one than the mounting says, or may not move.
     """
-    with BUSES[settings.protocol](settings.port, settings.baudrate) as bus:
-        found = check_bus(bus, known.servos.ids)
-        for servo_id, joint, wanted in zip(
-            known.servos.ids, known.joints, known.servos.models, strict=True
-        ):
-            model = bus.models[servo_id]
-            if wanted is not None and model.number != _number(wanted):
-                raise HardwareError(
-                    f"joint {joint!r} has a {wanted} by the mounting, and servo {servo_id} at"
-                    f" {settings.port} is a {model.name}: correct its id or its model"
-                )
+    found = check_bus(bus, known.servos.ids)
+    for servo_id, joint, wanted in zip(
+        known.servos.ids, known.joints, known.servos.models, strict=True
+    ):
+        model = bus.models[servo_id]
+        if wanted is not None and model.number != _number(wanted):
+            raise HardwareError(
+                f"joint {joint!r} has a {wanted} by the mounting, and servo {servo_id} at"
+                f" {bus.name} is a {model.name}: correct its id or its model"
+            )
     bad = [one for one in found if not one.is_good]
     if not bad:
         console.print(f"{len(found)} checks of the servos: all fine")
@@ -483,9 +539,8 @@ class Log:
 def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
     """A log of each servo for `elastic identify --log`: time, goal, position, and its load.
 
-    Servos that no weight loads are left out: nothing tells their torque. The load is that of the
-    model at the encoders' angles. It turns the joint forward, so that it is the negative of the
-    torque that holds it.
+    Servos that no weight loads are left out: nothing tells their torque. Known is the torque of the
+    weight and of the other joints' motion, by the model at the encoders' angles.
     """
     table = pd.read_csv(log, nrows=_MOST_ROWS)
     theta = table[[f"theta.{joint} [rad]" for joint in known.joints]]
@@ -494,15 +549,18 @@ def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
         return []
     table = table.loc[told]
     angles = np.ascontiguousarray(theta.to_numpy()[told])
-    load = -known.links.gravity_torque(angles)
+    time_s = table["time [s]"].to_numpy()
+    inertia, load = known_loads(known.links, time_s, angles)
+    weight = known.links.gravity_torque(angles)
     files = []
     for column, joint in enumerate(known.joints):
-        if np.abs(load[:, column]).max() < _TOLD_NM:
+        if np.abs(weight[:, column]).max() < _TOLD_NM:
             continue
         content = {
-            "time [s]": table["time [s]"],
+            "time [s]": time_s,
             "goal [rad]": table[f"command.{joint} [rad]"],
             "position [rad]": angles[:, column],
+            "inertia [kg·m²]": inertia[column],
             f"tau_known.{joint} [N·m]": load[:, column],
         }
         files.append(log.with_name(f"servo_{joint}.csv"))

@@ -80,7 +80,9 @@ class LogPoses(OnArm):
 
     Example: elastic hardware log --robot arm.urdf --mounting mounting.yaml --port /dev/ttyACM0
 
-    Then, for each joint: elastic identify --log runs/hardware/servo_elbow_flex.csv --joints
+    Then, where all servos are equal: elastic identify --log runs/hardware/servo_*.csv
+
+    Otherwise for each joint: elastic identify --log runs/hardware/servo_elbow_flex.csv --joints
     elbow_flex
     """
 

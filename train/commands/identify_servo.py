@@ -63,7 +63,8 @@ def identify_servo(
 
     logs = list(map(read, paths))
     further = list(map(read, servo.unfitted))
-    _require_one_supply([*logs, *further])
+    _require_alike("supply voltage", [log.supply for log in (*logs, *further)])
+    _require_alike("gain", [log.gain for log in (*logs, *further) if log.enabled.any()])
     inner = logs
     outer = further
     if not further and options.judged.holdout:
@@ -145,10 +146,10 @@ def show_result(result: ServoIdentification, console: Console) -> None:
         console.print(make_table(title, head, rows, box=box.SIMPLE))
     rows = []
     for one in result.gains:
+        register = "" if one.register_value is None else f" at gain {one.register_value:g}"
         supply = "" if one.supply_v is None else f", {one.supply_v:.4g} V"
-        name = f"k_p at gain {one.register_value:g}{supply}"
         gain = f"{one.position_gain_nm_per_rad:.4g}"
-        rows.append([name, gain, _width(one.half_width), "N·m/rad", ""])
+        rows.append([f"k_p{register}{supply}", gain, _width(one.half_width), "N·m/rad", ""])
     for one in result.parameters:
         if one.name != "position_gain" and one.value is not None:
             width = _width(one.half_width)
@@ -229,11 +230,11 @@ def _each_once(paths: Sequence[str]) -> dict[str, set[Path | str]]:
     return seen
 
 
-def _require_one_supply(logs: Sequence[ServoLog]) -> None:
-    known = {log.supply != 1.0 for log in logs}
-    if len(known) > 1:
+def _require_alike(what: str, values: Sequence[float]) -> None:
+    """Refuse logs of which only some say a value; it is 1 where they do not."""
+    if len({value == 1.0 for value in values}) > 1:
         raise ConfigurationError(
-            "some logs say their supply voltage and some do not; give it in all or in none"
+            f"some logs say their {what} and some do not; give it in all or in none"
         )
 
 

@@ -37,6 +37,8 @@ class FeetechBus(ServoBus):
         super().__init__(port, baudrate)
         self._parser = feetech_packets.Parser()
         self._received: deque[Packet] = deque()
+        self._is_noise = False
+        """True where bytes have come that make no packet."""
         known = [model for model in servo_models().values() if model.protocol == "feetech"]
         first, last = (known[0].table[name] for name in _WHO)
         self._who = range(first.address, last.end)
@@ -63,6 +65,7 @@ class FeetechBus(ServoBus):
         wire = feetech_packets.packet(servo_id, instruction, data)
         self._parser = feetech_packets.Parser()
         self._received.clear()
+        self._is_noise = False
         with bus_gone(self.name):
             self.port.release()
             self.port.clearPort()
@@ -76,8 +79,13 @@ class FeetechBus(ServoBus):
         with bus_gone(self.name):
             while not self._received:
                 if self.port.isPacketTimeout():
-                    return None
-                self._received.extend(self._parser.parse(self.port.readPort(4096)))
+                    was_noise = self._is_noise
+                    self._is_noise = False
+                    return DAMAGED if was_noise else None
+                data = self.port.readPort(4096)
+                self._is_noise |= bool(data)
+                self._received.extend(self._parser.parse(data))
+        self._is_noise = False
         found = self._received.popleft()
         if not found.is_intact:
             return DAMAGED

@@ -24,6 +24,7 @@ from typing import Any, Literal
 from elastic_env.core.errors import missing_extra
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.port_lock import cannot_open, lock_port
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.errors import BusGoneError, PortError
 
 try:
@@ -71,6 +72,9 @@ class Port(PortHandler):
         name: Device, such as /dev/ttyUSB0.
         baudrate: Bits per second.
 
+    Attributes:
+        clock: By which timeouts go; the system's, or that of an emulated line.
+
     Raises:
         MissingExtraError: The SDK is not installed.
     """
@@ -80,6 +84,7 @@ class Port(PortHandler):
             raise _MISSING
         super().__init__(name)
         self.baudrate = baudrate
+        self.clock: Clock = time
         self._read_ahead = b""
         self._lock: int | None = None
 
@@ -107,10 +112,14 @@ class Port(PortHandler):
         """Open the device such that a read blocks for a short while instead of not at all."""
         name = self.port_name
         rate = self.baudrate
-        self.ser = serial.Serial(name, rate, timeout=_READ_SLICE_S, write_timeout=0.1)
+        self.use(serial.Serial(name, rate, timeout=_READ_SLICE_S, write_timeout=0.1))
+        return True
+
+    def use(self, line: Any) -> None:
+        """Speak over a line that is open, as `serial.Serial` is."""
+        self.ser = line
         self.is_open = True
         self.tx_time_per_byte = 1e4 / self.baudrate
-        return True
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """Bytes that have come, at most so many; waits a short while for the first one."""
@@ -127,7 +136,7 @@ class Port(PortHandler):
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Milliseconds of a clock that nobody sets."""
-        return 1e3 * time.monotonic()
+        return 1e3 * self.clock.monotonic()
 
     def release(self) -> None:
         """Make the port usable again after an interrupted read."""

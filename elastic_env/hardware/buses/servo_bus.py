@@ -8,7 +8,6 @@ What differs from make to make is in `dynamixel_bus` and `feetech_bus`: packets,
 meaning of a status.
 """
 
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -378,7 +377,7 @@ class ServoBus(ABC):
                 values[row] = model.decode_block(block, replies[servo_id])
         angle, velocity, current, temperature = values.T.copy()
         torque = servo_models.torque_of_current(current, *self._torque_lines)
-        now = time.monotonic()
+        now = self.port.clock.monotonic()
         is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
         return States(angle, velocity, torque, is_fresh, has_alert, now, temperature)
@@ -418,11 +417,11 @@ class ServoBus(ABC):
     def _wait_for_silence(self) -> None:
         with bus_gone(self.name):
             self.port.release()
-            deadline = time.monotonic() + 10 * _QUIET_S
-            end = time.monotonic() + _QUIET_S
-            while time.monotonic() < min(end, deadline):
+            deadline = self.port.clock.monotonic() + 10 * _QUIET_S
+            end = self.port.clock.monotonic() + _QUIET_S
+            while self.port.clock.monotonic() < min(end, deadline):
                 if self.port.readPort(256):
-                    end = time.monotonic() + _QUIET_S
+                    end = self.port.clock.monotonic() + _QUIET_S
 
 
 class BusGroup:
@@ -470,11 +469,12 @@ class BusGroup:
         """
         if not any(bus.can_limit_effort for bus in self.buses):
             return
-        begin = time.monotonic()
+        clock = self.buses[0].port.clock
+        begin = clock.monotonic()
         share = 1.0
         while share > 0.0:
-            time.sleep(_LOWER_S)
-            share = max(1.0 - (time.monotonic() - begin) / duration_s, 0.0)
+            clock.sleep(_LOWER_S)
+            share = max(1.0 - (clock.monotonic() - begin) / duration_s, 0.0)
             # most of the torque is not needed to hold the arm: cubed, it is gone early
             limits = [partial(bus.limit_effort, share**3) for bus in self.buses]
             answers = self._call_all([partial(_call, limit) for limit in limits])

@@ -12,6 +12,7 @@ import termios
 import time
 import tty
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.emulator.imu import EmulatedImu
 from elastic_env.hardware.emulator.joints import ArmJoints, Joints, ServoJoints
 from elastic_env.hardware.emulator.launch import EmulatorConfig, damage
@@ -85,20 +87,29 @@ class Emulator:
 
     Args:
         config: What is emulated.
+        clock: Its clock; default the system's.
+        terminals: Makes what programs speak to.
 
     Attributes:
         events: When, at which servo, which register became what: torque, goal and watchdog; and
             which position was asked for.
     """
 
-    def __init__(self, config: EmulatorConfig) -> None:
-        now = time.monotonic()
+    def __init__(
+        self,
+        config: EmulatorConfig,
+        clock: Clock = time,
+        terminals: Callable[[], Terminal] = Terminal,
+    ) -> None:
+        now = clock.monotonic()
+        self._clock = clock
+        self._terminals = terminals
         model = servo_model(config.model_number)
         self.config = config
         self.faults = config.faults
         self.events: deque[tuple[float, int, str, int]] = deque(maxlen=_KEPT_EVENTS)
-        self.bus_terminal: Terminal | None = Terminal()
-        self.imu_terminal = Terminal()
+        self.bus_terminal: Terminal | None = terminals()
+        self.imu_terminal = terminals()
         # each with a stream of its own: who asks for replies gets the same faults, whatever the
         # time
         self._reply_faults = np.random.default_rng([config.seed, 0])
@@ -131,23 +142,29 @@ class Emulator:
         if self.bus_terminal is not None:
             sources.append(self.bus_terminal.master)
         ready, _, _ = select.select(sources, [], [], self._idle_s(wait_s))
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._send_due(now)  # replies wait for nothing
         is_idle = not self._replies and now >= self._settled_s
         for servo in self._servos:
             servo.watch(now)
         has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
-        if self.bus_terminal is not None and has_heard:
-            now = self._hear(self.bus_terminal)
+        if has_heard:
+            now = self.hear()
         # after the answers, which are urgent
         if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
-        self._send_due(time.monotonic())
+        self._send_due(self._clock.monotonic())
         self._imu.measure(self._joints.q[0], now, self.faults)
         attitudes = self._imu.pop_due(now)
         if attitudes:
             self.imu_terminal.write(attitudes)
         return control in ready
+
+    def pass_time(self) -> None:
+        """Let the joints move and replies go out until now."""
+        now = self._clock.monotonic()
+        self._joints.advance(now)
+        self._send_due(now)
 
     def set_faults(self, changes: dict[str, Any]) -> None:
         """Switch faults on and off."""
@@ -159,7 +176,7 @@ class Emulator:
             self.bus_terminal.close()
             self.bus_terminal = None
         elif not self.faults.unplugged and self.bus_terminal is None:
-            self.bus_terminal = Terminal()
+            self.bus_terminal = self._terminals()
             self._parser = self._bus.wire.parser()
             self._replies.clear()
 
@@ -173,7 +190,7 @@ class Emulator:
     def state(self) -> dict[str, Any]:
         """Truth about joints and servos."""
         return {
-            "time_s": time.monotonic(),
+            "time_s": self._clock.monotonic(),
             "theta": self._joints.theta.tolist(),
             "q": self._joints.q.tolist(),
             "torque_on": [servo.is_on for servo in self._servos],
@@ -182,7 +199,7 @@ class Emulator:
 
     def _idle_s(self, wait_s: float) -> float:
         """How long nothing is to be done [s], at most a time."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
         at = min(now + wait_s, physics_s, self._imu.next_s, self._next_packet_s())
         return max(at - now, 0.0)
@@ -202,7 +219,7 @@ class Emulator:
 
     def _note(self, index: int, servo_id: int, name: str, value: int) -> None:
         """Pass a change of a servo on to its joint."""
-        self.events.append((time.monotonic(), servo_id, name, value))
+        self.events.append((self._clock.monotonic(), servo_id, name, value))
         servo = self._servos[index]
         if name in ("torque_enable", servo.model.effort_register):
             self._joints.set_torque(index, servo.effort if servo.is_on else 0.0)
@@ -211,11 +228,12 @@ class Emulator:
         if name == "goal_position" and servo.is_on:
             self._joints.command(index, servo.goal)
 
-    def _hear(self, terminal: Terminal) -> float:
+    def hear(self) -> float:
         """Answer the instructions that have come; returns when they were read."""
-        data = terminal.read_bytes()
-        now = time.monotonic()
-        if not terminal.has_rate(self.config.rate):
+        terminal = self.bus_terminal
+        data = b"" if terminal is None else terminal.read_bytes()
+        now = self._clock.monotonic()
+        if terminal is None or not terminal.has_rate(self.config.rate):
             return now  # noise
         for packet in self._parser.parse(data):
             if self._instruction_faults.random() < self.faults.unheard:
@@ -249,7 +267,7 @@ class Emulator:
             due += self._replies.popleft()[1]
         if due and self.bus_terminal is not None:
             self.bus_terminal.write(due)
-            self._settled_s = time.monotonic() + _SETTLE_S
+            self._settled_s = self._clock.monotonic() + _SETTLE_S
 
 
 def serve(config: EmulatorConfig) -> None:

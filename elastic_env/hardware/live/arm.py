@@ -6,7 +6,6 @@ link estimate  └── motor encoders  ←──────┘
 """
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.arm_settings import ArmSettings, ServoMap
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.live.targets import Follower, Targets
 from elastic_env.hardware.safety import realtime
@@ -57,6 +57,11 @@ class Compensator(Protocol):
 
 class ArmBus(Protocol):
     """What an arm needs of its servos, see `SupervisedBus`."""
+
+    @property
+    def clock(self) -> Clock:
+        """By which they are read."""
+        ...
 
     def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
         """Torque on; the servos' angles, (n,) [rad]."""
@@ -154,7 +159,7 @@ class Arm:
         self._bus = bus
         self._compensator = compensator
         self._ranges = ranges
-        self._pace = realtime.Pace(self.period_s)
+        self._pace = realtime.Pace(self.period_s, bus.clock)
         self._temperature = np.full(n, np.nan)
         self.start: Array = np.zeros(n)
         """Where the arm stood when its torque went on [rad]."""
@@ -172,7 +177,7 @@ class Arm:
         self.start = self.servos.joint_angle(stands)
         self.follower = self._follower(self.start)
         self._command = self.start
-        self._begin_s = time.monotonic()
+        self._begin_s = self._bus.clock.monotonic()
         self._pace.restart()
         return self.start
 

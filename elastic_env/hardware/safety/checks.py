@@ -4,7 +4,6 @@ Each with its cure.
 """
 
 import statistics
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -72,9 +71,9 @@ def _check_line(bus: ServoBus, servo_id: int) -> list[Check]:
     times = []
     retries = bus.num_retries
     for _ in range(_PINGS):
-        begin = time.monotonic()
+        begin = bus.port.clock.monotonic()
         bus.knock(servo_id)
-        times.append(time.monotonic() - begin)
+        times.append(bus.port.clock.monotonic() - begin)
     lost = bus.num_retries - retries
     typical = statistics.median(times)
     trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"

@@ -6,6 +6,7 @@ import os
 import time
 from enum import IntEnum
 
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.safety.guard import exceeds
 
 LONGEST_WAIT_S = 0.02
@@ -66,11 +67,11 @@ def give_up_realtime() -> None:
         os.sched_setscheduler(0, policy, os.sched_param(0))
 
 
-def sleep_until(moment_s: float) -> None:
+def sleep_until(moment_s: float, clock: Clock = time) -> None:
     """Wait for a moment of the monotonic clock."""
-    remaining = moment_s - time.monotonic()
+    remaining = moment_s - clock.monotonic()
     if remaining > 0.0:
-        time.sleep(remaining)
+        clock.sleep(remaining)
 
 
 class Pace:
@@ -82,20 +83,22 @@ class Pace:
 
     Args:
         period_s: Time between readings [s].
+        clock: Its clock; default the system's.
     """
 
-    def __init__(self, period_s: float) -> None:
+    def __init__(self, period_s: float, clock: Clock = time) -> None:
         self._period_s = period_s
+        self._clock = clock
         self.restart()
 
     def restart(self) -> None:
         """A period begins now."""
-        self._due_s = time.monotonic()
+        self._due_s = self._clock.monotonic()
         self._lost_s = 0.0
 
     def next(self) -> float:
         """When to read, for a command that is ready now: not before now [s, monotonic clock]."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._due_s += self._period_s
         self._lost_s = now - self._due_s
         if not self.is_overrun(self._lost_s):

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.protocols import BUSES
 from elastic_env.hardware.buses.servo_bus import BusGroup
 from elastic_env.hardware.buses.servo_models import Protocol
+from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.errors import FaultError, HardwareError, ReplyError
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
@@ -54,6 +55,13 @@ class Cycle:
     late_s: float
     """How much later than asked for the servos were read [s]."""
 
+    @classmethod
+    def load(cls, answer: dict[str, Any]) -> Self:
+        """The cycle that a supervisor answers."""
+        goals, is_limited = (np.array(answer[name]) for name in ("goals", "is_limited"))
+        late_s = float(answer["late_s"])
+        return cls(States.load(answer), goals, is_limited, bool(answer["is_held"]), late_s)
+
 
 class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     """Servos on one port or several, moved through a supervisor process of their own.
@@ -65,6 +73,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
 
     Attributes:
         models: Model numbers of the servos, a list for each port.
+        clock: By which they are read.
         is_confirmed_off: Whether all servos have said that their torque is off, and nothing has
             enabled it since.
 
@@ -84,6 +93,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         for ids in ports.values():
             require_ids(ids)
         self.models: list[list[int]] = []
+        self.clock: Clock = time
         self.is_confirmed_off = False
         self._ports = {port: list(ids) for port, ids in ports.items()}
         self._baudrate = baudrate or BUSES[protocol].rates[0]
@@ -162,9 +172,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             with contextlib.suppress(HardwareError, OSError):
                 self._request("disable", _ANSWER_S)
             raise
-        goals, is_limited = (np.array(answer[name]) for name in ("goals", "is_limited"))
-        last = (bool(answer["is_held"]), float(answer["late_s"]))
-        return Cycle(States.load(answer), goals, is_limited, *last)
+        return Cycle.load(answer)
 
     def read_states(self) -> States:
         """States without a command."""

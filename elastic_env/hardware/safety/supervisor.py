@@ -15,7 +15,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from typing import Any, cast
 
 import numpy as np
@@ -58,6 +57,7 @@ class Supervisor:
         self._program = program
         self._buses = buses
         self._servos = BusGroup(buses)
+        self._clock = buses[0].port.clock
         self._guard: Guard | None = None
         """Guard of the motion; None while torque is off."""
         self._commanded_s = 0.0
@@ -70,7 +70,7 @@ class Supervisor:
         try:
             while (request := self._next_request()) is not None:
                 self._number = request["number"]
-                self._channel.send({"number": self._number, **self._answer(request)})
+                self._channel.send({"number": self._number, **self.answer(request)})
         except OSError:
             pass  # the program is gone
         finally:
@@ -101,14 +101,15 @@ class Supervisor:
         """How long a command may still be waited for [s]; forever while nothing moves."""
         if self._guard is None:
             return np.inf
-        return max(self._served_s + self._guard.limits.hang_s - time.monotonic(), 0.0)
+        return max(self._served_s + self._guard.limits.hang_s - self._clock.monotonic(), 0.0)
 
     def _stop_if_hanging(self) -> None:
         if self._guard is not None and self._patience_s() == 0.0:
             hang_ms = 1e3 * self._guard.limits.hang_s
             self._stop(f"no command for {hang_ms:.0f} ms: the program hangs")
 
-    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Do what is asked for; what came of it, or why nothing did."""
         name = request["do"]
         if name not in _ACTIONS:
             choices = ", ".join(_ACTIONS)
@@ -169,7 +170,7 @@ class Supervisor:
             self._torque_off()
             raise
         self._guard = guard
-        self._commanded_s = time.monotonic()
+        self._commanded_s = self._clock.monotonic()
         self._served_s = self._commanded_s
         for bus in self._buses:
             bus.reply_timeout_s = bus.patience_s
@@ -181,7 +182,7 @@ class Supervisor:
         The moment is on the monotonic clock, which both processes share.
         """
         guard = self._require_motion()
-        now = time.monotonic()
+        now = self._clock.monotonic()
         wait_s = at - now
         if exceeds(wait_s, LONGEST_WAIT_S):
             asked = f"asked for {wait_s:.3f} s"
@@ -191,14 +192,14 @@ class Supervisor:
         allowed, is_limited = guard.command(np.array(goals), elapsed_s)
         self._servos.write_goals(allowed)
         self._commanded_s = now
-        realtime.sleep_until(at)
-        begin = time.monotonic()
+        realtime.sleep_until(at, self._clock)
+        begin = self._clock.monotonic()
         states = self._servos.read_states(self._buses[0].patience_s)
         reason = guard.check(states)
         if reason:
             fault = self._stop(reason)
             raise type(fault)(f"{fault}{self._explain_alerts(states)}")
-        self._served_s = time.monotonic()
+        self._served_s = self._clock.monotonic()
         commands = {"goals": allowed.tolist(), "is_limited": is_limited.tolist()}
         return {**states.dump(), **commands, "is_held": is_held, "late_s": begin - at}
 

@@ -1,0 +1,172 @@
+"""An emulated bus, its driver and its supervisor in one process, on a clock that only they move.
+
+As from process to process, but without terminals, faster than in real time, and never too busy.
+"""
+
+import os
+import time
+from contextlib import AbstractContextManager
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.signals import Array
+from elastic_env.hardware import errors
+from elastic_env.hardware.buses.protocols import BUSES
+from elastic_env.hardware.buses.servo_bus import ServoBus
+from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.process import Emulator, Terminal
+from elastic_env.hardware.safety.realtime import sleep_until
+from elastic_env.hardware.safety.supervised_bus import Cycle
+from elastic_env.hardware.safety.supervisor import Supervisor
+from elastic_env.hardware.settings import SafetyLimits
+
+_SLICE_S = 1e-3
+_NAME = "the emulated bus"
+
+
+class _Wire(Terminal):
+    """The emulator's end of a line."""
+
+    name = _NAME
+    master = -1
+
+    def __init__(self) -> None:
+        self.sent = b""
+        """To the servos, not heard yet."""
+        self.shown = b""
+        """From them, not read yet."""
+
+    def write(self, data: bytes) -> None:
+        self.shown += data
+
+    def read_bytes(self) -> bytes:
+        data = self.sent
+        self.sent = b""
+        return data
+
+    def has_rate(self, baudrate: int) -> bool:  # noqa: ARG002
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+class _Line:
+    """The driver's end, in the place of a `serial.Serial`: who asks for bytes lets time pass."""
+
+    def __init__(self, emulator: Emulator, clock: "VirtualBus") -> None:
+        self._emulator = emulator
+        self._clock = clock
+
+    @property
+    def _wire(self) -> Any:
+        if self._emulator.bus_terminal is None:
+            raise OSError("no such device")
+        return self._emulator.bus_terminal
+
+    @property
+    def in_waiting(self) -> int:
+        if not self._wire.shown:
+            self._clock.sleep(_SLICE_S)
+        return len(self._wire.shown)
+
+    def write(self, data: bytes) -> int:
+        self._wire.sent += bytes(data)
+        self._clock.sleep(10.0 * len(data) / self._emulator.config.rate)
+        self._emulator.hear()
+        return len(data)
+
+    def read(self, length: int) -> bytes:
+        data = self._wire.shown[:length]
+        self._wire.shown = self._wire.shown[length:]
+        return data
+
+    def reset_input_buffer(self) -> None:
+        self._wire.shown = b""
+
+    def close(self) -> None:
+        pass
+
+
+class VirtualBus(AbstractContextManager["VirtualBus"]):
+    """What a `SupervisedBus` offers, and the emulator behind it; also their clock.
+
+    Args:
+        config: What is emulated.
+
+    Attributes:
+        now_s: The clock [s].
+        emulator: Servos, joints and faults.
+        driver: Driver of the servos, which are attached.
+    """
+
+    is_confirmed_off = False
+
+    def __init__(self, config: EmulatorConfig) -> None:
+        self.now_s = 0.0
+        self._ahead_s = -np.inf
+        self.emulator = Emulator(config, self, _Wire)
+        self.driver: ServoBus = BUSES[servo_model(config.model_number).protocol](_NAME, config.rate)
+        self.driver.port.clock = self
+        self.driver.port.use(_Line(self.emulator, self))
+        self.driver.attach(config.ids)
+        nobody: Any = SimpleNamespace(send=lambda _: None)
+        self._supervisor = Supervisor(nobody, [self.driver], os.getpid())
+
+    @property
+    def links(self) -> Array:
+        """True angles of the links, (n,) [rad]."""
+        return np.array(self.emulator.state["q"])
+
+    @property
+    def clock(self) -> "VirtualBus":
+        """Its clock."""
+        return self
+
+    def monotonic(self) -> float:
+        """Now [s]."""
+        return self.now_s
+
+    def sleep(self, seconds: float, /) -> None:
+        """Let time pass: physics and replies."""
+        end_s = self.now_s + seconds
+        while self.now_s < end_s:
+            self.now_s = min(self.now_s + _SLICE_S, end_s)
+            self.emulator.pass_time()
+        sleep_until(self._ahead_s + self.now_s)
+
+    def keep_pace(self) -> None:
+        """From now on let no time pass faster than it does, as somebody's targets come in it."""
+        self._ahead_s = time.monotonic() - self.now_s
+
+    def enable(self, limits: SafetyLimits | None = None, ranges: Array | None = None) -> Array:
+        """See `SupervisedBus`."""
+        ends = None if ranges is None else ranges.tolist()
+        allowed = (limits or SafetyLimits()).model_dump()
+        return np.array(self._ask("enable", limits=allowed, ranges=ends)["position"])
+
+    def exchange(self, goals: Array, at: float) -> Cycle:
+        """See `SupervisedBus`."""
+        return Cycle.load(self._ask("exchange", goals=goals.tolist(), at=at))
+
+    def keep(self, goals: Array, limit_s: float = 5.0) -> None:
+        """Nothing: no time passes until the next cycle."""
+
+    def stop_keeping(self) -> None:
+        """Nothing, see `keep`."""
+
+    def close(self) -> None:
+        """Torque off."""
+        self._ask("disable")
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+        answer = self._supervisor.answer({"do": action, "with": arguments})
+        if "error" in answer:
+            raise getattr(errors, answer["error"])(answer["message"])
+        return answer
