@@ -913,7 +913,7 @@ def test_a_list_of_seeds_needs_one_per_world() -> None:
         ),
         (
             {"pendulum": {"mass": -1.0}},
-            r"TestbedConfig\.pendulum\.mass must be a finite number > 0 \[kg\], got -1",
+            r"TestbedConfig\.pendulum\.mass must be a finite number >= 0\.001 and <= 10000 \[kg\], got -1",
         ),
         (
             {"pendulum": {"mas": 1.0}},

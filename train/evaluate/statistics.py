@@ -117,7 +117,10 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
     # here: it takes half a second to load, and most programs need none of it
     from scipy import stats
 
-    return stats.trim_mean(values, _CUT, axis=axis)
+    # one nan, and SciPy goes row by row
+    is_unknown = np.isnan(values).any(axis=axis, keepdims=True)
+    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _CUT, axis=axis, keepdims=True)
+    return np.squeeze(np.where(is_unknown, np.nan, trimmed), axis=axis)[()]
 
 
 def worst_share_mean(values: Array, share: float = WORST) -> float:
