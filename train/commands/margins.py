@@ -11,6 +11,7 @@ from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, Entries, Locator, Model, Title, quantity
 from elastic_env.core.files import write_whole
+from train.commands.compare import try_out
 from train.commands.options import MotionOrDefault
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.margins import (
@@ -77,6 +78,7 @@ class Margins(Model):
             )
             for name in self.policies
         ]
+        try_out(conditions)
         steps = num_steps(conditions)
         rounds = self.halvings + 1
         totals = {name: rounds * own for name, own in zip(self.policies, steps, strict=True)}

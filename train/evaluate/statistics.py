@@ -119,8 +119,8 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
 
     # one nan, and SciPy goes row by row
     is_unknown = np.isnan(values).any(axis=axis, keepdims=True)
-    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _CUT, axis=axis, keepdims=True)
-    return np.squeeze(np.where(is_unknown, np.nan, trimmed), axis=axis)[()]
+    trimmed = stats.trim_mean(np.where(is_unknown, 0.0, values), _CUT, axis=axis)
+    return np.where(np.squeeze(is_unknown, axis=axis), np.nan, trimmed)[()]
 
 
 def worst_share_mean(values: Array, share: float = WORST) -> float:
