@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.adaptation.iterative import LearnedOffsets, learned_signals
-from baselines.adaptation.offset_table import load_table
+from baselines.adaptation.offset_folder import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
     BEST_ON_JOINTS,

@@ -195,8 +195,8 @@ def test_the_gap_of_soles_side_by_side_and_one_behind_the_other() -> None:
 @pytest.mark.parametrize(
     ("goes", "message"),
     [
-        ({"turn_rad": 0.5}, "the feet touch or cross in step 1: soles of 0.26 m x 0.16 m"),
-        ({"step_width_m": 0.15}, "the feet touch or cross in step 1.*take a larger step_width_m"),
+        ({"turn_rad": 0.5}, "the soles of 0.26 m x 0.16 m touch or cross in step 1"),
+        ({"step_width_m": 0.15}, "touch or cross in step 1.*take a larger step_width_m"),
         ({"step_length_m": 0.5}, "foot is out of reach at .*; lower .*step_length_m"),
         ({"step_length_m": 2.0}, "Gait.step_length_m must be .*<= 1"),
         ({"turn_rad": float("nan")}, "Gait.turn_rad must be"),

@@ -24,7 +24,7 @@ from baselines.adaptation.iterative import (
     update,
     zero_phase,
 )
-from baselines.adaptation.offset_table import DESCRIPTION, OFFSETS
+from baselines.adaptation.offset_folder import DESCRIPTION, OFFSETS
 from baselines.policies import Track, track
 from baselines.walking.zmp_shift import center_of_mass_shift
 from elastic_env.core.errors import ConfigurationError, ElasticError

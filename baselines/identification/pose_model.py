@@ -180,7 +180,7 @@ class PoseModel:
         return self.log.measured
 
     def expand(self, unknowns: Array, name: str) -> Array:
-        """One of c, o, F of all joints, zero where it is not sought, (n,)."""
+        """Compliance c, offset o or friction F of all joints; 0 where it is not sought, (n,)."""
         values = np.zeros(len(self.log.joints))
         own = unknowns[self.unknowns.slices[name]]
         values[self.unknowns.elastic[: len(own)]] = own

@@ -79,8 +79,8 @@ class ServoProblem:
         torque = max(float(np.abs(log.external_torque(log.position)).max()) for log in logs)
         if torque < _LEAST_TORQUE:
             raise ElasticError(
-                "nothing loads the joint, so that no torque is known; hang a known mass on it, turn"
-                " its axis out of the vertical, or log a column tau_known [N·m]"
+                "nothing loads the joint; hang a known mass on it, turn its axis out of the"
+                " vertical, or log a column tau_known [N·m]"
             )
         highest = max(log.gain for log in logs)
         inertia = max(log.load.inertia or torque / 100.0 for log in logs)

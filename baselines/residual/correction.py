@@ -99,7 +99,7 @@ class Corrected:
         return as_action(action, inputs.is_single), memory
 
     def correct(self, rows: Array, residual: Array, memory: Any, inputs: Any) -> Step:
-        """`act` for rows: offsets of the joints, (num_worlds, n) [rad], and the new memory.
+        """Act with the base and the correction: joint offsets, (num_worlds, n) [rad], and memory.
 
         Args:
             rows: Observations, (num_worlds, m).

@@ -65,7 +65,7 @@ def require_network(tensors: Tensors) -> int:
             raise ConfigurationError(f"weight{i} must have {shapes}")
     std = tensors["std"]
     if std.shape != (widths[0],) or not (std > 0.0).all():
-        raise ConfigurationError(f"std must be {widths[0]} positive values, as mean")
+        raise ConfigurationError(f"std must be {widths[0]} positive values, one per action")
     return depth
 
 

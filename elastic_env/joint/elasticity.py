@@ -4,7 +4,8 @@ r"""The elastic joint: a rotor behind a spring, a damper and a dead band.
 
 The deflection is δ = θ − q (Eq. 2), the joint torque τ_J what the transmission passes to the link;
 at rest τ_J equals the gravity torque τ_g up to the friction on the link. All functions work on
-(..., n) arrays, so that one joint, one robot and a batch of robots are the same formula.
+(..., n) arrays, so that one joint, one robot and a batch of robots are the same formula. In
+simulation `make_elastic` puts the same joint into a model of MuJoCo.
 
 [Spong1987] M. W. Spong, "Modeling and Control of Elastic Joint Robots", J. Dyn. Sys., Meas.,
 Control 109(4). Eq. n: the paper that this project reproduces (see the README).

@@ -42,7 +42,7 @@ _SINGULAR = 1e-10
 
 
 def hinges_of(model: MjModel) -> list[str]:
-    """Names of the hinges of a model that have one, in its order."""
+    """Names of all hinges with a name, in the order of the model."""
     return [name for j in _hinges(model) if (name := model.joint(j).name)]
 
 

@@ -48,7 +48,7 @@ class FloatingBody:
     def inverse_dynamics(
         self, q: Array, base_dot: Array, q_dot: Array, base_ddot: Array, q_ddot: Array
     ) -> tuple[Array, Array]:
-        """Forces and torques of a motion besides gravity compensation, without any contact.
+        """Forces and torques of a motion, gravity included, without contact or `gravcomp`.
 
         Args:
             q: Hinges, (N, n) [rad].

@@ -442,7 +442,7 @@ def show_walk(step: Any, walker: Any, observed: Array) -> None:
 
 @compiled
 def row_of(plan: Any, step: int) -> Any:
-    """The plan's row of a step; its last one from the end on."""
+    """Row of the plan at a control step; after the end its last row."""
     return plan[min(step, len(plan) - 1)]
 
 

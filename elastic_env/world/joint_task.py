@@ -399,8 +399,8 @@ def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> Pe
         return None
     if any(own.inertial_share < 1.0 for own in scenario.parts):
         raise ConfigurationError(
-            f"scenario {scenario.name!r} has an inertial IMU in a share of the robots, which only a"
-            " walker knows; here inertial_share must be 0 or 1"
+            f"scenario {scenario.name!r} gives only some robots an IMU that computes its attitude;"
+            " only the walker supports that, set inertial_share to 0 or 1"
         )
     if plant.imu_arm_m is None:
         raise ConfigurationError(

@@ -1,4 +1,7 @@
-"""Scores of an episode from the samples of its steps, such as RMS and peak. One row per world."""
+"""Scores of an episode from the samples of its steps, such as RMS and peak. One row per world.
+
+Which scores there are is listed in `robots/thormang/metrics.csv` and `world/joint_metrics.csv`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

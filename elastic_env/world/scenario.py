@@ -69,7 +69,7 @@ class Scenario(RobotRanges):
 
     @property
     def parts(self) -> tuple[RobotRanges, ...]:
-        """Ranges that have equal shares of the robots."""
+        """Ranges of the parameters; each supplies an equal share of the robots."""
         return self.mixture or (self,)
 
     @property

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from baselines.adaptation import offset_table
+from baselines.adaptation import offset_folder
 from baselines.identification.identify import StaticPoints
 from baselines.policies import is_saved
 from baselines.residual.residual_policy import DESCRIPTION, WEIGHTS, find_folder
@@ -53,7 +53,7 @@ tables list it.
 """
 _LABELS = {"label": True, "policy": {"label"}, "member": {"base"}}
 """Parts of a condition that are text for people and name no files."""
-_SAVED = (DESCRIPTION, WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
+_SAVED = (DESCRIPTION, WEIGHTS, offset_folder.DESCRIPTION, offset_folder.OFFSETS)
 """Files of which the folder of a policy consists."""
 _LARGEST_SOURCE = 10_000_000
 """Bytes of a Python file that is looked through for imports."""

@@ -128,7 +128,7 @@ class Run(Model):
     policy: str = "uncompensated"
     """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own."""
     reference: MotionOrDefault = None
-    """MotionOrDefault, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
+    """Motion, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None
     """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if
     taken.

@@ -40,7 +40,7 @@ from elastic_env.hardware.live.arm import (
     weigh,
     wrong_sign,
 )
-from elastic_env.hardware.live.targets import Poses, Socket, Stream, Targets
+from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.supervised_bus import SupervisedBus

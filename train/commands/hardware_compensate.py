@@ -11,7 +11,7 @@ from elastic_env.core.config import quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.hardware.live.arm import ArmState
-from elastic_env.hardware.live.targets import Poses, Socket, Stream, Targets, read_targets
+from elastic_env.hardware.live.target_sources import Poses, Socket, Stream, Targets, read_targets
 from train.commands.hardware_arm import KnownArm, OnArm, Plain, move_arm
 
 

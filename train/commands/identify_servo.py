@@ -99,7 +99,8 @@ def _require_no_poses(options: ArmOptions) -> None:
     unused += given_options(options.judged, ["folds"])
     if unused:
         raise ConfigurationError(
-            f"{', '.join(unused)}: not for logs in time; leave it out beside {options.log[0]}"
+            f"{', '.join(unused)}: for poses only, and {options.log[0]} is a log in time; leave it"
+            " out"
         )
     if len(options.joints) > 1:
         raise ConfigurationError(

@@ -18,7 +18,7 @@ from baselines.adaptation.iterative import (
     Trial,
     learned_signals,
 )
-from baselines.adaptation.offset_table import TableDescription, motion_of, save_table
+from baselines.adaptation.offset_folder import TableDescription, motion_of, save_table
 from baselines.catalogue import PolicyOptions, learned_base
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -59,7 +59,7 @@ class Iterate(Model):
     scenario: Title = DEFAULT_SCENARIO
     """Scenario, see elastic evaluate --help."""
     reference: MotionOrDefault = None
-    """MotionOrDefault, as in elastic evaluate; it must be the same in every trial."""
+    """Motion, as in elastic evaluate; it must be the same in every trial."""
     trials: int = quantity("1", 10, ge=1, le=1000)
     """Trials that it learns from."""
     base: Title | None = None

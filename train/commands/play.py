@@ -171,7 +171,7 @@ class WatchedEpisode(Model):
     scenario: str = DEFAULT_SCENARIO
     """Scenario."""
     reference: MotionOrDefault = None
-    """MotionOrDefault, as in elastic evaluate; default sine, on the walker 3."""
+    """Motion, as in elastic evaluate; default sine, on the walker 3."""
     seed: Seed = 0
     """Seed of the episode."""
     max_s: float | None = quantity("s", None, gt=0)

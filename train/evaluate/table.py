@@ -192,7 +192,7 @@ class EpisodeTable:
                         yield self.scope(policy, *members, group=name)
 
     def cells_of_base(self, scope: Scope, base: str) -> list[int]:
-        """Numbers of the base's cells beside those of a scope; fewer where it does not play all.
+        """Cells in which the base played what a scope's cells play; those it lacks are left out.
 
         A base that is not swept has one cell for all values, its level.
         """

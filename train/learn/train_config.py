@@ -122,7 +122,7 @@ class TrainConfig(CodeNamingModel):
     def _critic_is_one_of_the_state(self) -> Self:
         if self.critic_sees and self.algorithm in ("SAC", CONSTANTS):
             raise ValueError(
-                f"critic_sees is for PPO and A2C, whose critic looks at the state alone, got"
+                f"critic_sees is for PPO and A2C, whose critic has inputs of its own, got"
                 f" {self.algorithm}; leave it out"
             )
         return self

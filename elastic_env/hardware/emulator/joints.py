@@ -172,8 +172,8 @@ class ArmJoints(ServoJoints):
         for name in arm.order:
             if name not in joints or joints[name].servo is None:
                 raise ConfigurationError(
-                    f"the emulated joint {name!r} has no elastic joint with a servo; there are"
-                    f" {', '.join(joints)}"
+                    f"joint {name!r} cannot be emulated: it must be elastic and have a servo; the"
+                    f" elastic joints are {', '.join(joints)}"
                 )
         found = [joints[name].servo for name in arm.order]
         servos = [servo for servo in found if servo is not None]

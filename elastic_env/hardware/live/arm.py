@@ -19,7 +19,7 @@ from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.arm_settings import ArmSettings, ServoMap
 from elastic_env.hardware.clock import Clock
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.live.targets import Follower, Targets
+from elastic_env.hardware.live.target_sources import Follower, Targets
 from elastic_env.hardware.safety import realtime
 from elastic_env.hardware.safety.supervised_bus import Cycle
 from elastic_env.hardware.settings import SafetyLimits

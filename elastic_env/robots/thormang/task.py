@@ -1,6 +1,7 @@
 """The walking task: walk on elastic legs, in place or from foothold to foothold.
 
-The pelvis is to stay level, and the ZMP and the feet where they are planned.
+The pelvis is to stay level, and the ZMP and the feet where they are planned. `score` in
+`world.control_kernels` is the reward, `WalkRewardWeights` has its weights.
 
 Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee,
 l_ankle_pitch, l_ankle_roll, then the same of the right leg (r_...); a name before a dot has one

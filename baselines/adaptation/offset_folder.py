@@ -48,7 +48,7 @@ class TableDescription(Model):
     @classmethod
     def _base_is_a_name(cls, value: str) -> str:
         if ":" in value or value == "iterative":
-            raise ValueError(f"it must be a baseline without learning, got {value!r}")
+            raise ValueError(f"the base must be a baseline without learning, got {value!r}")
         return value
 
 
