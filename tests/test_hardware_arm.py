@@ -37,7 +37,7 @@ from elastic_env.hardware.emulator.launch import EmulatorConfig, Faults, Running
 from elastic_env.hardware.emulator.virtual import VirtualBus
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.live import arm as live
-from elastic_env.hardware.live import targets as sources
+from elastic_env.hardware.live import target_sources as sources
 from elastic_env.hardware.live.target_sources import Follower, Poses, Socket, Stream, read_targets
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.rigid.rigid_body import RigidBody
