@@ -186,7 +186,7 @@ def test_a_module_that_stands_before_the_users_file_is_named(
         named_object("train:make")
 
 
-MINE = """import numpy as np
+FAULTY = """import numpy as np
 def make(env, gain=1.0):
     return np.linalg.inv(np.zeros((2, 2)))
 class Alone:
@@ -197,7 +197,7 @@ class Alone:
 
 def test_an_error_names_the_line_of_the_user_and_none_of_a_library(tmp_path: Path) -> None:
     """Catches NumPy's line in the place of the user's, and a line of ours."""
-    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "mine.py").write_text(FAULTY)
     spec = PolicySpec(name=f"{tmp_path}/mine.py:make", options={"gain": 2.0})
     with pytest.raises(ConfigurationError, match=r"raised \(mine\.py:3\) LinAlgError"):
         make_policy(spec, None)
@@ -207,7 +207,7 @@ def test_an_option_that_a_policy_does_not_take_is_answered_by_those_that_it_take
     tmp_path: Path,
 ) -> None:
     """Catches an answer that lists the baselines."""
-    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "mine.py").write_text(FAULTY)
     spec = PolicySpec(name=f"{tmp_path}/mine.py:make", options={"gian": 2.0})
     with pytest.raises(ConfigurationError, match=r"one of: gain\. Did you mean 'gain'"):
         make_policy(spec, None)
@@ -215,7 +215,7 @@ def test_an_option_that_a_policy_does_not_take_is_answered_by_those_that_it_take
 
 def test_a_policy_that_returns_no_state_is_told_what_to_return(tmp_path: Path) -> None:
     """Catches the words of a failed unpacking."""
-    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "mine.py").write_text(FAULTY)
     policy = named_object(f"{tmp_path}/mine.py:Alone")()
     env = gymnasium.make("elastic_env/Testbed-v0", reference="sine")
     with pytest.raises(ConfigurationError, match=r"must return \(action, state\), got ndarray"):
