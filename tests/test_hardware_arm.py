@@ -812,6 +812,67 @@ def test_a_dry_run_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert (tmp_path / "run" / "servo_elbow_flex.csv").is_file()
 
 
+DAMPED = "damping: 0.8, rotor_inertia: 0.0235, viscous_friction: 0.03"
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "code", "words"),
+    [
+        (f"{{stiffness: .inf, {DAMPED}, servo: {{position_gain: 12}}}}", 0, "K = 20 k_p"),
+        ("{stiffness: 300}", 2, "diverge: a spring is too stiff .* lower its stiffness"),
+    ],
+)
+def test_a_dry_run_of_joints_that_are_hard_to_simulate(
+    stiffness: str, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a file of elastic identify that cannot be tried, and a traceback of what
+    diverges."""
+    joints = tmp_path / "joints.yaml"
+    joints.write_text(f'"*": {stiffness}\n')
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join((FOLDER / "so101_poses.csv").read_text().splitlines()[:2]) + "\n")
+    arguments = [
+        *("hardware", "compensate", "--robot", ROBOT, "--joints", str(joints)),
+        *("--mounting", str(MOUNTING), "--targets", str(poses)),
+        *("--dry-run", "--output", str(tmp_path / "run")),
+    ]
+    ended = 0
+    try:
+        main(arguments)
+    except SystemExit as error:
+        ended = int(error.code or 0)
+    assert ended == code
+    said = capsys.readouterr()
+    assert re.search(words, said.out + said.err)
+
+
+def test_a_stream_that_ends_at_once_leaves_a_short_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback where nothing was told yet."""
+    read, write = os.pipe()
+    os.write(write, b"rubbish\n")
+    os.close(write)
+    with os.fdopen(read) as stream:
+        monkeypatch.setattr("sys.stdin", stream)
+        main(
+            [
+                *("hardware", "compensate", "--robot", ROBOT, "--joints", str(JOINTS)),
+                *("--mounting", str(MOUNTING), "--targets", "-"),
+                *("--dry-run", "--no-check", "--output", str(tmp_path / "run")),
+            ]
+        )
+    assert (tmp_path / "run" / "log.csv").is_file()
+    assert "servo_" not in capsys.readouterr().out
+
+
+def test_limits_of_a_mounting_are_those_of_an_arm_where_it_names_none() -> None:
+    """Catches the testbed's limits, by which an arm would drop at torque-off."""
+    joints = {"elbow_flex": {"id": 1}}
+    settings = ArmSettings(port="virtual", joints=joints, limits={"patience_cycles": 7})  # type: ignore[arg-type]
+    assert settings.limits == ARM_LIMITS.replace(patience_cycles=7)
+
+
 TURNED = (1, 1, -1, 1, 1, 1)
 
 

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import field_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -59,6 +60,11 @@ class ArmSettings(Model):
     """True if somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = ARM_LIMITS
     """What stops a motion or limits the goal; each joint also keeps to the range of the model."""
+
+    @field_validator("limits", mode="before")
+    @classmethod
+    def _those_of_an_arm_unless_named(cls, given: Any) -> Any:
+        return {**ARM_LIMITS.model_dump(), **given} if isinstance(given, dict) else given
 
     def _check(self) -> None:
         first: dict[int, str] = {}

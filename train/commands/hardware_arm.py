@@ -67,6 +67,9 @@ _TOLD_NM = 0.05
 _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperature")
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
+_FEWEST_ROWS = 10
+_STIFF = 20.0
+"""Of a log of which a servo can be identified."""
 _MOST_OFFSET_RAD = 1.0
 """Largest `limit_rad`."""
 
@@ -239,6 +242,8 @@ def move_arm(
         truth = None
         if options.dry_run:
             bus = truth = stack.enter_context(VirtualBus(emulated(known)))
+            if stiffened(known):
+                console.print(f"rigid joints are emulated with K = {_STIFF:g} k_p")
             _check_servos(known, bus.driver, console)
         else:
             bus = stack.enter_context(_real_bus(known, console))
@@ -299,6 +304,7 @@ def _play(
     """Follow the targets and go back; keep log and table, whatever ends the motion."""
     rests: dict[int, ArmState] = {}
     true_links: dict[int, Array] = {}
+    is_interrupted = False
     path = folder / "log.csv"
     with path.open("w", newline="", encoding="utf-8") as file, _shown(console) as show:
         log = Log(file, known.joints)
@@ -315,6 +321,9 @@ def _play(
             for state in arm.go(arm.start):
                 log.write(state, targets.number)
         except KeyboardInterrupt:
+            is_interrupted = True
+            rests.pop(targets.number, None)  # on its way
+            true_links.pop(targets.number, None)
             console.print("stopped; torque falls")
         finally:
             try:
@@ -336,7 +345,19 @@ def _play(
         told = [f"{1e3 * known.tip_error(desired, q):.2f} mm {how}" for how, q in links.items()]
         console.print(f"tip from its poses, rms: {', '.join(told)}")
     print_files(folder, files, console)
+    if is_interrupted and not isinstance(targets, Stream | Socket):
+        raise KeyboardInterrupt
     return rests
+
+
+def stiffened(known: KnownArm) -> dict[str, Any]:
+    """Rigid joints whose servo gives way, which are not simulated, with K = 20 k_p."""
+    found: dict[str, Any] = {}
+    for joint, own in known.joint_settings.items():
+        gain = own.servo.sagging_gain(joint)
+        if own.is_rigid and np.isfinite(gain):
+            found[joint] = own.replace(stiffness=_STIFF * gain).model_dump(exclude_defaults=True)
+    return found
 
 
 def emulated(known: KnownArm) -> EmulatorConfig:
@@ -345,7 +366,7 @@ def emulated(known: KnownArm) -> EmulatorConfig:
     name = names[0] if names else _EMULATED[known.settings.protocol]
     arm = EmulatedArm(
         model=str(Path(known.options.robot).resolve()),
-        joints=known.mapping,
+        joints={**known.mapping, **stiffened(known)},
         order=known.joints,
         direction=tuple(int(sign) for sign in known.servos.direction),
         zero_rad=tuple(known.servos.zero.tolist()),
@@ -543,12 +564,13 @@ def write_servo_logs(log: Path, known: KnownArm) -> list[Path]:
     weight and of the other joints' motion, by the model at the encoders' angles.
     """
     table = pd.read_csv(log, nrows=_MOST_ROWS)
-    theta = table[[f"theta.{joint} [rad]" for joint in known.joints]]
-    told = np.isfinite(theta.to_numpy()).all(axis=1)
-    if not told.any():
+    columns = [f"theta.{joint} [rad]" for joint in known.joints]
+    theta = table[columns].to_numpy(dtype=np.float64)
+    told = np.isfinite(theta).all(axis=1)
+    if told.sum() < _FEWEST_ROWS:
         return []
     table = table.loc[told]
-    angles = np.ascontiguousarray(theta.to_numpy()[told])
+    angles = np.ascontiguousarray(theta[told])
     time_s = table["time [s]"].to_numpy()
     inertia, load = known_loads(known.links, time_s, angles)
     weight = known.links.gravity_torque(angles)

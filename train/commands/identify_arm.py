@@ -138,19 +138,19 @@ def identify_arm(
 def _require_poses(options: ArmOptions) -> None:
     """Refuse options that do not name static poses of an arm, or the first plan of them."""
     logs = [Path(log) for log in options.log]
-    if options.servo != ServoOptions():
-        if logs and not logs[0].is_file():
-            raise ConfigurationError(f"no log at {quote(options.log[0])[1:-1]}; name a file")
-        raise ConfigurationError(
-            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
-            " with columns time, goal and position by --log"
-        )
     for log in logs:
+        if not log.exists():
+            raise ConfigurationError(f"no log at {quote(str(log))[1:-1]}; name a file")
         if log.is_file() and log.stat().st_size == 0:
             raise ConfigurationError(
                 f"the log {quote(str(log))[1:-1]} is empty; a log in time has the columns time,"
                 " goal and position, one of poses those of docs/identification.md"
             )
+    if options.servo != ServoOptions():
+        raise ConfigurationError(
+            "--mass-kg, --lever-m, --gain, --angles and --unfitted are for logs in time; name one"
+            " with columns time, goal and position by --log"
+        )
     if options.robot is None:
         problem = "--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)"
         raise ConfigurationError(problem)

@@ -105,6 +105,12 @@ class ServoJoints:
 
     def _step(self, steps: int) -> None:
         self._simulation.advance(steps)
+        if not np.isfinite(self._simulation.qpos).all():
+            raise ConfigurationError(
+                "the emulated joints diverge: a spring is too stiff for the inertia and the damping"
+                " that the joints file gives it; lower its stiffness, or raise its damping or"
+                " rotor_inertia"
+            )
 
 
 class Joints(ServoJoints):

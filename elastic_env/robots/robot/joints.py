@@ -85,8 +85,8 @@ def elastic_settings(
         elif np.isfinite(gain):
             raise ConfigurationError(
                 f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it"
-                f" a stiffness K [N·m/rad] far above its position_gain of {gain:g}, such as"
-                f" {1e3 * gain:g}"
+                f" a stiffness K [N·m/rad] well above its position_gain of {gain:g}, such as"
+                f" {20.0 * gain:g}"
             )
     if not found:
         raise ConfigurationError(
