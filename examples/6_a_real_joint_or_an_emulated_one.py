@@ -20,10 +20,10 @@ emulator = subprocess.Popen(
     stdout=subprocess.PIPE,
     text=True,
 )
-ports: list[str] = []
+ports: dict[str, None] = {}
 while len(ports) < 2:
-    ports += re.findall(r"/dev/pts/\d+", emulator.stdout.readline())
-servo_port, imu_port = dict.fromkeys(ports)
+    ports |= dict.fromkeys(re.findall(r"/dev/pts/\d+", emulator.stdout.readline()))
+servo_port, imu_port = ports
 
 # %%
 # Which servos are at the port? Nothing moves.
