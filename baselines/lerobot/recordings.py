@@ -14,7 +14,7 @@ import numpy as np
 from baselines.identification.servo_file import read_episodes
 from baselines.identification.servo_log import known_loads
 from baselines.lerobot.arm import LeRobotArm
-from baselines.lerobot.settings import read_json
+from elastic_env.core.config import read_json
 from elastic_env.core.errors import ConfigurationError, list_names, shorten
 from elastic_env.core.signals import Array
 

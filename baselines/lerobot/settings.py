@@ -2,7 +2,6 @@
 
 import csv
 import math
-from collections.abc import Callable
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -10,11 +9,9 @@ from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
-from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.config import Model, Title, quantity, read_json
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError, require_known, shorten
-from elastic_env.core.files import read_bounded
-from elastic_env.core.json_text import parse_json
 
 Units = Literal["degrees", "range", "percent"]
 """Degrees, −100 to 100 over the calibrated range, or 0 to 100 over it."""
@@ -176,27 +173,6 @@ def motors_of(robot: str, use_degrees: bool | None = None) -> tuple[Motor, ...]:
     return tuple(
         motor.replace(units=motor.units if motor.units == "percent" else units) for motor in motors
     )
-
-
-def read_json(path: Path, most_bytes: int, missing: Callable[[str], str]) -> Any:
-    """Content of a JSON file.
-
-    Args:
-        path: The file.
-        most_bytes: Largest size.
-        missing: What to say where it cannot be read, for a reason.
-
-    Raises:
-        ConfigurationError: It cannot be read, or is not JSON.
-    """
-    try:
-        return parse_json(read_bounded(path, most_bytes).decode("utf-8"))
-    except ConfigurationError:
-        raise
-    except OSError as error:
-        raise ConfigurationError(missing(str(error.strerror))) from None
-    except ValueError as error:
-        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
 
 
 class _Calibration(Model):

@@ -192,6 +192,30 @@ def load_yaml(
         raise ConfigurationError(f"in {shorten(file)}: {problem}") from None
 
 
+def read_json(
+    path: Path, most_bytes: int, missing: Callable[[str], str], within: Path | None = None
+) -> Any:
+    """Content of a JSON file.
+
+    Args:
+        path: The file.
+        most_bytes: Largest size.
+        missing: What to say where it cannot be read, for a reason.
+        within: Folder that the file must lie in, after all links; None for anywhere.
+
+    Raises:
+        ConfigurationError: It cannot be read, or is not JSON.
+    """
+    try:
+        return parse_json(read_bounded(path, most_bytes, within).decode("utf-8"))
+    except ConfigurationError:
+        raise
+    except OSError as error:
+        raise ConfigurationError(missing(str(error.strerror))) from None
+    except ValueError as error:
+        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+
+
 def load_json(
     path: Path,
     model: type[ModelT],
@@ -212,15 +236,7 @@ def load_json(
         ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the
             model.
     """
-    try:
-        data = read_bounded(path, _BYTES * LARGEST_JSON, within)
-        content = parse_json(data.decode("utf-8"))
-    except ConfigurationError:
-        raise
-    except OSError as error:
-        raise ConfigurationError(missing(str(error.strerror))) from None
-    except ValueError as error:
-        raise ConfigurationError(f"{shorten(path)} is not JSON: {error}") from None
+    content = read_json(path, _BYTES * LARGEST_JSON, missing, within)
     if not isinstance(content, dict):
         kind = type(content).__name__
         raise ConfigurationError(f"{shorten(path)} must be a mapping, got {kind}")

@@ -49,6 +49,7 @@ from elastic_env.joint.model_file import compiled_model
 from elastic_env.joint.small_servos import SMALL_SERVOS
 from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.rigid.tree.end_effector import EndEffector, outermost_body
+from elastic_env.robots.robot.joints import STIFF_OVER_SERVO
 from elastic_env.world.robot_model import joint_ranges
 from train.runs.console import make_table, print_files
 from train.runs.folders import run_folder
@@ -68,7 +69,6 @@ _LOGGED = ("target", "desired", "command", "theta", "link", "torque", "temperatu
 _UNITS = {"torque": "N·m", "temperature": "°C"}
 _MOST_ROWS = 200_000
 _FEWEST_ROWS = 10
-_STIFF = 20.0
 """Of a log of which a servo can be identified."""
 _MOST_OFFSET_RAD = 1.0
 """Largest `limit_rad`."""
@@ -243,7 +243,7 @@ def move_arm(
         if options.dry_run:
             bus = truth = stack.enter_context(VirtualBus(emulated(known)))
             if stiffened(known):
-                console.print(f"rigid joints are emulated with K = {_STIFF:g} k_p")
+                console.print(f"rigid joints are emulated with K = {STIFF_OVER_SERVO:g} k_p")
             _check_servos(known, bus.driver, console)
         else:
             bus = stack.enter_context(_real_bus(known, console))
@@ -351,12 +351,14 @@ def _play(
 
 
 def stiffened(known: KnownArm) -> dict[str, Any]:
-    """Rigid joints whose servo gives way, which are not simulated, with K = 20 k_p."""
+    """Rigid joints whose servo gives way, which are not simulated, made stiff, by name."""
     found: dict[str, Any] = {}
     for joint, own in known.joint_settings.items():
         gain = own.servo.sagging_gain(joint)
         if own.is_rigid and np.isfinite(gain):
-            found[joint] = own.replace(stiffness=_STIFF * gain).model_dump(exclude_defaults=True)
+            found[joint] = own.replace(stiffness=STIFF_OVER_SERVO * gain).model_dump(
+                exclude_defaults=True
+            )
     return found
 
 

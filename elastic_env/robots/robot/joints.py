@@ -32,6 +32,9 @@ DAMPING_RATIO = 0.17
 """Of rotor and link on the spring between them; about that of the testbed's joint, K 1001, B
 0.839, D 10 [1].
 """
+STIFF_OVER_SERVO = 20.0
+"""K over k_p of a joint that is as good as rigid and can still be simulated."""
+
 _SERVO_TO_SPRING = 50.0
 """k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while
 its integrator acts.
@@ -86,7 +89,7 @@ def elastic_settings(
             raise ConfigurationError(
                 f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it"
                 f" a stiffness K [N·m/rad] well above its position_gain of {gain:g}, such as"
-                f" {20.0 * gain:g}"
+                f" {STIFF_OVER_SERVO * gain:g}"
             )
     if not found:
         raise ConfigurationError(
