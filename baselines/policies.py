@@ -124,7 +124,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
     known = policies_of(is_walker).get(name)
     if known is None:
-        names = [*policies_of(is_walker), f"{RESIDUAL}PATH"]
+        names = [*policies_of(is_walker), f"{RESIDUAL}PATH", "module:function"]
         raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, names)
     _require_effect(name, env, given, known.options)
     return known.build(env, _assumed(env, chosen), chosen)

@@ -1,6 +1,7 @@
 """The CI benchmark: what it measures, how it fails, what it writes."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import yaml
 import elastic_env
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.commands.bench import BenchConfig, annotation, configuration
+from train.commands.bench import BenchConfig, configuration
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import evaluate
+from train.runs.annotations import annotation
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
@@ -102,17 +104,63 @@ def test_what_falls_short_stands_first_and_is_an_annotation(
     rows = [line for line in table if "link_error" in line or "testbed" in line]
     assert "stiffness_scale" in rows[0]
     assert "falls short" in rows[1]
-    assert f"| {scaled:.4g} [" in rows[1]  # the interval over its episodes
+    assert f"| {scaled:.4g} |" in rows[1]
+    assert re.search(r"\| [0-9.e-]+, [0-9.e-]+ \|$", rows[1])  # the interval over its episodes
     assert f"+{100 * (scaled / 1e-4 - 1):.1f} %" in rows[1]
     assert all("better" in line for line in rows[2:] if "link_error" in line)
     assert all("-99.9 %" in line for line in rows[2:] if "link_error" in line)
+
+
+def test_figures_with_a_sign_are_judged_by_their_size(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a lowest error that grows tenfold and counts as better."""
+    path = written(figures={"link_error_min_rad": None, "clipped_share": None})
+    assert not failed([str(path), "--update"])
+    case = yaml.safe_load(path.read_text())["cases"][0]
+    accepted = case["figures"]["link_error_min_rad"]
+    assert accepted < 0.0
+    assert case["figures"]["clipped_share"] == 0.0
+    assert not failed([str(written(figures={"link_error_min_rad": accepted}))])
+    assert failed([str(written(figures={"link_error_min_rad": 0.1 * accepted}))])
+    assert "(+900." in capsys.readouterr().out
+    assert not failed([str(written(figures={"link_error_min_rad": 10.0 * accepted}))])
+    assert "better" in capsys.readouterr().out
+
+
+def test_an_update_fits_without_margin_and_changes_figures_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches digits that were rounded away and fail at once, line ends that change, figures of
+    another case that end in a traceback, and an update that says what it did not do."""
+    path = written(margins={"link_error_rms_rad": 0.0})
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    assert not failed([str(path), "--update"])
+    assert "accepted 1 of 1 figures" in capsys.readouterr().out
+    assert path.read_bytes().count(b"\n") == path.read_bytes().count(b"\r\n") > 3
+    assert not failed([str(path)])
+    case = "{<<: *a, seed: 3}"
+    path.write_text(path.read_text().replace("- env", "- &a\n  env", 1) + f"- {case}\n")
+    with pytest.raises(SystemExit) as end:
+        main(["bench", str(path), "--update"])
+    assert end.value.code == 2
+    assert "figures of cases.1 stand elsewhere" in capsys.readouterr().err
+
+
+def test_wrong_inputs_are_annotations_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a workflow that fails and does not say why at the pull request."""
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "none.yaml"])
+    assert end.value.code == 2
+    assert "::error title=elastic::no configuration file at none.yaml" in capsys.readouterr().out
 
 
 def test_an_annotation_is_one_command_whatever_it_says() -> None:
     """Catches a path or a message that ends the command early."""
     made = annotation("50 % of\na: b, c", Path("a,b:c.yaml"))
     place, message = "a%2Cb%3Ac.yaml", "50 %25 of%0Aa: b, c"
-    assert made == f"::error file={place},title=elastic bench::{message}"
+    assert made == f"::error file={place},title=elastic::{message}"
 
 
 def test_a_fall_falls_short_and_an_unknown_figure_is_refused(

@@ -37,7 +37,8 @@ from train.evaluate.conditions import (
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import over_cells
-from train.report.table_formats import Head, Row, Table, to_markdown, to_terminal
+from train.report.table_formats import Head, Row, Table, print_table, to_markdown
+from train.runs.annotations import annotation, in_workflow
 from train.runs.folders import run_folder
 from train.runs.user_code import CodeNamingModel, is_a, load_without_code
 
@@ -66,7 +67,8 @@ class BenchCase(Model):
     episodes: NumEpisodes = 1
     """Episodes, with seeds that follow; a figure is the mean over them."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
-    """Metrics of the episodes with what was accepted; null where `--update` has not measured."""
+    """Metrics of the episodes with what was accepted; null where `--update` has not measured.
+    Their size counts, and smaller is better."""
     margins: dict[str, Margin] = {}
     """Margins of single figures, in place of that of the file."""
 
@@ -122,6 +124,8 @@ class Bench(Model):
     def run(self, console: Console) -> None:
         """Play the rollouts, and write and print their figures."""
         path = configuration(self.config or USUAL, self.update)
+        if path == _SHIPPED:
+            console.print(f"there is no {USUAL}; these are the rollouts of the package")
         if self.config is None:  # it was found, and nobody named it
             cure = f"name it: elastic bench {path}"
             config = load_without_code(path, BenchConfig, cure)
@@ -141,32 +145,19 @@ class Bench(Model):
         if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
             with Path(summary).open("a", encoding="utf-8") as file:
                 file.write(markdown)
-        console.print(to_terminal(table))
+        print_table(table, console, "bench.md")
         console.print(f"wrote {folder}/bench.json and bench.md")
         if self.update:
-            _accept(path, evaluations)
-            console.print(f"accepted the figures into {path}")
+            accepted = _accept(path, evaluations)
+            console.print(f"accepted {accepted} of {len(figures)} figures into {path}")
         short = [one for one in figures if one["problem"]]
         if self.update:
             short = [one for one in figures if one["measured"] is None]
-        in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
-        place = Path(os.path.relpath(path, os.environ.get("GITHUB_WORKSPACE")))
         for one in short:
             problem = f"{one['case']}: {one['problem']}"
-            console.print(annotation(problem, place) if in_workflow else problem)
+            console.print(annotation(problem, path) if in_workflow() else problem)
         if short:
             sys.exit(1)
-
-
-def annotation(problem: str, file: Path) -> str:
-    """The command by which GitHub shows a problem at a file of a pull request.
-
-    Its escapes are those of docs.github.com, "Workflow commands": a property may hold neither
-    colons nor commas.
-    """
-    message = problem.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
-    place = str(file).replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
-    return f"::error file={place},title=elastic bench::{message}"
 
 
 def configuration(path: Path, update: bool = False) -> Path:
@@ -183,7 +174,7 @@ def configuration(path: Path, update: bool = False) -> Path:
     return _SHIPPED
 
 
-_UNITS = ("_m", "_rad", "_s", "_nm")
+_UNITS = ("_m", "_rad", "_s", "_nm", "_share", "_count")
 """Ends of the names of metrics."""
 _Figure = dict[str, Any]
 """A figure of a rollout: measured, accepted and largest value, and what is wrong in words.
@@ -208,7 +199,7 @@ def _figures(case: BenchCase, found: Evaluation, margin: float) -> Iterator[_Fig
             "measured": score and score.value,
             "interval": score.ends if score and score.has_interval else None,
             "accepted": accepted,
-            "bound": None if accepted is None else accepted + own * abs(accepted),
+            "bound": None if accepted is None else (1.0 + own) * abs(accepted),
         }
         yield {**figure, "problem": _problem(figure, found)}
 
@@ -230,38 +221,63 @@ def _problem(figure: _Figure, found: Evaluation) -> str:
     if measured is None:
         return f"{metric} of this episode is not a number"
     if bound is None:
-        return f"{metric} is {measured:.4g}, and nothing was accepted yet; --update accepts it"
-    if measured <= bound:
+        cure = "nothing was accepted yet; --update accepts it"
+        return f"{metric} is {_rounded(measured)}, and {cure}"
+    if float(_rounded(abs(measured))) <= bound:
         return ""
     worse = f" ({_change(measured, figure['accepted'])})" if figure["accepted"] else ""
-    return f"{metric} is {measured:.4g}{worse}, at most {bound:.4g} is accepted"
+    return f"{metric} is {_rounded(measured)}{worse}, at most {_rounded(bound)} is accepted"
 
 
-def _accept(path: Path, evaluations: list[Evaluation]) -> None:
-    """Write measured figures in the place of accepted ones; what stands around them stays."""
-    text = path.read_text(encoding="utf-8")
+def _rounded(figure: float) -> str:
+    """A figure as it is accepted and printed."""
+    return f"{figure:.4g}"
+
+
+def _accept(path: Path, evaluations: list[Evaluation]) -> int:
+    """Write measured figures in the place of accepted ones; what stands around them stays.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        ConfigurationError: A case takes its figures from another one.
+    """
+    text = path.read_bytes().decode()
     cases = _child(yaml.compose(text), "cases").value
-    changes = []
-    for case, evaluation in zip(cases, evaluations, strict=True):
-        for key, value in _child(case, "figures").value:
+    changes = dict[tuple[int, int], str]()
+    for number, (case, evaluation) in enumerate(zip(cases, evaluations, strict=True)):
+        figures = _child(case, "figures")
+        if figures is None or any(key.value == "<<" for key, _ in figures.value):
+            problem = f"{path}: figures of cases.{number} stand elsewhere"
+            raise ConfigurationError(f"{problem}; give it figures of its own to update them")
+        for key, value in figures.value:
             if (measured := _score(evaluation, key.value)) is not None:
                 place = (value.start_mark.index, value.end_mark.index)
-                changes.append((*place, f"{measured.value:.4g}"))
-    for begin, end, value in sorted(changes, reverse=True):
+                changes[place] = _rounded(measured.value)
+    for (begin, end), value in sorted(changes.items(), reverse=True):
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
-    write_whole(path.resolve(), text)  # the user named it, maybe by a link
+    write_whole(path.resolve(), text.encode())  # the user named it, maybe by a link
+    return len(changes)
 
 
 def _child(node: Any, name: str) -> Any:
-    return next(value for key, value in node.value if key.value == name)
+    return next((value for key, value in node.value if key.value == name), None)
 
 
 _NUMBERS = ("measured", "accepted", "bound")
 
 
 def _table(figures: list[_Figure]) -> Table:
-    titles = ("rollout and figure", "measured", "accepted", "at most", "change", "")
-    heads = [Head(title, is_number=0 < n < 5) for n, title in enumerate(titles)]
+    heads = (
+        Head("rollout and figure", is_number=False),
+        Head("", is_number=False),
+        Head("measured"),
+        Head("change"),
+        Head("at most", leaves=3),
+        Head("accepted", leaves=2),
+        Head("95 % interval", leaves=1),
+    )
     rows = []
     failed = {figure["case"] for figure in figures if figure["problem"]}
     figures = sorted(figures, key=lambda one: (one["case"] not in failed, not one["problem"]))
@@ -272,18 +288,20 @@ def _table(figures: list[_Figure]) -> Table:
             verdict = "falls short" if figure["problem"] else "kept"
             if measured is not None and bound is None:
                 verdict = "new"
-            elif measured is not None and measured < 2.0 * accepted - bound:
-                verdict = "better: --update keeps it"
-            texts = ["-" if n is None else f"{n:.4g}" for n in (measured, accepted, bound)]
-            if figure["interval"]:
-                texts[0] += " [{:.4g}, {:.4g}]".format(*figure["interval"])
-            rows.append(Row((figure["metric"], *texts, _change(measured, accepted), verdict)))
+            elif measured is not None and abs(measured) < 2.0 * abs(accepted) - bound:
+                verdict = "better"
+            three = (measured, bound, accepted)
+            shown, *limits = ["-" if n is None else _rounded(n) for n in three]
+            change = _change(measured, accepted)
+            ends = figure["interval"]
+            interval = f"{_rounded(ends[0])}, {_rounded(ends[1])}" if ends else "-"
+            rows.append(Row((figure["metric"], verdict, shown, change, *limits, interval)))
     title = "short rollouts against what was accepted"
-    return Table(tuple(heads), tuple(rows), title=title)
+    return Table(heads, tuple(rows), title=title, caption="--update accepts what is better.")
 
 
 def _change(measured: float | None, accepted: float | None) -> str:
-    """Change of a figure against what was accepted, in per cent; a dash where there is none."""
+    """Change of a figure's size against what was accepted, in per cent; a dash without one."""
     if measured is None or not accepted:
         return "-"
-    return f"{100.0 * (measured - accepted) / abs(accepted):+.1f} %"
+    return f"{100.0 * (abs(measured) / abs(accepted) - 1.0):+.1f} %"

@@ -23,6 +23,7 @@ from rich.text import Text
 import elastic_env
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import shorten
+from train.runs.annotations import annotation, in_workflow
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explain
 from train.runs.import_path import leave
@@ -53,6 +54,8 @@ def _print_failure(error: Exception) -> int:
         found = f"this is a defect of elastic-env, please report it: {kind}", DEFECT
     said, code = found
     _print_last(said, error, "error: ")
+    if in_workflow():
+        CONSOLE.print(annotation(said))
     return code
 
 

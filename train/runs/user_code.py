@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from elastic_env.core.config import Model, load_yaml
-from elastic_env.core.errors import ConfigurationError, quote, shorten
+from elastic_env.core.errors import ConfigurationError, quote, shorten, unknown_name
 from train.runs.folders import require_run
 from train.runs.import_path import look_last_in
 
@@ -155,10 +155,9 @@ def named_object(name: str) -> Any:
         ) from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
-        functions = inspect.getmembers(module, inspect.isfunction)
-        own = [name for name, found in functions if found.__module__ == module.__name__]
-        known = f"its functions are: {', '.join(own) or 'none'}"
-        raise ConfigurationError(f"{shorten(place)} has no {attribute!r}; {known}")
+        callables = inspect.getmembers(module, callable)
+        own = [name for name, found in callables if found.__module__ == module.__name__]
+        raise unknown_name(f"function or class of {shorten(place)}", attribute, own)
     return getattr(module, attribute)
 
 
