@@ -14,7 +14,15 @@ from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.residual_seeds import Origin, origin
-from train.evaluate.statistics import Counts, Estimate, beats, estimate, mean_of_robots
+from train.evaluate.statistics import (
+    Counts,
+    Estimate,
+    beats,
+    estimate,
+    mean_of_part,
+    mean_of_robots,
+    middle,
+)
 
 Groups = Mapping[str, Sequence[str]]
 """Scenarios to pool over, by the name of the group."""
@@ -275,6 +283,21 @@ def over_cells(
         return means_of_cells(values, counts, mean).mean(axis=0)
 
     return estimate(figures, [own.shape[1] for own in values])
+
+
+def median_of(evaluation: Evaluation, metric: str) -> Estimate:
+    """Median over the episodes that did not fail; of a residual its middle over training seeds.
+
+    The interval is over seeds and episodes; there is none where all episodes are the same.
+    """
+    condition = evaluation.condition
+    same = condition.environment.is_deterministic(condition.scenario, condition.reference)
+    seeds = group_by(evaluation.episodes, lambda own: own.get("training_seed"))
+    values = [
+        [None if own["termination"] else own.get(metric) for own in episodes[: 1 if same else None]]
+        for episodes in seeds.values()
+    ]
+    return over_cells([np.array(values, dtype=np.float64)], mean_of_part(middle))
 
 
 def means_of_cells(

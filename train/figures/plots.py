@@ -12,8 +12,9 @@ from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
+from train.evaluate.table import median_of
 from train.figures.chart import Chart, Curve, Evaluations, Mark
-from train.figures.colours import FAILED, policy_colours
+from train.figures.colours import FAILED, INK, policy_colours
 from train.runs.escaping import visible
 
 FigureFormat = Literal["png", "pdf", "svg"]
@@ -182,8 +183,8 @@ def show_numbers(axis: Any, numticks: int | None = None) -> None:
 def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Path) -> Path:
     """Metrics of every policy: a panel for each and every reference, or of one scenario one.
 
-    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
-    failed.
+    Bars are medians over the episodes that did not fail, with their 95 % intervals; dots these
+    episodes, crosses episodes that failed.
     """
     known = evaluations[0].condition.environment
     titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
@@ -225,6 +226,8 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
         handles.append(axes[0].scatter([], [], **cross))
     if any(len(evaluation.episodes) > 1 for evaluation in evaluations):
         handles.append(axes[0].scatter([], [], label="episode (bar: median)", **_DOTS))
+        style = {"marker": "|", "lw": 0.0, "ms": 9, "mew": _INTERVAL["lw"], "color": INK}
+        handles += axes[0].plot([], [], label="its 95 % interval", **style)
     ncols = columns_of(len(handles), max(int(size[0] / 1.7), 2))
     figure.legend(handles=handles, ncols=ncols, loc="outside lower center")
     return save(figure, path)
@@ -232,6 +235,8 @@ def draw_overview(evaluations: Evaluations, columns: Sequence[Column], path: Pat
 
 _DOTS: dict[str, Any] = {"s": 4, "color": "#222222", "alpha": 0.45, "lw": 0, "zorder": 3}
 """Looks of single episodes."""
+_INTERVAL: dict[str, Any] = {"lw": 1.3, "color": INK, "zorder": 4}
+"""Looks of an interval, beside the dots."""
 _WIDEST = 12.0
 """Width beyond which panels stand one above the other [in]."""
 _ROOMY = 7
@@ -253,10 +258,13 @@ def _draw_bars(
             x = place + (index - (len(policies) - 1) / 2) * width
             values = column.scale * e.values(column.metric)
             shade = shades[e.condition.policy.title]
-            height = np.median(values) if len(values) else 0.0
+            level = median_of(e, column.metric).times(column.scale)
+            height = level.value if level.is_known else 0.0
             axis.bar(x, height, width=0.9 * width, color=shade)
             if len(e.episodes) > 1:
                 axis.scatter(np.full(len(values), x), values, **_DOTS)
+            if level.has_interval:
+                axis.vlines(x + 0.25 * width, *level.ends, **_INTERVAL)
             if e.num_failed:
                 cross = {"marker": "X", "s": 26, "edgecolors": "white", "lw": 0.5}
                 cross["color"] = FAILED if len(values) else shade

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
-from train.evaluate.episodes import Evaluation, group_by
-from train.evaluate.statistics import Estimate, mean_of_part, middle
-from train.evaluate.table import over_cells
+from train.evaluate.episodes import Evaluation
+from train.evaluate.statistics import Estimate
+from train.evaluate.table import median_of
 from train.report.page import bullets
 from train.report.report_text import capital
 from train.report.table_formats import (
@@ -86,27 +86,12 @@ def _interval(evaluations: Sequence[Evaluation]) -> str:
 
 def _figure(evaluation: Evaluation, column: Column, worst: bool, interval: bool) -> str:
     """Median of a metric with its interval, and the episode that is farthest from zero."""
-    median = _median(evaluation, column.metric)
+    median = median_of(evaluation, column.metric)
     found = number_interval(median if interval else Estimate(median.value), column)
     values = column.scale * evaluation.values(column.metric)
     if not worst or len(values) < 2:
         return found
     return f"{found} ({values[np.argmax(np.abs(values))]:.{column.decimals}f})"
-
-
-def _median(evaluation: Evaluation, metric: str) -> Estimate:
-    """Median over the episodes that did not fail; of a residual its middle over training seeds.
-
-    The interval is over seeds and episodes; there is none where all episodes are the same.
-    """
-    condition = evaluation.condition
-    same = condition.environment.is_deterministic(condition.scenario, condition.reference)
-    seeds = group_by(evaluation.episodes, lambda own: own.get("training_seed"))
-    values = [
-        [None if own["termination"] else own.get(metric) for own in episodes[: 1 if same else None]]
-        for episodes in seeds.values()
-    ]
-    return over_cells([np.array(values, dtype=np.float64)], mean_of_part(middle))
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
