@@ -185,6 +185,19 @@ def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
     assert (step, value) == (7, -8.0)
 
 
+def test_a_training_shorter_than_an_episode_has_its_reward_per_decision(tmp_path: Path) -> None:
+    """Catches a training that ends without a reward, as its last checkpoint ended the episodes."""
+    settings = {"decision_period": 50, "history": 1}
+    config = TrainConfig(**{**SMALL, **PPO, "decisions": 32, "settings": settings})
+    Training(config, 1, tmp_path).run()
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    ((step, value),) = [
+        (event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")
+    ]
+    assert step == 32
+    assert -10.0 < value < 0.0
+
+
 def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
     """Catches first episodes, which are cut and of the beginning of the motion, in a mean with
     whole ones."""

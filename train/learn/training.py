@@ -302,6 +302,7 @@ class Curves(Logger):
         super().__init__(folder, [make_output_format("tensorboard", folder)])
         self._model = model
         self._worlds = worlds
+        self._beginning: float | None = None
 
     def dump(self, step: int = 0) -> None:
         """Write what was recorded; see SB3."""
@@ -311,11 +312,15 @@ class Curves(Logger):
         if episodes:
             decisions = sum(episode["l"] for episode in episodes)
             self.record(_REWARD, sum(episode["r"] for episode in episodes) / decisions)
+        elif (reward := self._worlds.reward_per_decision) is not None:
+            self._beginning = reward
         super().dump(step)
 
     def finish(self, step: int) -> None:
-        """Write the reward per decision of the present episodes, where no whole one has ended."""
-        reward = self._worlds.reward_per_decision
-        if not self._model.ep_info_buffer and reward is not None:
-            self.record(_REWARD, reward)
+        """Write the reward per decision of the last episodes, where no whole one has ended.
+
+        The last checkpoint has ended them.
+        """
+        if not self._model.ep_info_buffer and self._beginning is not None:
+            self.record(_REWARD, self._beginning)
             self.dump(step)
