@@ -185,17 +185,34 @@ def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
     assert (step, value) == (7, -8.0)
 
 
-def test_a_training_shorter_than_an_episode_has_its_reward_per_decision(tmp_path: Path) -> None:
+def test_a_training_shorter_than_an_episode_has_its_reward_per_decision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Catches a training that ends without a reward, as its last checkpoint ended the episodes."""
     settings = {"decision_period": 50, "history": 1}
     config = TrainConfig(**{**SMALL, **PPO, "decisions": 32, "settings": settings})
-    Training(config, 1, tmp_path).run()
+    training = Training(config, 1, tmp_path)
+    present: list[list[float]] = [[] for _ in range(4)]
+    step = training._worlds.env.step
+
+    def kept(actions: Any) -> Any:
+        result = step(actions)
+        _, rewards, terminated, truncated, _ = result
+        for own, reward, ended in zip(present, rewards, terminated | truncated, strict=True):
+            own.append(reward)
+            if ended:
+                own.clear()
+        return result
+
+    monkeypatch.setattr(training._worlds.env, "step", kept)
+    training.run()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    ((step, value),) = [
+    ((step_of, value),) = [
         (event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")
     ]
-    assert step == 32
-    assert -10.0 < value < 0.0
+    assert step_of == 32
+    assert value == pytest.approx(np.mean(list(itertools.chain(*present))), rel=1e-6)
+    assert value < 0.0
 
 
 def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
