@@ -396,18 +396,21 @@ def _warn_of_near_poses(
     home: Array,
 ) -> None:
     """Say which poses are played, where the servos are too weak for the usual ones."""
+    changes = []
     moved = np.abs(home - (0.0 if before is None else np.array(before)))
     most = int(moved.argmax())
-    text = (
-        f"the servos are too weak for {near.kind!r} all over the workspace; they are drawn within"
-        f" {near.within_rad:.3g} rad of home"
-    )
     if moved[most] > 0.0:
-        text += (
-            f", which is moved by up to {moved[most]:.3g} rad (joint {names[most]!r}) to where the"
-            " servos hold it"
+        where = "to where the servos hold it"
+        changes.append(
+            f"home is moved {where}, by up to {moved[most]:.3g} rad (joint {names[most]!r})"
         )
-    warnings.warn(f"{text}. To choose them, give within_rad, move_s or home", stacklevel=4)
+    if near.within_rad < type(near)().within_rad:
+        changes.append(f"they are drawn within {near.within_rad:.3g} rad of home")
+    warnings.warn(
+        f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}. To choose"
+        " them, give within_rad, move_s or home",
+        stacklevel=4,
+    )
 
 
 def _followed(
