@@ -102,11 +102,20 @@ class Workspace:
         pose = self.home
         for _ in range(_ROUNDS):
             if self.holds(pose):
-                return pose
+                return self._closer(pose)
             drawn = pose + stride * generator.standard_normal((_NEARBY, len(pose)))
             nearby = np.vstack([pose, np.clip(drawn, low, high)])
             pose = nearby[self.lack(nearby).argmin()]
         return None
+
+    def _closer(self, pose: Array) -> Array:
+        """A pose that servos hold, with every joint at home that need not leave it, (n,) [rad]."""
+        for joint, angle in enumerate(self.home):
+            returned = pose.copy()
+            returned[joint] = angle
+            if self.holds(returned):
+                pose = returned
+        return pose
 
 
 class _Drawn(RepeatableReference):

@@ -384,8 +384,8 @@ def _unheld(robot: RobotModel, body: RigidBody, home: Array) -> ConfigurationErr
     return arm_references.WeakServosError(
         f"at home the weight takes {needed[weakest]:.4g} N·m of the servo of joint"
         f" {robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.4g} N·m, and no"
-        " pose near home is held with a fifth to spare, so that a simulated robot would sink; raise"
-        " its torque_limit, or choose another home"
+        " pose near home was found that is held with a fifth to spare: a simulated robot would"
+        " sink; raise its torque_limit, or choose another home"
     )
 
 
@@ -405,7 +405,7 @@ def _warn_of_near_poses(
             f"home is moved {where}, by up to {moved[most]:.3g} rad (joint {names[most]!r})"
         )
     if near.within_rad < type(near)().within_rad:
-        changes.append(f"they are drawn within {near.within_rad:.3g} rad of home")
+        changes.append(f"poses are drawn within {near.within_rad:.3g} rad of home")
     warnings.warn(
         f"the servos are too weak for the usual {near.kind!r}; {' and '.join(changes)}. To choose"
         " them, give within_rad, move_s or home",
